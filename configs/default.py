@@ -1,0 +1,75 @@
+"""Every knob of a run, with its unit. The other files here change fields of this one."""
+
+from ml_collections import ConfigDict
+
+
+def mlp():
+    """The paper's network (Fig. 7): 595,844 parameters."""
+    return ConfigDict(
+        {
+            "depth": 8,  # layers before density
+            "width": 256,  # features a layer
+            "skip_layer": 4,  # the encoded position joins again after the layer of this index
+            "view_width": 128,  # features of the layer that sees the direction
+            "num_freqs": 10,  # octaves of the position
+            "num_view_freqs": 4,  # octaves of the direction
+            "use_viewdirs": True,  # False: colour does not depend on the direction
+            "density_activation": "relu",  # "relu" or "softplus"
+            "density_bias": 0.0,  # added before the activation
+            "compute_dtype": "float32",  # of the layers: "float32" or "bfloat16"
+        }
+    )
+
+
+def get_config():
+    """Returns the configuration of the paper's method on the embedded scene."""
+    return ConfigDict(
+        {
+            "seed": 0,
+            "data": {
+                "format": "synthetic",  # "synthetic" (embedded, rendered once and cached) or "blender"
+                "dir": "",  # the scene's folder; relative to $JAXNERF_SCENES where that is set
+                "factor": 1,  # images are area-averaged down this many times
+                "size": 100,  # px, side of the embedded scene's images
+                "near": 2.0,  # in t; the embedded scene brings its own
+                "far": 6.0,  # in t
+                "background": "white",  # behind alpha and behind the scene: "white", "black" or "none"
+                "pixel_offset": 0.5,  # px; 0.5 looks through pixel centres, 0 is what the 2020 code did
+                "ndc": False,  # normalised device coordinates, for forward-facing captures
+            },
+            "coarse": mlp(),  # guides the fine samples
+            "fine": mlp(),  # is what counts; absent when sampling.num_fine is 0
+            "sampling": {
+                "num_coarse": 64,  # samples a ray of the coarse network
+                "num_fine": 128,  # points more for the fine network
+                "rule": "segments",  # "segments", or "points" as in the paper
+                "in_disparity": False,  # coarse samples in equal steps of 1 / t
+                "importance_floor": 0.0,  # added to the weights before they guide samples
+                "density_noise": 0.0,  # 1 / world unit, deviation of noise on the density in training
+            },
+            "train": {
+                "batch_size": 1024,  # rays a step, over all devices
+                "block_size": 0,  # rays whose gradient is taken at once; 0: all that a device has
+                "batching": "all_images",  # "all_images", or "single_image": a view a step
+                "parallel": "auto",  # "jit", "sharded", "pmap"; auto: jit on one device, else sharded
+                "max_steps": 200_000,
+                "max_seconds": 0.0,  # s of training without compilation; 0: no limit
+                "lr_init": 5e-4,  # Adam
+                "lr_final": 5e-5,  # reached exponentially at lr_steps
+                "lr_steps": 200_000,  # the run may end before or after
+                "warmup_steps": 0,  # linear from 0
+                "beta1": 0.9,
+                "beta2": 0.999,
+                "epsilon": 1e-8,
+                "log_every": 100,  # steps
+                "save_every": 5000,  # steps
+                "keep": 3,  # checkpoints
+                "max_nonfinite": 20,  # steps in a row without a finite gradient before the run stops
+            },
+            "eval": {
+                "split": "test",
+                "chunk": 4096,  # rays rendered at once
+                "at_end": False,  # score the split when training ends
+            },
+        }
+    )

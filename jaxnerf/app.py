@@ -1,0 +1,47 @@
+"""What the command line programs share: errors of a user's making take one line and no traceback."""
+
+import sys
+
+from absl import app, flags, logging
+
+
+def run(main):
+    """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line."""
+    app.run(_without_traceback(main), flags_parser=_parse)
+
+
+def use_data_dir(config, data_dir):
+    """Lets --data_dir override the scene's folder."""
+    if data_dir:
+        config.data.dir = data_dir
+    return config
+
+
+def _parse(argv):
+    try:
+        rest = flags.FLAGS(argv)
+        if not flags.FLAGS["verbosity"].present:
+            logging.set_verbosity(logging.WARNING)  # orbax tells of every file it touches
+        return rest
+    except AttributeError as error:
+        _leave(2, f"the configuration has no such field ({error}); configs/default.py lists them all")
+    except (flags.Error, KeyError, TypeError, ValueError, OSError, ImportError) as error:
+        _leave(2, error)
+
+
+def _without_traceback(main):
+    def wrapped(argv):
+        try:
+            if len(argv) > 1:
+                raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
+            return main(argv)
+        except (ValueError, OSError) as error:
+            _leave(1, error)
+
+    return wrapped
+
+
+def _leave(code, error):
+    line = " ".join(str(error).split())
+    print(f"error: {line}", file=sys.stderr)
+    sys.exit(code)

@@ -1,0 +1,267 @@
+"""Cameras: pixels, lenses, rays and their projective (NDC) form, poses and paths.
+
+Camera axes are x right, y up, looking along -z. Image axes are x right, y down.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxnerf.core.structs import Rays, check_shapes
+
+
+def pixel_grid(height, width, *, offset=0.5):
+    """Returns [H, W, 2], the (x, y) of every pixel in px from the top left corner of the image.
+
+    Args:
+        height, width: px.
+        offset: where in its square a pixel is looked through. 0.5 is its centre; 0 is what the
+            2020 code did.
+    """
+    x, y = jnp.meshgrid(jnp.arange(width) + offset, jnp.arange(height) + offset, indexing="xy")
+    return jnp.stack([x, y], axis=-1).astype(jnp.float32)
+
+
+def undistort(camera, pixels):
+    """Returns where the straight rays behind distorted pixels cross the plane at distance 1.
+
+    Newton's method on the lens model; the gradient with respect to pixels, focal, center and
+    distortion is that of the exact inverse (one differentiable Newton step from the solution).
+
+    Args:
+        camera: one Camera. Its lens is "pinhole"; "opencv" with distortion (k1, k2, p1, p2) or
+            (k1, k2, p1, p2, k3); or "fisheye" with the equidistant model's (k1, k2, k3, k4).
+        pixels: [..., 2] px.
+
+    Returns:
+        points [..., 2], x right and y down, focal length 1; and converged [...]. A pixel outside
+        the lens's image has no preimage: its point is 0 and its flag False.
+
+    Raises:
+        ValueError: on other shapes or an unknown lens.
+    """
+    pixels = jnp.asarray(pixels)
+    check_shapes(
+        "undistort", pixels=(pixels, "... 2"), focal=(camera.focal, "2"), center=(camera.center, "2")
+    )
+    lead = (1,) * (pixels.ndim - 1)
+    focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
+    target = (pixels - center) / focal
+    if camera.distortion is None or camera.lens == "pinhole":
+        return target, jnp.ones(target.shape[:-1], bool)
+    distortion = jnp.asarray(camera.distortion)
+    if (camera.lens, distortion.size) not in (("opencv", 4), ("opencv", 5), ("fisheye", 4)):
+        raise ValueError(
+            f"undistort: lens {camera.lens!r} with {distortion.size} coefficients, wanted 'opencv' with 4 or "
+            "5 (k1, k2, p1, p2[, k3]) or 'fisheye' with 4 (k1, k2, k3, k4); pad with zeros"
+        )
+    distort = _brown if camera.lens == "opencv" else _equidistant
+    flat = target.reshape(-1, 2)
+    points, converged = jax.vmap(lambda goal: _invert(distort, distortion, goal))(flat)
+    if camera.lens == "fisheye":
+        # The unknown is the angle from the axis, along (x, y); the plane at distance 1 takes its tangent.
+        angle = norm(points)
+        inside = converged & (angle < 0.5 * math.pi)
+        angle = jnp.where(inside, angle, 0)
+        stretch = jnp.where(angle > 1e-4, jnp.tan(angle) / jnp.where(angle > 1e-4, angle, 1), 1)
+        points, converged = jnp.where(inside[:, None], points * stretch[:, None], 0), inside
+    return points.reshape(target.shape), converged.reshape(target.shape[:-1])
+
+
+def rays_from_pixels(camera, pixels, *, near, far):
+    """Returns the rays that a camera sees through pixels.
+
+    Args:
+        camera: one Camera (use jax.vmap for a stack).
+        pixels: [..., 2] px, as from pixel_grid.
+        near, far: scalars or [...] in t, which here is the distance along the camera's axis.
+
+    Returns:
+        Rays [...]; directions reach the plane at distance 1 (not unit length), as in the released
+        codes. A pixel without a preimage gets near = far and looks along the axis.
+
+    Raises:
+        ValueError: on other shapes or an unknown lens.
+    """
+    pixels = jnp.asarray(pixels)
+    check_shapes("rays_from_pixels", pixels=(pixels, "... 2"), to_world=(camera.to_world, "3 4"))
+    points, converged = undistort(camera, pixels)
+    to_world = jnp.asarray(camera.to_world)
+    lead = (1,) * (pixels.ndim - 1)
+    local = jnp.stack([points[..., 0], -points[..., 1], -jnp.ones_like(points[..., 0])], axis=-1)
+    # Sums of products, as a matrix unit may round the camera to ten bits.
+    directions = (to_world[:, :3].reshape(*lead, 3, 3) * local[..., None, :]).sum(axis=-1)
+    shape = pixels.shape[:-1]
+    near, far = (jnp.broadcast_to(jnp.asarray(value, directions.dtype), shape) for value in (near, far))
+    return Rays(
+        origins=jnp.broadcast_to(to_world[:, 3], directions.shape).astype(directions.dtype),
+        directions=directions,
+        viewdirs=normalize(directions),
+        near=near,
+        far=jnp.where(converged, far, near),
+    )
+
+
+def ndc_rays(rays, camera, *, near_plane=1.0):
+    """Returns forward-facing rays in normalised device coordinates (Appendix C, Eqs. 25 and 26).
+
+    The whole half space beyond the near plane z = -near_plane becomes a box, and t in [0, 1] runs
+    from that plane to infinity, linear in disparity.
+
+    Args:
+        rays: Rays [...] in a world whose cameras look roughly along -z.
+        camera: the Camera, for its focal length and size.
+        near_plane: distance in world units.
+
+    Returns:
+        Rays [...] with near 0 and far 1; viewdirs untouched. A ray that does not go towards -z
+        never meets the box and gets near = far = 0.
+
+    Raises:
+        ValueError: if the camera's size is unknown.
+    """
+    if camera.height is None or camera.width is None:
+        raise ValueError("ndc_rays: the camera has no height and width; NDC wants them, set both in px")
+    forward = rays.directions[..., 2] < 0
+    depth = jnp.where(forward, rays.directions[..., 2], -1)
+    shift = -(near_plane + rays.origins[..., 2]) / depth
+    origins = rays.origins + shift[..., None] * rays.directions  # now at z = -near_plane
+    focal = jnp.asarray(camera.focal)
+    scale = (2 * focal / jnp.array([camera.width, camera.height], focal.dtype)).reshape(
+        *(1,) * shift.ndim, 2
+    ) * jnp.ones_like(origins[..., :2])
+    lateral = scale * origins[..., :2] / near_plane
+    slope = -scale * rays.directions[..., :2] / depth[..., None] - lateral
+    plane = jnp.ones_like(shift)[..., None]
+    return Rays(
+        origins=jnp.concatenate([lateral, -plane], axis=-1),
+        directions=jnp.concatenate([slope, 2 * plane], axis=-1),
+        viewdirs=rays.viewdirs,
+        near=jnp.zeros_like(shift),
+        far=jnp.where(forward, 1.0, 0.0).astype(shift.dtype),
+    )
+
+
+def ndc_to_t(t, rays, camera=None, *, near_plane=1.0):
+    """Returns the t of world rays at the same points as NDC t: the depth back.
+
+    Args:
+        t: [...] in [0, 1], t of ndc_rays(rays, camera).
+        rays: the world Rays [...] that went into ndc_rays.
+        camera: not needed, as depth does not depend on it; taken so that both calls look alike.
+        near_plane: as in ndc_rays.
+
+    Returns:
+        [...] in t of the world rays: at the near plane for 0, inf for 1.
+
+    Raises:
+        ValueError: on other shapes.
+    """
+    check_shapes("ndc_to_t", t=(t, "..."), near=(rays.near, "..."))
+    depth = rays.directions[..., 2]
+    shift = -(near_plane + rays.origins[..., 2]) / depth
+    return shift - near_plane * t / ((1 - t) * depth)
+
+
+def norm(vectors):
+    """Returns the length [...] of vectors [..., D] without over- or underflow; 0, with gradient 0, for 0."""
+    largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
+    nonzero = largest > 0
+    largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
+    squares = ((vectors / largest) ** 2).sum(axis=-1, keepdims=True)
+    return jnp.where(nonzero, largest * jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)[..., 0]
+
+
+def normalize(vectors):
+    """Returns vectors [..., D] at unit length; 0, with gradient 0, for a zero vector."""
+    largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
+    nonzero = largest > 0
+    scaled = vectors / jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
+    squares = (scaled**2).sum(axis=-1, keepdims=True)
+    return jnp.where(nonzero, scaled / jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)
+
+
+def look_at(eye, target, up):
+    """Returns the pose [3, 4] of a camera at eye [3] that looks to target [3].
+
+    up [3] points upwards in the image. Where up is along the line of sight another axis takes its place.
+    """
+    eye, target, up = (jnp.asarray(value, jnp.float32) for value in (eye, target, up))
+    check_shapes("look_at", eye=(eye, "3"), target=(target, "3"), up=(up, "3"))
+    back = normalize(eye - target)
+    right = jnp.cross(normalize(up), back)
+    spare = jnp.cross(jnp.roll(back, 1), back)
+    right = normalize(jnp.where(norm(right) > 1e-6, right, spare))
+    return jnp.stack([right, jnp.cross(back, right), back, eye], axis=-1)
+
+
+def turntable(num_frames, *, center, radius, elevation, up=(0.0, 0.0, 1.0)):
+    """Returns poses [N, 3, 4] on a circle around center [3], looking at it.
+
+    Args:
+        num_frames: N, one turn.
+        center: [3] world.
+        radius: distance to the center, world units.
+        elevation: radians above the plane across up.
+        up: [3] the axis of the turn; unit length, not along x + 0.1 y.
+    """
+    center, up = jnp.asarray(center, jnp.float32), jnp.asarray(up, jnp.float32)
+    first = normalize(jnp.cross(up, jnp.array([1.0, 0.1, 0.0])))
+    second = jnp.cross(up, first)
+
+    def pose(angle):
+        around = jnp.cos(angle) * first + jnp.sin(angle) * second
+        eye = center + radius * (math.cos(elevation) * around + math.sin(elevation) * up)
+        return look_at(eye, center, up)
+
+    return jax.vmap(pose)(2 * math.pi * jnp.arange(num_frames) / num_frames)
+
+
+def _brown(distortion, point):
+    """The "opencv" lens: radial and tangential terms on the plane at distance 1 (Brown 1966)."""
+    k1, k2, p1, p2 = distortion[:4]
+    k3 = distortion[4] if distortion.size == 5 else 0.0
+    x, y = point
+    square = x * x + y * y
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    return jnp.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (square + 2 * y * y),
+        ]
+    )
+
+
+def _equidistant(distortion, point):
+    """The "fisheye" lens on points whose length is the angle from the axis (Kannala and Brandt 2006)."""
+    square = (point**2).sum()
+    k1, k2, k3, k4 = distortion
+    return point * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+
+
+def _invert(distort, distortion, goal):
+    """Returns the point [2] with distort(point) = goal [2], and whether it is one on the lens's own side."""
+
+    def newton(point, coefficients, goal):
+        jacobian = jax.lax.stop_gradient(jax.jacfwd(distort, argnums=1)(distortion, point))
+        (a, b), (c, d) = jacobian
+        determinant = a * d - b * c
+        x, y = distort(coefficients, point) - goal
+        return point - jnp.stack([d * x - b * y, a * y - c * x]) / determinant, determinant
+
+    fixed = jax.lax.stop_gradient(goal)
+    start = jax.lax.stop_gradient(distortion)
+    point = jax.lax.fori_loop(0, 20, lambda _, point: newton(point, start, fixed)[0], fixed)
+    residual = norm(distort(start, point) - fixed)
+    # Past a fold of the lens the same pixel is met again: the image must grow all the way there.
+    fractions = jnp.linspace(0, 1, 32, dtype=goal.dtype)
+    _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(start, s * point), (s,), (jnp.ones_like(s),)))(
+        fractions
+    )
+    growing = ((slopes * point[None]).sum(axis=-1)[1:] > 0).all() | (norm(point) == 0)
+    tolerance = 8 * jnp.finfo(goal.dtype).eps * (1 + norm(fixed))
+    converged = (residual <= tolerance) & growing
+    point = jax.lax.stop_gradient(jnp.where(converged, point, 0))
+    refined, _ = newton(point, distortion, goal)
+    return jnp.where(converged, refined, 0), converged

@@ -1,0 +1,105 @@
+"""How close two images are: PSNR, SSIM, and the 8-bit rounding that makes figures comparable."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxnerf.core.structs import check_shapes
+
+
+def mse(a, b, *, mask=None):
+    """Returns the mean squared error [...] of images [..., H, W, C], over the pixels in mask [..., H, W].
+
+    NaN where the mask is empty. Raises ValueError if the shapes differ.
+    """
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    check_shapes("mse", a=(a, "... H W C"), b=(b, "... H W C"))
+    squares = (a - b) ** 2
+    if mask is None:
+        return squares.mean(axis=(-3, -2, -1))
+    check_shapes("mse", a=(a, "... H W C"), mask=(mask, "... H W"))
+    kept = jnp.where(mask[..., None], squares, 0)
+    return kept.sum(axis=(-3, -2, -1)) / (mask.sum(axis=(-2, -1)) * a.shape[-1])
+
+
+@jax.custom_jvp
+def decibels(error):
+    """Returns -10 log10(error) for mean squared errors [...] of colours in [0, 1].
+
+    No error is inf dB; the gradient there is 0, as nothing is left to improve. NaN stays NaN.
+    """
+    return -10 / math.log(10) * jnp.log(error)
+
+
+@decibels.defjvp
+def _decibels_jvp(primals, tangents):
+    (error,), (tangent,) = primals, tangents
+    slope = jnp.where(error == 0, 0, -10 / math.log(10) / jnp.where(error == 0, 1, error))
+    return decibels(error), slope * tangent
+
+
+def psnr(a, b, *, mask=None):
+    """Returns the peak signal-to-noise ratio in dB of images with colours in [0, 1].
+
+    Args:
+        a, b: [..., H, W, C].
+        mask: [..., H, W] bool, the pixels that count; all when None.
+
+    Returns:
+        [...] dB: inf for identical images, with gradient 0; NaN if a colour that counts is.
+
+    Raises:
+        ValueError: if the shapes differ.
+    """
+    return decibels(mse(a, b, mask=mask))
+
+
+def ssim(a, b):
+    """Returns the structural similarity of images with colours in [0, 1] (Wang et al. 2004).
+
+    A Gaussian window of 11 pixels and deviation 1.5 wherever it fits, k1 = 0.01, k2 = 0.03, population
+    variances, the mean over windows and channels: the figure of the paper's tables and of dm_pix.
+
+    Args:
+        a, b: [..., H, W, C].
+
+    Returns:
+        [...] in [-1, 1], 1 for identical images.
+
+    Raises:
+        ValueError: if the shapes differ, or a side is under 11 pixels.
+    """
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    check_shapes("ssim", a=(a, "... H W C"), b=(b, "... H W C"))
+    size, deviation = 11, 1.5
+    if min(a.shape[-3:-1]) < size:
+        raise ValueError(
+            f"ssim: images are {a.shape[-3]} x {a.shape[-2]} px, wanted at least {size} x {size}"
+        )
+    bells = [math.exp(-(((i - size // 2) / deviation) ** 2) / 2) for i in range(size)]
+    window = [bell / sum(bells) for bell in bells]
+
+    def blur(x):
+        for axis in (-3, -2):
+            valid = x.shape[axis] - size + 1
+            shifted = (jax.lax.slice_in_dim(x, i, i + valid, axis=x.ndim + axis) for i in range(size))
+            x = sum(weight * part for weight, part in zip(window, shifted, strict=True))
+        return x
+
+    # Around a common grey the squares are smaller, and so is what their difference loses.
+    a, b = a - 0.5, b - 0.5
+    mean_a, mean_b = blur(a), blur(b)
+    variance_a = jnp.maximum(blur(a * a) - mean_a**2, 0)
+    variance_b = jnp.maximum(blur(b * b) - mean_b**2, 0)
+    covariance = blur(a * b) - mean_a * mean_b
+    mean_a, mean_b = mean_a + 0.5, mean_b + 0.5
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
+    structure = (2 * covariance + c2) / (variance_a + variance_b + c2)
+    return (luminance * structure).mean(axis=(-3, -2, -1))
+
+
+def round_to_8_bits(image):
+    """Returns colours [...] clipped to [0, 1] and rounded to the nearest of the 256 levels of a PNG."""
+    return jnp.round(jnp.clip(jnp.asarray(image), 0, 1) * 255) / 255

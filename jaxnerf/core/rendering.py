@@ -1,0 +1,192 @@
+"""The volume renderer, for any scene that is a function (x, viewdirs) -> (density, rgb)."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxnerf.core import compositing, sampling
+from jaxnerf.core.cameras import norm
+from jaxnerf.core.structs import Rendering, check_shapes, without_weights
+
+
+def positions(rays, t):
+    """Returns the points x(t) = o + t d on rays [...], for t [..., S]: [..., S, 3] in world units."""
+    check_shapes("positions", origins=(rays.origins, "... 3"), t=(t, "... S"))
+    return rays.origins[..., None, :] + t[..., None] * rays.directions[..., None, :]
+
+
+def render_samples(scene, rays, samples, *, background=None):
+    """Returns what rays see of a scene that is asked at the given samples (Eq. 3).
+
+    Args:
+        scene: (x [..., S, 3], viewdirs [..., 1, 3]) -> (density [..., S], rgb [..., S, 3]).
+        rays: Rays [...].
+        samples: Samples [..., S]. Where delta is 0 the scene is asked at the ray's near end, and
+            whatever it answers, NaN too, reaches neither value nor gradient.
+        background: None (black), [3], or [..., 3]: the colour of what passes through.
+
+    Returns:
+        Rendering [...]. An empty ray has the background's colour, depth far and disparity 0.
+
+    Raises:
+        ValueError: if the scene's answer, or an argument, has another shape.
+    """
+    check_shapes(
+        "render_samples",
+        origins=(rays.origins, "... 3"),
+        directions=(rays.directions, "... 3"),
+        near=(rays.near, "..."),
+        far=(rays.far, "..."),
+        t=(samples.t, "... S"),
+        delta=(samples.delta, "... S"),
+    )
+    kept = samples.delta > 0
+    t = jnp.where(kept, samples.t, jnp.broadcast_to(rays.near[..., None], samples.t.shape))
+    density, rgb = scene(positions(rays, t), rays.viewdirs[..., None, :])
+    if density.shape != t.shape or rgb.shape != (*t.shape, 3):
+        raise ValueError(
+            f"render_samples: the scene returned density {density.shape} and rgb {rgb.shape} for positions "
+            f"{(*t.shape, 3)}, wanted {t.shape} and {(*t.shape, 3)}"
+        )
+    density, rgb = jnp.where(kept, density, 0), jnp.where(kept[..., None], rgb, 0)
+    length = samples.delta * norm(rays.directions)[..., None]
+    density, rgb = density.astype(length.dtype), rgb.astype(length.dtype)  # a field may compute in less
+    weights = compositing.weights_from_density(density, length)
+    passing = compositing.transmittance(density, length)
+    return Rendering(
+        rgb=compositing.composite(weights, rgb, background=background, transmittance=passing),
+        opacity=compositing.opacity(density, length),
+        depth=compositing.expected_depth(weights, t, passing, far=rays.far),
+        disparity=compositing.expected_disparity(weights, t),
+        weights=weights,
+        dropped=jnp.zeros(t.shape[:-1], jnp.int32),
+    )
+
+
+def render_rays(
+    key,
+    scene,
+    rays,
+    *,
+    num_samples,
+    rule="segments",
+    in_disparity=False,
+    background=None,
+    render=render_samples,
+):
+    """Returns what rays see of a scene asked at evenly spread samples between near and far.
+
+    Args:
+        key: None for fixed samples, one key, or one key a ray [...], for stratified ones (Eq. 2).
+        scene: see render_samples.
+        rays: Rays [...].
+        num_samples: S.
+        rule: "segments", or "points" for the released codes' quadrature.
+        in_disparity: equal steps in 1 / t (wants near > 0).
+        background: see render_samples.
+        render: render_samples, or a function of the same meaning.
+
+    Returns:
+        Rendering [...].
+
+    Raises:
+        ValueError: on an unknown rule, and as uniform_edges and render_samples.
+    """
+    samples = _even_samples(key, rays, num_samples, rule, in_disparity)
+    return render(scene, rays, samples, background=background)
+
+
+def render_hierarchical(
+    key,
+    coarse,
+    fine,
+    rays,
+    *,
+    num_coarse,
+    num_fine,
+    rule="segments",
+    in_disparity=False,
+    importance_floor=0.0,
+    background=None,
+):
+    """Returns what rays see of two scenes, the second asked where the first has weight (Section 5.2).
+
+    Args:
+        key: None for fixed samples, one key, or one key a ray [...].
+        coarse, fine: scenes, see render_samples. They may be the same.
+        rays: Rays [...].
+        num_coarse: samples of the coarse scene.
+        num_fine: importance points. The fine scene is asked at num_coarse + num_fine samples.
+        rule: "segments": the points cut the coarse segments, and each piece is asked once.
+            "points": the paper's sorted union of both sets of points, with a last delta of 1e10.
+        in_disparity: equal coarse steps in 1 / t.
+        importance_floor: see importance_points; the released codes have 1e-5.
+        background: see render_samples.
+
+    Returns:
+        (Rendering, Rendering): coarse and fine. No gradient flows from the fine one to the coarse scene.
+
+    Raises:
+        ValueError: as render_rays.
+    """
+    coarse_key, point_key, fine_key = sampling.split_key(key, 3)
+    if rule == "segments":
+        edges = sampling.uniform_edges(
+            rays.near, rays.far, num_segments=num_coarse, in_disparity=in_disparity
+        )
+        samples = sampling.samples_from_edges(coarse_key, edges)
+    else:
+        samples = _even_samples(coarse_key, rays, num_coarse, rule, in_disparity)
+    first = render_samples(coarse, rays, samples, background=background)
+    options = {"num_points": num_fine, "floor": importance_floor}
+    if rule == "segments":
+        points = sampling.importance_points(point_key, edges, first.weights, **options)
+        samples = sampling.samples_from_edges(fine_key, sampling.merge_edges(edges, points))
+    else:
+        # The released codes draw between the middles of the coarse points, from the inner weights.
+        middles = sampling.midpoints(samples.t)
+        points = sampling.importance_points(point_key, middles, first.weights[..., 1:-1], **options)
+        samples = sampling.samples_from_points(sampling.merge_edges(samples.t, points))
+    return first, render_samples(fine, rays, samples, background=background)
+
+
+def render_image(render, rays, *, chunk):
+    """Returns a whole image, rendered in chunks of one compiled shape.
+
+    Args:
+        render: Rays [chunk] -> Rendering [chunk], jitted. Parameters are best its arguments, bound
+            with functools.partial: a new checkpoint then compiles nothing.
+        rays: Rays [H, W], or any other leading axes.
+        chunk: rays at once. The last chunk is filled up with copies of the last ray.
+
+    Returns:
+        Rendering [H, W] without weights, on the host.
+
+    Raises:
+        ValueError: if chunk < 1 or there are no rays.
+    """
+    shape = rays.near.shape
+    count = rays.near.size
+    if chunk < 1 or count < 1:
+        raise ValueError(f"render_image: chunk {chunk} and {count} rays, wanted at least 1 of each")
+    flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[len(shape) :]), rays)
+    parts = []
+    for start in range(0, count, chunk):
+        index = jnp.minimum(jnp.arange(start, start + chunk), count - 1)
+        part = render(jax.tree.map(lambda leaf, index=index: leaf[index], flat))
+        parts.append(jax.device_get(without_weights(part)))
+    whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
+
+
+def _even_samples(key, rays, num_samples, rule, in_disparity):
+    if rule == "segments":
+        edges = sampling.uniform_edges(
+            rays.near, rays.far, num_segments=num_samples, in_disparity=in_disparity
+        )
+        return sampling.samples_from_edges(key, edges)
+    if rule == "points":
+        t = sampling.stratified_points(
+            key, rays.near, rays.far, num_points=num_samples, in_disparity=in_disparity
+        )
+        return sampling.samples_from_points(t)
+    raise ValueError(f"rule is {rule!r}, wanted 'segments' or 'points'")

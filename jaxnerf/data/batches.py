@@ -1,0 +1,110 @@
+"""Training rays, drawn on the device from the pixels of all views."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnerf.core.cameras import ndc_rays, ndc_to_t, norm, rays_from_pixels
+from jaxnerf.core.structs import Batch
+
+BATCHINGS = ("all_images", "single_image")
+
+
+def pixel_colors(pixels, background):
+    """Returns colours [..., 3] in [0, 1] of pixels [..., C] of uint8 or uint16.
+
+    With C = 4 the colour is composited over background [3] (None: black); with C = 3 it is opaque.
+    """
+    largest = jnp.iinfo(pixels.dtype).max
+    values = pixels.astype(jnp.float32) / largest
+    if pixels.shape[-1] == 3:
+        return values
+    rgb, alpha = values[..., :3], values[..., 3:]
+    if background is None:
+        return rgb * alpha
+    behind = jnp.broadcast_to(jnp.asarray(background, jnp.float32), rgb.shape)
+    return rgb * alpha + behind * (1 - alpha)
+
+
+def view_rays(views, index, pixels, *, ndc=False):
+    """Returns Rays [...] of one view through pixels [..., 2]; index is a number, traced or not."""
+    camera = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], views.cameras)
+    near, far = jnp.asarray(views.near)[index], jnp.asarray(views.far)[index]
+    rays = rays_from_pixels(camera, pixels, near=near, far=far)
+    return ndc_rays(rays, camera) if ndc else rays
+
+
+def world_depth(views, index, pixels, depth, *, ndc=False):
+    """Returns the distance [...] along the rays of view_rays, in world units, of depth [...] in their t."""
+    rays = view_rays(views, index, pixels)
+    t = ndc_to_t(depth, rays) if ndc else depth
+    return t * norm(rays.directions)
+
+
+def live_pixels(views):
+    """Returns [L] int32, the ids of the pixels that belong to batches, ascending; None where all do.
+
+    Raises:
+        ValueError: if a view has none; names it.
+    """
+    if views.mask is None:
+        return None
+    live = np.flatnonzero(views.mask).astype(np.int32)
+    ends = np.append(np.asarray(views.offset)[1:], len(views.mask))
+    for view, (first, last) in enumerate(
+        zip(np.searchsorted(live, views.offset), np.searchsorted(live, ends), strict=True)
+    ):
+        if first == last:
+            name = views.names[view] if views.names else view
+            raise ValueError(
+                f"view {name}: its mask leaves no pixel, wanted at least one; drop the view or mend it"
+            )
+    return live
+
+
+def draw_batch(
+    seed, step, positions, views, live=None, *, batching="all_images", pixel_offset=0.5, ndc=False
+):
+    """Returns one key a ray and the rays and colours of a part of one step's batch.
+
+    Everything depends on the seed, the step and the ray's position in the whole batch alone, so
+    it is the same however the batch is split over devices.
+
+    Args:
+        seed: int.
+        step: int32 scalar.
+        positions: [B] int32, of the rays in the step's whole batch.
+        views: Views, on the device.
+        live: None, or live_pixels(views): the pixels to draw from.
+        batching: "all_images": each ray from any pixel of any view; "single_image": all rays of a
+            step from one view, as in the paper's synthetic runs.
+        pixel_offset: where in its square a pixel is looked through, see pixel_grid.
+        ndc: rays in normalised device coordinates.
+
+    Returns:
+        keys [B], for sampling along the rays; and Batch [B].
+
+    Raises:
+        ValueError: on an unknown batching.
+    """
+    if batching not in BATCHINGS:
+        raise ValueError(f"draw_batch: batching is {batching!r}, wanted one of {BATCHINGS}")
+    step_key = jax.random.fold_in(jax.random.key(seed), step)
+    ray_keys = jax.vmap(lambda position: jax.random.fold_in(step_key, position))(positions)
+    pixel_keys, keys = jax.vmap(lambda key: tuple(jax.random.split(key)))(ray_keys)
+    first, count = 0, views.pixels.shape[0] if live is None else live.shape[0]
+    if batching == "single_image":
+        # No ray has this position, so the key is the step's own.
+        view = jax.random.randint(jax.random.fold_in(step_key, 2**32 - 1), (), 0, views.offset.shape[0])
+        first, count = views.offset[view], views.size[view].prod()
+        if live is not None:
+            first, last = jnp.searchsorted(live, jnp.stack([first, first + count]))
+            count = last - first
+    index = jax.vmap(lambda key: jax.random.randint(key, (), first, first + count))(pixel_keys)
+    index = index if live is None else live[index]
+    view = jnp.searchsorted(views.offset, index, side="right", method="compare_all") - 1
+    place = index - views.offset[view]
+    width = views.size[view, 1]
+    pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
+    rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
+    return keys, Batch(rays=rays, rgb=pixel_colors(views.pixels[index], views.background))

@@ -1,0 +1,109 @@
+"""Photographs as arrays: reading a file, shrinking by whole factors, straight alpha.
+
+Straight alpha keeps the colour of a half covered pixel as if it were fully covered; premultiplied colour
+is already scaled by its alpha, which is what averages and composites correctly. Files and Views are
+straight, arithmetic is premultiplied. Everything here is numpy on the host.
+"""
+
+import numpy as np
+from PIL import Image
+
+
+def read_image(path):
+    """Returns the pixels of an image file at the precision that the file has.
+
+    Args:
+        path: an 8 or 16 bit PNG, or an 8 bit file of another kind that Pillow reads.
+
+    Returns:
+        [H, W, 3] opaque or [H, W, 4] with straight alpha, uint8 or uint16. Grey becomes three equal
+        channels, a palette or a transparent colour key is resolved.
+
+    Raises:
+        ValueError: if the file is missing, no image, or cut short.
+    """
+    try:
+        with Image.open(path) as image:
+            raw = image.tile[0][3] if image.format == "PNG" else None
+            if raw in ("RGB;16B", "RGBA;16B"):
+                # Pillow keeps only the first byte of each 16 bit value. Naming the byte order the other way
+                # round makes it keep the second, so two passes give all sixteen bits.
+                high, low = np.asarray(image), _second_bytes(path, raw)
+                return high.astype(np.uint16) * 256 + low
+            if image.mode == "I;16":
+                return np.repeat(np.asarray(image)[..., None], 3, axis=-1)
+            mode = "RGBA" if image.has_transparency_data else "RGB"
+            image = image if image.mode == mode else image.convert(mode)
+            return np.asarray(image)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file, wanted an image; copy it or correct the name") from None
+    except Exception as error:  # a damaged file makes Pillow's decoders raise almost anything
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(
+            f"{path}: unreadable ({reason}), wanted a whole image file; copy or render it again"
+        ) from error
+
+
+def _second_bytes(path, raw):
+    with Image.open(path) as image:
+        image.tile = [(*image.tile[0][:3], raw.replace("16B", "16L"))]
+        return np.asarray(image)
+
+
+def average_blocks(pixels, factor, *, background=None):
+    """Returns the image shrunk by area: each new pixel is the mean of factor x factor old ones.
+
+    The mean is taken of premultiplied colour in float64, so a transparent pixel's colour, which nobody
+    sees, does not bleed into the edge of an object.
+
+    Args:
+        pixels: [H, W, 3] or [H, W, 4] with straight alpha, uint8 or uint16.
+        factor: whole number >= 1 that divides H and W.
+        background: see `to_straight`; without alpha it plays no part.
+
+    Returns:
+        [H / factor, W / factor, 3 or 4] uint16, straight again, rounded to nearest.
+
+    Raises:
+        ValueError: if factor does not divide the size; the message lists those that do.
+    """
+    height, width, channels = pixels.shape
+    if height % factor or width % factor:
+        common = np.gcd(height, width)
+        works = ", ".join(str(k) for k in range(1, common + 1) if common % k == 0)
+        raise ValueError(
+            f"factor {factor} does not divide {width} x {height}, wanted one that does; take one of {works}"
+        )
+    scaled = pixels / np.float64(np.iinfo(pixels.dtype).max)
+    if channels == 4:
+        scaled[..., :3] *= scaled[..., 3:]
+    # Rows first: adding whole rows runs through memory in order, three times faster than both axes at once.
+    rows = scaled.reshape(height // factor, factor, width * channels).sum(axis=1)
+    mean = rows.reshape(height // factor, width // factor, factor, channels).sum(axis=2) / factor**2
+    if channels == 3:
+        return np.rint(mean * 65535).astype(np.uint16)
+    return to_straight(mean[..., :3], mean[..., 3], background=background)
+
+
+def to_straight(premultiplied, alpha, *, background=None):
+    """Returns premultiplied colour and alpha as 16 bit straight RGBA.
+
+    Two roundings meet when the result is composited: alpha's and the colour's. Colour is rounded last and,
+    where the background is known, makes up for what rounding alpha changed, which halves the error.
+
+    Args:
+        premultiplied: [..., 3] colour times alpha, in [0, alpha].
+        alpha: [...] in [0, 1].
+        background: 3 values in [0, 1] over which compositing is to be right to 0.5 / 65535 = 7.7e-6, or None
+            for right to twice that over any colour.
+
+    Returns:
+        [..., 4] uint16. Colour is 0 where alpha rounds to 0.
+    """
+    alpha = np.asarray(alpha, np.float64)
+    rounded = np.rint(np.clip(alpha, 0, 1) * 65535) / 65535
+    behind = 0.0 if background is None else np.asarray(background, np.float64) * (rounded - alpha)[..., None]
+    covered = rounded[..., None]
+    colour = (premultiplied + behind) / np.where(covered > 0, covered, 1.0)
+    colour = np.where(covered > 0, np.clip(colour, 0, 1), 0.0)
+    return np.rint(np.concatenate([colour, covered], axis=-1) * 65535).astype(np.uint16)

@@ -1,0 +1,183 @@
+"""Scores of a trained run on held-out views, and the pictures they were taken from."""
+
+import functools
+import json
+import os
+import pathlib
+import shutil
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.core.metrics import psnr, round_to_8_bits, ssim
+from jaxnerf.core.rendering import render_image
+from jaxnerf.data.batches import pixel_colors
+from jaxnerf.engine import pictures, records, workdir
+from jaxnerf.engine.load import newest_step, open_run
+
+
+def evaluate(folder, *, config=None, split=None, step=None, chunk=None, overwrite=False):
+    """Scores one checkpoint and writes <workdir>/eval/<step>/.
+
+    Args:
+        folder: the workdir.
+        config: ConfigDict in place of the workdir's own.
+        split: of the data; the configuration's eval.split when None. Another split than that one
+            is written to eval/<step>-<split>.
+        step: of the checkpoint; the newest when None.
+        chunk: rays rendered at once; the configuration's eval.chunk when None.
+        overwrite: whether an earlier result of the same step and split is replaced.
+
+    Returns:
+        What results.json holds.
+
+    Raises:
+        ValueError: if there is no such run, checkpoint or split, or the result is already there.
+    """
+    run = open_run(folder, config)
+    return score_run(run, folder, split=split, step=step, chunk=chunk, overwrite=overwrite)
+
+
+def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False, views=None):
+    """As evaluate, for a run that is open already and views that may be read already."""
+    options = run.experiment.eval
+    step, chunk, split = newest_step(run, folder, step), chunk or options.chunk, split or options.split
+    name = str(step) if split == options.split else f"{step}-{split}"
+    target = pathlib.Path(folder) / "eval" / name
+    if target.exists() and not overwrite:
+        raise ValueError(f"{target}: is there already; give --overwrite to score again, or another --step")
+    views = run.experiment.load_views(split) if views is None else views
+    params = run.params(step)
+    partial = target.with_name(name + ".tmp")
+    shutil.rmtree(partial, ignore_errors=True)
+    rows = _render_views(run, functools.partial(run.render, params), views, chunk, partial)
+    rays = sum(row.pop("rays") for row in rows)
+    # The first view's time would hold the compilation too.
+    timed = rows[1:] or rows
+    seconds = sum(row["seconds"] for row in timed) / len(timed)
+    trained = [row for row in records.read_rows(folder) if row["step"] <= step]
+    results = {
+        **{key: _mean(row[key] for row in rows) for key in ("psnr", "ssim", "psnr_float")},
+        "views": len(rows),
+        "rays_per_second": rays / len(rows) / seconds,
+        "seconds_per_frame": seconds,
+        "step": step,
+        "rays_seen": trained[-1]["rays"] if trained else None,
+        "training_seconds": trained[-1]["seconds"] if trained else None,
+        "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(params)),
+        "conventions": {**run.experiment.conventions, "split": split, "chunk": chunk},
+        "images": rows,
+    }
+    workdir.write_text(partial / "results.json", json.dumps(results, indent=2) + "\n")
+    if target.exists():
+        shutil.rmtree(target)
+    os.replace(partial, target)  # whole or not at all
+    return results
+
+
+def watch(folder, *, poll_seconds=10.0, config=None, data_dir=None, split=None, chunk=None):
+    """Scores every new checkpoint of a running training until its last step; says when it waits."""
+    views, said = None, None
+    while True:
+        try:
+            run = open_run(folder, config, data_dir=data_dir)
+            break
+        except ValueError as error:
+            said = _wait(f"{error}", said, poll_seconds)
+    split = split or run.experiment.eval.split
+    while True:
+        scored = pathlib.Path(folder) / "eval"
+        suffix = "" if split == run.experiment.eval.split else f"-{split}"
+        waiting = [step for step in run.steps() if not (scored / f"{step}{suffix}").exists()]
+        if waiting:
+            views = run.experiment.load_views(split) if views is None else views
+            results = score_run(run, folder, split=split, step=waiting[0], chunk=chunk, views=views)
+            print(summary(results), flush=True)
+        elif run.steps() and run.steps()[-1] >= run.experiment.train.max_steps:
+            return
+        else:
+            said = _wait(f"{folder}: no new checkpoint", said, poll_seconds)
+
+
+def score_predictions(predictions, references, *, names):
+    """Returns results for images made elsewhere: the same metrics on 8-bit images, row by row.
+
+    Args:
+        predictions, references: iterables of [H, W, 3] colours in [0, 1], in the same order.
+        names: one a pair.
+
+    Raises:
+        ValueError: if a pair's sizes differ; names it.
+    """
+    rows = []
+    for name, predicted, reference in zip(names, predictions, references, strict=True):
+        if predicted.shape != reference.shape:
+            raise ValueError(
+                f"{name}: is {predicted.shape}, its reference {reference.shape}; make both one size"
+            )
+        rows.append({"name": name, **_scores(predicted, reference)})
+    means = {key: _mean(row[key] for row in rows) for key in ("psnr", "ssim", "psnr_float")}
+    return {**means, "views": len(rows), "images": rows}
+
+
+def summary(results):
+    """Returns one line that sums up results.json."""
+    step = f"step {results['step']}: " if "step" in results else ""
+    speed = f", {results['seconds_per_frame']:.2f} s a frame" if "seconds_per_frame" in results else ""
+    scores = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
+    return f"{step}{scores} over {results['views']} views{speed}"
+
+
+def reference(views, index):
+    """Returns the colours [H, W, 3] of one of Views, over its background."""
+    height, width = (int(value) for value in views.size[index])
+    first = int(views.offset[index])
+    pixels = jnp.asarray(views.pixels[first : first + height * width])
+    return pixel_colors(pixels, views.background).reshape(height, width, 3)
+
+
+def _render_views(run, render, views, chunk, folder):
+    rows, shown = [], []
+    for index, name in enumerate(views.names):
+        height, width = (int(value) for value in views.size[index])
+        pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
+        started = time.perf_counter()
+        rays = run.experiment.view_rays(views, index, pixels)
+        image = render_image(render, rays, chunk=chunk)
+        seconds = time.perf_counter() - started
+        truth = reference(views, index)
+        rows.append({"name": name, **_scores(image.rgb, truth), "seconds": seconds, "rays": height * width})
+        depth = run.experiment.world_depth(views, index, pixels, image.depth)
+        pictures.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
+        if index % -(-len(views.names) // pictures.SHEET_ROWS) == 0:
+            shown.append((truth, image))
+        print(f"\r{index + 1}/{len(views.names)} views", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    pictures.write_sheet(folder / "sheet.png", shown)
+    return rows
+
+
+@jax.jit
+def _pair_scores(image, truth):
+    rounded, target = round_to_8_bits(image), round_to_8_bits(truth)
+    return {"psnr": psnr(rounded, target), "ssim": ssim(rounded, target), "psnr_float": psnr(image, truth)}
+
+
+def _scores(image, truth):
+    return {key: float(value) for key, value in _pair_scores(jnp.asarray(image), jnp.asarray(truth)).items()}
+
+
+def _mean(values):
+    return float(np.mean(list(values)))
+
+
+def _wait(text, said, seconds):
+    if text != said:
+        print(f"{text}; looking again every {seconds:g} s", file=sys.stderr, flush=True)
+    time.sleep(seconds)
+    return text

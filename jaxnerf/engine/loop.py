@@ -1,0 +1,209 @@
+"""The training loop: resume, step, log, save, stop cleanly."""
+
+import contextlib
+import signal
+import sys
+import threading
+import time
+
+import jax
+import numpy as np
+
+from jaxnerf.core.metrics import decibels
+from jaxnerf.data.batches import live_pixels
+from jaxnerf.engine import build, parallel, records, workdir
+from jaxnerf.engine.checkpoint import Checkpoints
+from jaxnerf.engine.evaluate import evaluate
+from jaxnerf.engine.state import create_state
+from jaxnerf.engine.step import make_train_step
+
+
+def train_and_evaluate(config, folder):
+    """Trains as a configuration says, from the last checkpoint under folder if there is one.
+
+    Args:
+        config: ConfigDict, see configs/default.py.
+        folder: the workdir; made if missing.
+
+    Returns:
+        Whether training came to its end (False: stopped by Ctrl-C or SIGTERM, saved).
+
+    Raises:
+        ValueError: on bad input, or when too many steps in a row were not finite.
+    """
+    experiment = build.build(config)
+    views = experiment.load_views("train")  # before the workdir is made: bad input leaves nothing behind
+    workdir.claim(folder, config)
+    finished = train(experiment, views, folder)
+    if finished and experiment.eval.at_end:
+        evaluate(folder)
+    return finished
+
+
+def train(experiment, views, folder):
+    """Runs the loop of train_and_evaluate on Views that were read; returns whether it came to its end."""
+    options = experiment.train
+    state = create_state(experiment.model, experiment.optimizer, experiment.seed)
+    run, state, data, compile_seconds = _compile(experiment, state, views)
+    checkpoints = Checkpoints(folder, keep=options.keep)
+    if checkpoints.steps():
+        state = checkpoints.load(checkpoints.steps()[-1], state)
+    first = int(state.step)
+    log = records.Records(folder, first_step=first)
+    before = log.rows[-1]["seconds"] if log.rows else 0.0
+    print(_header(experiment, views, state, compile_seconds), file=sys.stderr)
+    progress = records.Progress(options.max_steps)
+    clock = _Clock(before, first * options.batch_size)
+    recent = []
+    with _Interrupt() as interrupt:
+        for step in range(first + 1, options.max_steps + 1):
+            state, metrics = run(state, data)
+            recent.append(metrics)
+            jax.block_until_ready(recent[-2:][0])  # one step in flight, no more: a stop is prompt
+            late = 0 < options.max_seconds <= clock.seconds()
+            last = step == options.max_steps or late or interrupt.caught
+            if step % options.log_every == 0 or last:
+                row = _row(experiment, step, recent, clock, compile_seconds)
+                log.append(row)
+                progress.show(step, _text(row, options, late))
+                recent = []
+                _check_finite(row, options, folder)
+            if step % options.save_every == 0 or last:
+                with clock.paused():
+                    checkpoints.save(state)
+            if last:
+                break
+    progress.close()
+    checkpoints.close()
+    log.close()
+    if interrupt.caught:
+        print(
+            f"stopped at step {int(state.step)} and saved; the same command goes on from there",
+            file=sys.stderr,
+        )
+    return not interrupt.caught
+
+
+def _compile(experiment, state, views):
+    options = experiment.train
+    mode = options.parallel
+    if mode == "auto":
+        mode = "jit" if jax.local_device_count() == 1 else "sharded"
+    started = time.perf_counter()
+    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
+    sizes = {"batch_size": options.batch_size, "block_size": options.block_size}
+    placed = parallel.compile_step(step, state, (views, live_pixels(views)), mode=mode, **sizes)
+    return *placed, time.perf_counter() - started
+
+
+def _row(experiment, step, recent, clock, compile_seconds):
+    """Returns the metrics since the last row: means of the errors, the rest as it stands."""
+    values = {name: np.array([float(metrics[name]) for metrics in recent]) for name in recent[0]}
+    rays = step * experiment.train.batch_size
+    return {
+        "step": step,
+        "seconds": clock.seconds(),
+        "compile_seconds": compile_seconds,
+        "rays": rays,
+        "rays_per_second": clock.rate(rays),
+        "loss": values["loss"].mean(),
+        "psnr_coarse": float(decibels(values["mse_coarse"].mean())),
+        "psnr_fine": float(decibels(values["mse"].mean())),
+        "lr": float(experiment.schedule(step - 1)),
+        "grad_norm": values["grad_norm"][-1],
+        "nonfinite": int(values["nonfinite"][-1]),
+        "nonfinite_in_a_row": int(values["nonfinite_in_a_row"][-1]),
+    }
+
+
+def _text(row, options, late):
+    left = (options.max_steps - row["step"]) * options.batch_size / max(row["rays_per_second"], 1e-9)
+    if options.max_seconds:
+        left = min(left, options.max_seconds - row["seconds"])
+    missed = f"  {row['nonfinite']} steps not finite" if row["nonfinite"] else ""
+    return (
+        f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
+        f"{_minutes(row['seconds'])} done, {_minutes(0.0 if late else left)} left{missed}"
+    )
+
+
+def _minutes(seconds):
+    minutes, seconds = divmod(int(seconds), 60)
+    return f"{minutes}:{seconds:02d}"
+
+
+def _check_finite(row, options, folder):
+    if row["nonfinite_in_a_row"] >= options.max_nonfinite:
+        raise ValueError(
+            f"{folder}: {row['nonfinite_in_a_row']} steps in a row up to {row['step']} had a loss or "
+            f"gradient that is not finite (loss {row['loss']}, gradient norm {row['grad_norm']}, learning rate "
+            f"{row['lr']:.2g}); nothing of them was kept: lower train.lr_init, or check the images and poses"
+        )
+
+
+def _header(experiment, views, state, compile_seconds):
+    """Returns the lines that say once what runs on what."""
+    device = jax.local_devices()[0]
+    counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
+    eyes = np.asarray(views.cameras.to_world)[:, :, 3]
+    near, far = np.min(views.near), np.max(views.far)
+    dtype = jax.tree.leaves(state.params)[0].dtype
+    shares = ", ".join(f"{name} {count:,}" for name, count in counts.items())
+    return "\n".join(
+        [
+            f"device      {jax.local_device_count()} x {device.device_kind} ({device.platform})",
+            f"precision   parameters {dtype}; compiled in {compile_seconds:.1f} s",
+            f"parameters  {sum(counts.values()):,} ({shares})",
+            f"views       {len(views.offset)}, {views.pixels.shape[0]:,} pixels, t from {near:g} to {far:g}",
+            f"cameras     within {_point(eyes.min(0))} to {_point(eyes.max(0))}",
+            f"steps       {int(state.step)} of {experiment.train.max_steps} taken, "
+            f"{experiment.train.batch_size} rays each",
+        ]
+    )
+
+
+def _point(values):
+    return "(" + ", ".join(f"{value:.2f}" for value in values) + ")"
+
+
+class _Clock:
+    """Seconds of training, without compilation and saving, counted on from an earlier start."""
+
+    def __init__(self, seconds, rays):
+        self._started = time.perf_counter() - seconds
+        self._last = (seconds, rays)
+
+    def seconds(self):
+        return time.perf_counter() - self._started
+
+    def rate(self, rays):
+        """Returns rays a second since the last call."""
+        (seconds, before), self._last = self._last, (self.seconds(), rays)
+        return (rays - before) / max(self._last[0] - seconds, 1e-9)
+
+    @contextlib.contextmanager
+    def paused(self):
+        entered = time.perf_counter()
+        yield
+        self._started += time.perf_counter() - entered
+
+
+class _Interrupt:
+    """Turns the first Ctrl-C or SIGTERM into a flag; a second one ends the program as usual."""
+
+    def __enter__(self):
+        self.caught = False
+        self._old = {}
+        if threading.current_thread() is threading.main_thread():  # elsewhere signals are not ours
+            self._old = {
+                number: signal.signal(number, self._catch) for number in (signal.SIGINT, signal.SIGTERM)
+            }
+        return self
+
+    def __exit__(self, *_):
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _catch(self, *_):
+        self.caught = True
+        self.__exit__()

@@ -1,0 +1,72 @@
+"""The one place that knows about devices: the same step under jit, sharded jit and pmap."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+MODES = ("jit", "sharded", "pmap")
+
+
+def compile_step(train_step, state, data, *, batch_size, block_size=0, mode="sharded"):
+    """Returns the step compiled for the local devices, and the state and data placed for it.
+
+    Args:
+        train_step: see step.make_train_step.
+        state: TrainState.
+        data: what the step's draw takes; copied to every device.
+        batch_size: rays a step, over all devices.
+        block_size: rays whose gradient is taken at once; 0: all that a device has.
+        mode: "jit" (one device), "sharded" (jit over a mesh of all devices) or "pmap".
+
+    Returns:
+        run, state, data: run(state, data) -> (state, metrics) consumes its state.
+
+    Raises:
+        ValueError: if the batch does not split evenly, or on an unknown mode.
+    """
+    if mode not in MODES:
+        raise ValueError(f"compile_step: mode is {mode!r}, wanted one of {MODES}")
+    devices = jax.local_devices()[: 1 if mode == "jit" else None]
+    positions = split_positions(batch_size, len(devices), block_size)
+    mesh = Mesh(np.array(devices), ("batch",))
+    everywhere = NamedSharding(mesh, P())
+    if mode == "jit":
+        run, (state, data) = train_step, jax.device_put((state, data), devices[0])
+        run = jax.jit(run, donate_argnums=0)
+        positions = jnp.asarray(positions[0])
+    else:
+        state, data = jax.device_put((state, data), everywhere)
+        step = functools.partial(train_step, axis_name="batch")
+        if mode == "pmap":
+            run = jax.pmap(
+                step, "batch", in_axes=(None, None, 0), out_axes=None, devices=devices, donate_argnums=0
+            )
+        else:
+            # With check_vma the gradient of replicated parameters would be summed once more.
+            sharded = jax.shard_map(
+                lambda state, data, positions: step(state, data, positions[0]),
+                mesh=mesh,
+                in_specs=(P(), P(), P("batch")),
+                out_specs=P(),
+                check_vma=False,
+            )
+            run = jax.jit(sharded, donate_argnums=0)
+            positions = jax.device_put(positions, NamedSharding(mesh, P("batch")))
+    compiled = run.lower(state, data, positions).compile()
+    return lambda state, data: compiled(state, data, positions), state, data
+
+
+def split_positions(batch_size, num_devices, block_size):
+    """Returns [devices, blocks, rays] int32, every place in the batch once, in order."""
+    share, uneven = divmod(batch_size, num_devices)
+    block_size = min(block_size, share) or share
+    if uneven or not share or share % block_size:
+        raise ValueError(
+            f"batch_size {batch_size} on {num_devices} device(s) in blocks of {block_size} rays does not "
+            "come out even; change train.batch_size or train.block_size"
+        )
+    return np.arange(batch_size, dtype=np.int32).reshape(num_devices, share // block_size, block_size)

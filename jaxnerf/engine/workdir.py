@@ -1,0 +1,71 @@
+"""The folder of a run: which configuration it belongs to, files that are whole or not there."""
+
+import json
+import os
+import pathlib
+
+from ml_collections import ConfigDict
+
+# What may change between the starts of one run, as it changes no step that was taken.
+FREE = (
+    "data.dir",
+    "train.max_steps",
+    "train.max_seconds",
+    "train.log_every",
+    "train.save_every",
+    "train.keep",
+)
+FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "eval.")
+
+
+def claim(workdir, config):
+    """Writes the configuration into a new workdir, or checks that an old one belongs to it.
+
+    Raises:
+        ValueError: if the workdir's run had another configuration; names the fields that differ.
+    """
+    path = pathlib.Path(workdir) / "config.json"
+    if path.exists():
+        old, new = _flat(read_config(workdir)), _flat(config)
+        keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
+        fixed = [key for key in keys if not key.startswith(FREE)]
+        if fixed:
+            shown = ", ".join(f"{key} {old.get(key)!r} -> {new.get(key)!r}" for key in fixed[:3])
+            more = f" and {len(fixed) - 3} more" if len(fixed) > 3 else ""
+            raise ValueError(
+                f"{workdir}: belongs to a run with another configuration ({shown}{more}); "
+                "give another --workdir, or the old configuration to go on"
+            )
+    elif (path.parent / "checkpoints").exists():
+        raise ValueError(f"{workdir}: has checkpoints but no config.json; give another --workdir")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, config.to_json_best_effort(indent=2) + "\n")
+
+
+def read_config(workdir):
+    """Returns the configuration of the run in a workdir; ValueError if there is none."""
+    path = pathlib.Path(workdir) / "config.json"
+    try:
+        return ConfigDict(json.loads(path.read_text()))
+    except FileNotFoundError:
+        raise ValueError(
+            f"{path}: no such file, wanted the workdir of a training run; correct --workdir"
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"{path}: malformed JSON ({error}); restore it or train anew") from None
+
+
+def write_text(path, text):
+    """Writes a text file so that it is there whole or not at all."""
+    path = pathlib.Path(path)
+    partial = path.with_name(path.name + ".tmp")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def _flat(config):
+    flat = {}
+    for section, values in json.loads(config.to_json_best_effort()).items():
+        fields = values.items() if isinstance(values, dict) else [(None, values)]
+        flat.update({f"{section}.{key}" if key else section: value for key, value in fields})
+    return flat

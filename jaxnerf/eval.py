@@ -1,0 +1,60 @@
+"""python -m jaxnerf.eval --workdir=DIR: scores a run's checkpoint on held-out views."""
+
+from absl import flags
+from ml_collections import config_flags
+
+from jaxnerf import app
+
+_CONFIG = config_flags.DEFINE_config_file("config", None, "In place of the workdir's own.", lock_config=True)
+_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.")
+_DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
+_SPLIT = flags.DEFINE_string("split", None, "Of the scene; config.eval.split when not given.")
+_STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
+_CHUNK = flags.DEFINE_integer("chunk", None, "Rays at once; config.eval.chunk when not given.", lower_bound=1)
+_WATCH = flags.DEFINE_bool("watch", False, "Score new checkpoints as they come, until training's last step.")
+_POLL = flags.DEFINE_float("poll_seconds", 10.0, "How often --watch looks.", lower_bound=0.01)
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier result.")
+_PREDICTIONS = flags.DEFINE_string(
+    "predictions", None, "Score the images in this folder (or its color/) in place of a run's renderings."
+)
+
+
+def main(argv):
+    del argv
+    from jaxnerf.engine import evaluate, predictions, workdir
+
+    if not (_WORKDIR.value or _PREDICTIONS.value):
+        raise ValueError("nothing to score: give --workdir=DIR of a run, or --predictions=DIR of images")
+    config = _CONFIG.value
+    if config is None and _WORKDIR.value and not _WATCH.value:
+        config = workdir.read_config(_WORKDIR.value)
+    if config is not None:
+        app.use_data_dir(config, _DATA_DIR.value)
+    if _PREDICTIONS.value:
+        results = predictions.score_folder(
+            _PREDICTIONS.value, config=config, split=_SPLIT.value, overwrite=_OVERWRITE.value
+        )
+    elif _WATCH.value:
+        evaluate.watch(
+            _WORKDIR.value,
+            config=config,
+            data_dir=_DATA_DIR.value,
+            split=_SPLIT.value,
+            chunk=_CHUNK.value,
+            poll_seconds=_POLL.value,
+        )
+        return
+    else:
+        results = evaluate.evaluate(
+            _WORKDIR.value,
+            config=config,
+            split=_SPLIT.value,
+            step=_STEP.value,
+            chunk=_CHUNK.value,
+            overwrite=_OVERWRITE.value,
+        )
+    print(evaluate.summary(results))
+
+
+if __name__ == "__main__":
+    app.run(main)

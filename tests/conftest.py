@@ -1,0 +1,41 @@
+"""One CPU, seen by JAX as four devices, for every test; and the real scenes, where there are any."""
+
+import os
+import pathlib
+
+# Both are read once, when JAX starts, so they are set before anything imports it.
+os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ["XLA_FLAGS"] = (
+    f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
+)
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_configure(config):
+    config.addinivalue_line(
+        "markers", "scenes(*names): needs the real scenes below JAXNERF_SCENES, each name a folder there"
+    )
+
+
+def pytest_runtest_setup(item):
+    """Skips when no scenes are offered, but fails when those that were promised are not there."""
+    marker = item.get_closest_marker("scenes")
+    if marker is None:
+        return
+    folder = os.environ.get("JAXNERF_SCENES")
+    if not folder:
+        pytest.skip("JAXNERF_SCENES is unset: it names the folder of the real scenes")
+    for path in [pathlib.Path(folder), *(pathlib.Path(folder) / name for name in marker.args)]:
+        if not path.is_dir():
+            pytest.fail(f"JAXNERF_SCENES is {folder}, but there is no folder {path}", pytrace=False)
+
+
+@pytest.fixture
+def scenes_dir():
+    """The folder of the real scenes; for tests marked `scenes`, which end before this when it is missing."""
+    return pathlib.Path(os.environ["JAXNERF_SCENES"])
