@@ -49,7 +49,7 @@ def get_config():
             },
             "train": {
                 "batch_size": 1024,  # rays a step, over all devices
-                "block_size": 0,  # rays whose gradient is taken at once; 0: all that a device has
+                "block_size": 0,  # rays whose gradient is taken at once; 0: what the device is fastest with
                 "batching": "all_images",  # "all_images", or "single_image": a view a step
                 "parallel": "auto",  # "jit", "sharded", "pmap"; auto: jit on one device, else sharded
                 "max_steps": 200_000,

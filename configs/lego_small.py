@@ -19,7 +19,7 @@ def get_config():
         network.density_activation, network.density_bias = "softplus", -1.0
     config.sampling.num_coarse, config.sampling.num_fine = 32, 32
     train = config.train
-    train.batch_size, train.block_size = 512, 128  # a block's activations fit the cache
+    train.batch_size = 512
     train.max_steps, train.lr_steps, train.max_seconds = 8000, 8000, 600.0
     train.lr_init, train.lr_final, train.warmup_steps, train.beta2 = 5e-3, 2e-4, 50, 0.99
     train.log_every, train.save_every = 100, 1000

@@ -1,6 +1,7 @@
 """The public surface is a contract: names, parameters, docstrings, and what an import costs."""
 
 import inspect
+import pathlib
 import re
 import subprocess
 import sys
@@ -109,5 +110,8 @@ def test_docstring_names_its_source(name):
 def test_import_is_light():
     heavy = ["absl", "ml_collections", "imageio", "flax", "optax"]
     code = f"import sys, jaxnerf; print([name for name in {heavy} if name in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    root = pathlib.Path(__file__).resolve().parent.parent
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
+    )
     assert result.stdout.strip() == "[]"

@@ -26,7 +26,7 @@ def pixel_grid(height, width, *, offset=0.5):
 def undistort(camera, pixels):
     """Returns where the straight rays behind distorted pixels cross the plane at distance 1.
 
-    Newton's method on the lens model; the gradient with respect to pixels, focal, center and
+    Newton's method on the lens model (Brown 1966; Kannala and Brandt 2006); the gradient with respect to pixels, focal, center and
     distortion is that of the exact inverse (one differentiable Newton step from the solution).
 
     Args:

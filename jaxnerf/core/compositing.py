@@ -114,7 +114,8 @@ def expected_depth(weights, t, transmittance, *, far):
     )
     passing = transmittance > 0
     behind = jnp.where(passing, transmittance * jnp.where(passing, far, 0), 0)
-    return (weights * t).sum(axis=-1) + behind
+    seen = weights > 0  # a sample at infinity that has no weight has no place either
+    return (weights * jnp.where(seen, t, 0)).sum(axis=-1) + behind
 
 
 def expected_disparity(weights, t):
@@ -137,11 +138,14 @@ def expected_disparity(weights, t):
 
 
 def _optical_depth(function, density, length):
-    """Returns sigma l, with segments of no length selected out on both sides of the product."""
+    """Returns sigma l, with what counts for nothing selected out on both sides of the product.
+
+    That is a segment of no length, and empty space without an end (0 times inf).
+    """
     density, length = jnp.asarray(density), jnp.asarray(length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))
-    kept = length > 0
-    return jnp.where(kept, jnp.where(kept, density, 0) * length, 0)
+    kept = (length > 0) & ~(jnp.isinf(length) & (density == 0))
+    return jnp.where(kept, jnp.where(kept, density, 0) * jnp.where(kept, length, 0), 0)
 
 
 def _sum_before(x):

@@ -15,12 +15,11 @@ def mse(a, b, *, mask=None):
     """
     a, b = jnp.asarray(a), jnp.asarray(b)
     check_shapes("mse", a=(a, "... H W C"), b=(b, "... H W C"))
-    squares = (a - b) ** 2
     if mask is None:
-        return squares.mean(axis=(-3, -2, -1))
+        return ((a - b) ** 2).mean(axis=(-3, -2, -1))
     check_shapes("mse", a=(a, "... H W C"), mask=(mask, "... H W"))
-    kept = jnp.where(mask[..., None], squares, 0)
-    return kept.sum(axis=(-3, -2, -1)) / (mask.sum(axis=(-2, -1)) * a.shape[-1])
+    kept = jnp.where(mask[..., None], a - b, 0)  # before the square: its gradient must not see the rest
+    return (kept**2).sum(axis=(-3, -2, -1)) / (mask.sum(axis=(-2, -1)) * a.shape[-1])
 
 
 @jax.custom_jvp
@@ -80,24 +79,29 @@ def ssim(a, b):
     bells = [math.exp(-(((i - size // 2) / deviation) ** 2) / 2) for i in range(size)]
     window = [bell / sum(bells) for bell in bells]
 
-    def blur(x):
-        for axis in (-3, -2):
-            valid = x.shape[axis] - size + 1
-            shifted = (jax.lax.slice_in_dim(x, i, i + valid, axis=x.ndim + axis) for i in range(size))
-            x = sum(weight * part for weight, part in zip(window, shifted, strict=True))
-        return x
-
-    # Around a common grey the squares are smaller, and so is what their difference loses.
-    a, b = a - 0.5, b - 0.5
-    mean_a, mean_b = blur(a), blur(b)
-    variance_a = jnp.maximum(blur(a * a) - mean_a**2, 0)
-    variance_b = jnp.maximum(blur(b * b) - mean_b**2, 0)
-    covariance = blur(a * b) - mean_a * mean_b
-    mean_a, mean_b = mean_a + 0.5, mean_b + 0.5
+    # Down, then across: the variance of a window is the mean of its lines' variances plus the variance
+    # of their means. Differences of squares would lose the digits that a white image needs.
+    mean_a, mean_b = a, b
+    variance_a, variance_b, covariance = (jnp.zeros_like(a) for _ in range(3))
+    for axis in (a.ndim - 3, a.ndim - 2):
+        lines = _windows((mean_a, mean_b, variance_a, variance_b, covariance), size, axis)
+        mean_a = sum(w * line[0] for w, line in zip(window, lines, strict=True))
+        mean_b = sum(w * line[1] for w, line in zip(window, lines, strict=True))
+        off = [(line[0] - mean_a, line[1] - mean_b) for line in lines]
+        terms = list(zip(window, lines, off, strict=True))
+        variance_a = sum(w * (line[2] + da * da) for w, line, (da, _) in terms)
+        variance_b = sum(w * (line[3] + db * db) for w, line, (_, db) in terms)
+        covariance = sum(w * (line[4] + da * db) for w, line, (da, db) in terms)
     c1, c2 = 0.01**2, 0.03**2
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
     structure = (2 * covariance + c2) / (variance_a + variance_b + c2)
     return (luminance * structure).mean(axis=(-3, -2, -1))
+
+
+def _windows(arrays, size, axis):
+    """Returns for each place in a window of that size the arrays shifted to it, along an axis."""
+    valid = arrays[0].shape[axis] - size + 1
+    return [[jax.lax.slice_in_dim(x, i, i + valid, axis=axis) for x in arrays] for i in range(size)]
 
 
 def round_to_8_bits(image):

@@ -159,7 +159,7 @@ def render_image(render, rays, *, chunk):
         chunk: rays at once. The last chunk is filled up with copies of the last ray.
 
     Returns:
-        Rendering [H, W] without weights, on the host.
+        Rendering [H, W] without weights.
 
     Raises:
         ValueError: if chunk < 1 or there are no rays.
@@ -173,7 +173,7 @@ def render_image(render, rays, *, chunk):
     for start in range(0, count, chunk):
         index = jnp.minimum(jnp.arange(start, start + chunk), count - 1)
         part = render(jax.tree.map(lambda leaf, index=index: leaf[index], flat))
-        parts.append(jax.device_get(without_weights(part)))
+        parts.append(without_weights(part))
     whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
 

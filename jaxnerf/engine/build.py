@@ -37,6 +37,7 @@ class Experiment(NamedTuple):
     draw: Callable[..., tuple]  # (step, positions, (Views, live)) -> (keys, Batch)
     view_rays: Callable[..., Any]  # (Views, index, pixels) -> Rays
     world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in world units
+    samples_per_ray: int  # of the network that has most
     seed: int
     pixel_offset: float
     train: SimpleNamespace  # the fields of the configuration's section
@@ -69,6 +70,7 @@ def build(config):
         draw=draw,
         view_rays=functools.partial(batches.view_rays, ndc=config.data.ndc),
         world_depth=functools.partial(batches.world_depth, ndc=config.data.ndc),
+        samples_per_ray=config.sampling.num_coarse + config.sampling.num_fine,
         seed=config.seed,
         pixel_offset=config.data.pixel_offset,
         train=SimpleNamespace(**config.train),

@@ -91,8 +91,15 @@ def _compile(experiment, state, views):
         mode = "jit" if jax.local_device_count() == 1 else "sharded"
     started = time.perf_counter()
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
-    sizes = {"batch_size": options.batch_size, "block_size": options.block_size}
-    placed = parallel.compile_step(step, state, (views, live_pixels(views)), mode=mode, **sizes)
+    placed = parallel.compile_step(
+        step,
+        state,
+        (views, live_pixels(views)),
+        batch_size=options.batch_size,
+        block_size=options.block_size,
+        samples_per_ray=experiment.samples_per_ray,
+        mode=mode,
+    )
     return *placed, time.perf_counter() - started
 
 
@@ -137,7 +144,7 @@ def _check_finite(row, options, folder):
         raise ValueError(
             f"{folder}: {row['nonfinite_in_a_row']} steps in a row up to {row['step']} had a loss or "
             f"gradient that is not finite (loss {row['loss']}, gradient norm {row['grad_norm']}, learning rate "
-            f"{row['lr']:.2g}); nothing of them was kept: lower train.lr_init, or check the images and poses"
+            f"{row['lr']:.2g}); nothing of them was kept: lower train.lr_init, or check images and poses"
         )
 
 

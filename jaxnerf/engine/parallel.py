@@ -9,9 +9,10 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 MODES = ("jit", "sharded", "pmap")
+CPU_BLOCK_SAMPLES = 12_288
 
 
-def compile_step(train_step, state, data, *, batch_size, block_size=0, mode="sharded"):
+def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_per_ray=1, mode="sharded"):
     """Returns the step compiled for the local devices, and the state and data placed for it.
 
     Args:
@@ -19,7 +20,9 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, mode="sha
         state: TrainState.
         data: what the step's draw takes; copied to every device.
         batch_size: rays a step, over all devices.
-        block_size: rays whose gradient is taken at once; 0: all that a device has.
+        block_size: rays whose gradient is taken at once. 0: all that a device has, or on a CPU as
+            many as its cache holds the activations of.
+        samples_per_ray: of the largest network, for that choice.
         mode: "jit" (one device), "sharded" (jit over a mesh of all devices) or "pmap".
 
     Returns:
@@ -31,6 +34,7 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, mode="sha
     if mode not in MODES:
         raise ValueError(f"compile_step: mode is {mode!r}, wanted one of {MODES}")
     devices = jax.local_devices()[: 1 if mode == "jit" else None]
+    block_size = block_size or default_block(batch_size // len(devices), samples_per_ray, devices[0].platform)
     positions = split_positions(batch_size, len(devices), block_size)
     mesh = Mesh(np.array(devices), ("batch",))
     everywhere = NamedSharding(mesh, P())
@@ -58,6 +62,15 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, mode="sha
             positions = jax.device_put(positions, NamedSharding(mesh, P("batch")))
     compiled = run.lower(state, data, positions).compile()
     return lambda state, data: compiled(state, data, positions), state, data
+
+
+def default_block(share, samples_per_ray, platform):
+    """Returns how many of a device's share of rays to take the gradient of at once."""
+    if platform != "cpu":
+        return share
+    # Measured by experiments/step_cost.py: beyond some 12,000 rows of activations the cache spills.
+    fitting = max(CPU_BLOCK_SAMPLES // samples_per_ray, 1)
+    return max(size for size in range(1, min(share, fitting) + 1) if share % size == 0) if share else 0
 
 
 def split_positions(batch_size, num_devices, block_size):
