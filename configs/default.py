@@ -28,7 +28,7 @@ def get_config():
             "seed": 0,
             "data": {
                 "format": "synthetic",  # "synthetic" (embedded, rendered once and cached) or "blender"
-                "dir": "",  # the scene's folder; relative to $JAXNERF_SCENES where that is set
+                "dir": "",  # the scene's folder, here or under $JAXNERF_SCENES
                 "factor": 1,  # images are area-averaged down this many times
                 "size": 100,  # px, side of the embedded scene's images
                 "near": 2.0,  # in t; the embedded scene brings its own

@@ -14,13 +14,14 @@ def get_config():
     coarse, fine = config.coarse, config.fine
     # The coarse network only has to say where matter is: no colour by direction, few octaves.
     coarse.depth, coarse.width, coarse.num_freqs, coarse.use_viewdirs = 2, 32, 6, False
-    fine.depth, fine.width, fine.view_width, fine.num_freqs = 4, 64, 64, 8
+    fine.depth, fine.width, fine.view_width, fine.num_freqs = 4, 80, 64, 7
     for network in (coarse, fine):
+        # ReLU would leave some starts black for ever at this learning rate.
         network.density_activation, network.density_bias = "softplus", -1.0
-    config.sampling.num_coarse, config.sampling.num_fine = 32, 32
+    config.sampling.num_coarse, config.sampling.num_fine = 24, 16
     train = config.train
-    train.batch_size = 512
-    train.max_steps, train.lr_steps, train.max_seconds = 8000, 8000, 600.0
-    train.lr_init, train.lr_final, train.warmup_steps, train.beta2 = 5e-3, 2e-4, 50, 0.99
-    train.log_every, train.save_every = 100, 1000
+    train.batch_size = 256
+    train.max_steps, train.lr_steps, train.max_seconds = 40_000, 22_000, 600.0
+    train.lr_init, train.lr_final, train.warmup_steps, train.beta2 = 8e-3, 3e-4, 50, 0.99
+    train.log_every, train.save_every = 200, 2000
     return config

@@ -2,14 +2,16 @@
 
     python experiments/step_cost.py [--config=configs/blender_paper.py]
 
-Prints, from one process: the time of the step (batch 1024, both networks, Adam) for several block
-sizes; the time of a plain chain of the same matrix products, forward and backward, at its best block
-of rows and best layout; their ratio; and, from a fresh process, the time from start to first step.
+Prints, from one process and in turn: the time of a plain chain of the step's matrix products, forward
+and backward, at its best block of rows and best layout; the time of the step (batch 1024, both networks,
+Adam) for several block sizes; the median of their ratios; and, from a fresh process, the time from start
+to first step.
 The embedded scene stands in for the images, whose reading is not the step's cost.
 """
 
 import importlib.util
 import os
+import statistics
 import subprocess
 import sys
 import time
@@ -35,23 +37,28 @@ def main(argv):
         run, state, data = _compiled(experiment, views, 0)
         jax.block_until_ready(run(state, data))
         return
-    rays, coarse = config.train.batch_size, config.sampling.num_coarse
-    fine = coarse + config.sampling.num_fine
-    share = parallel.default_block(rays, fine, jax.default_backend())
-    print(f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')!r}")
-    chains = {}
-    for rows in (1024, 2048, 4096, 8192, 16384, 32768):
-        for layout in ("rows first", "features first"):
-            seconds, products = _chain_seconds(config, rays * coarse, rays * fine, rows, layout)
-            chains[rows, layout] = seconds
-            print(f"chain of products, blocks of {rows:>6} rows, {layout:<14}: {seconds:7.3f} s, "
-                  f"{products / seconds / 1e9:6.1f} GFLOP/s")  # fmt: skip
-    best = min(chains.values())
-    for block in sorted({16, 32, 64, 128, 256, share}):
-        seconds = _step_seconds(experiment, views, block)
-        mark = "  <- the default" if block == share else ""
-        print(f"training step, {rays} rays in blocks of {block:>4}: {seconds:7.3f} s, {rays / seconds:6.0f} rays/s, "
-              f"{100 * best / seconds:5.1f} % of the best chain{mark}")  # fmt: skip
+    flags_set = os.environ.get("XLA_FLAGS", "")
+    print(f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores, XLA_FLAGS={flags_set!r}")
+    rays = config.train.batch_size
+    share = parallel.default_block(rays, experiment.samples_per_ray, jax.default_backend())
+    chains = {
+        (rows, layout): _chain(config, rows, layout)
+        for layout in ("rows first", "features first")
+        for rows in (2048, 4096, 8192, 12288, 16384, 32768)
+    }
+    best = min(chains, key=lambda key: min(_seconds(chains[key]) for _ in range(2)))
+    flops = _flops(config)
+    print(f"best chain of products: blocks of {best[0]} rows, {best[1]}")
+    for block in sorted({32, 64, 128, share}):
+        step = _step(experiment, views, block)
+        pairs = [(_seconds(chains[best]), _seconds(step)) for _ in range(_REPEATS.value)]
+        chain, seconds = (statistics.median(times) for times in zip(*pairs, strict=True))
+        ratio = statistics.median(a / b for a, b in pairs)
+        print(
+            f"step of {rays} rays in blocks of {block:>3}: {seconds:6.3f} s, {rays / seconds:5.0f} rays/s; "
+            f"chain {chain:6.3f} s, {flops / chain / 1e9:5.1f} GFLOP/s; ratio {100 * ratio:5.1f} %"
+            + ("  <- the default" if block == share else "")
+        )
     started = time.perf_counter()
     subprocess.run([sys.executable, *sys.argv, "--first_step"], check=True)
     print(f"from process start to the end of the first step: {time.perf_counter() - started:.1f} s")
@@ -74,73 +81,100 @@ def _compiled(experiment, views, block):
     return parallel.compile_step(step, state, (views, None), samples_per_ray=samples, mode="jit", **sizes)
 
 
-def _step_seconds(experiment, views, block):
+def _step(experiment, views, block):
+    """Returns a function that takes one training step."""
     run, state, data = _compiled(experiment, views, block)
-    times = []
-    for _ in range(_REPEATS.value + 1):
-        started = time.perf_counter()
-        state, _ = jax.block_until_ready(run(state, data))
-        times.append(time.perf_counter() - started)
-    return min(times[1:])
+    states = [state]
+
+    def once():
+        states[0], metrics = run(states[0], data)
+        return metrics
+
+    return once
 
 
-def _chain_seconds(config, coarse_samples, fine_samples, rows, layout):
-    """Returns seconds and FLOPs of the products of both networks over all samples, in blocks of rows."""
-    total, flops = 0.0, 0.0
-    for network, samples in ((config.coarse, coarse_samples), (config.fine, fine_samples)):
+def _chain(config, rows, layout):
+    """Returns a function that makes the products of both networks over all samples, in blocks of rows."""
+    parts = []
+    for network, samples in _networks(config):
         sizes = _layers(network)
-        blocks = -(-samples // rows)
         keys = jax.random.split(jax.random.key(0), len(sizes))
-        kernels = [jax.random.normal(key, size) / 16 for key, size in zip(keys, sizes, strict=True)]
-        inputs = {size: jnp.ones((rows, size) if layout == "rows first" else (size, rows)) for size in
-                  {side for pair in sizes for side in pair}}  # fmt: skip
-        chain = jax.jit(_chain, static_argnums=(2, 3))
-        times = []
-        for _ in range(_REPEATS.value + 1):
-            started = time.perf_counter()
-            jax.block_until_ready(chain(kernels, inputs, blocks, layout))
-            times.append(time.perf_counter() - started)
-        total += min(times[1:])
-        # Forward, gradient of the kernel, gradient of the input (not of the first: nothing is behind it).
-        flops += blocks * rows * sum(2 * a * b * (2 if i == 0 else 3) for i, (a, b) in enumerate(sizes))
-    return total, flops
+        kernels = {
+            name: jax.random.normal(key, size) / 16
+            for key, (name, size) in zip(keys, sizes.items(), strict=True)
+        }
+        encoded = sizes["trunk_0"][0]
+        x = jnp.ones((rows, encoded) if layout == "rows first" else (encoded, rows))
+        parts.append((kernels, x, -(-samples // rows)))
+    chain = jax.jit(_products, static_argnums=(2, 3))
+    return lambda: [chain(kernels, x, blocks, layout) for kernels, x, blocks in parts]
+
+
+def _seconds(function):
+    """Returns how long a call takes, after a first one that may compile."""
+    if function not in _warm:
+        jax.block_until_ready(function())
+        _warm.add(function)
+    started = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - started
+
+
+_warm = set()
+
+
+def _networks(config):
+    rays, coarse = config.train.batch_size, config.sampling.num_coarse
+    return (config.coarse, rays * coarse), (config.fine, rays * (coarse + config.sampling.num_fine))
+
+
+def _flops(config):
+    """Returns the operations of all products: forward, gradient of the kernel, gradient of the input.
+
+    The first layer and the skip have no gradient of the input: nothing learned lies behind it.
+    """
+    total = 0
+    for network, samples in _networks(config):
+        for name, (a, b) in _layers(network).items():
+            total += samples * 2 * a * b * (2 if name in ("trunk_0", "skip") else 3)
+    return total
 
 
 def _layers(network):
-    """Returns (inputs, outputs) of each product that is made for every sample."""
+    """Returns (inputs, outputs) of each product that is made for every sample, by name."""
     encoded, width = 3 * (1 + 2 * network.num_freqs), network.width
-    trunk = [(encoded, width)] + [(width, width)] * (network.depth - 1)
-    skip = [(encoded, width)] if network.skip_layer + 1 < network.depth else []
-    head = [(width, width), (width, network.view_width), (network.view_width, 3)] if network.use_viewdirs else []
-    return trunk + skip + [(width, 1)] + (head or [(width, 3)])
+    layers = {f"trunk_{i}": (width if i else encoded, width) for i in range(network.depth)}
+    if network.skip_layer + 1 < network.depth:
+        layers["skip"] = (encoded, width)
+    layers["density"] = (width, 1)
+    if network.use_viewdirs:
+        layers |= {"bottleneck": (width, width), "view": (width, network.view_width)}
+    return layers | {"rgb": (network.view_width if network.use_viewdirs else width, 3)}
 
 
-def _chain(kernels, inputs, blocks, layout):
-    """Every product of a forward and a backward pass, and nothing between them."""
+def _products(kernels, x, blocks, layout):
+    """The forward and backward pass of the network without anything between its products."""
 
-    def product(kernel, x):
-        return x @ kernel if layout == "rows first" else jnp.tensordot(kernel, x, axes=(0, 0))
+    def product(kernel, value):
+        return value @ kernel if layout == "rows first" else jnp.tensordot(kernel, value, axes=(0, 0))
 
-    def back(kernel, g):
-        return g @ kernel.T if layout == "rows first" else jnp.tensordot(kernel, g, axes=(1, 0))
-
-    def gradient(x, g):
-        return x.T @ g if layout == "rows first" else jnp.tensordot(x, g, axes=(1, 1))
+    def forward(kernels, x):
+        hidden, depth = x, sum(name.startswith("trunk") for name in kernels)
+        for layer in range(depth):
+            hidden = product(kernels[f"trunk_{layer}"], hidden)
+            if layer == depth - 3 and "skip" in kernels:
+                hidden = hidden + product(kernels["skip"], x)
+        density = product(kernels["density"], hidden)
+        for name in ("bottleneck", "view", "rgb"):
+            hidden = product(kernels[name], hidden) if name in kernels else hidden
+        return density, hidden
 
     def block(total, _):
-        grads = []
-        keep = 0.0
-        for index, kernel in enumerate(kernels):
-            # Each block's operands differ, so that no product can be left out or moved out of the loop.
-            x = inputs[kernel.shape[0]] + total[0][0, 0]
-            g = inputs[kernel.shape[1]] + total[0][0, 0]
-            forward = product(kernel, x)
-            keep += forward[0, 0] if index == 0 else forward[0, 0] + back(kernel, g)[0, 0]
-            grads.append(gradient(x, g))
-        return [old + new + keep for old, new in zip(total, grads, strict=True)], None
+        # Each block's input differs, so that no product can be moved out of the loop.
+        outputs, pull = jax.vjp(lambda kernels: forward(kernels, x + total["density"][0, 0]), kernels)
+        return jax.tree.map(jnp.add, total, *pull(outputs)), None
 
-    zeros = [jnp.zeros_like(kernel) for kernel in kernels]
-    return jax.lax.scan(block, zeros, length=blocks)[0]
+    return jax.lax.scan(block, jax.tree.map(jnp.zeros_like, kernels), length=blocks)[0]
 
 
 if __name__ == "__main__":

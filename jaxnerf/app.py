@@ -5,9 +5,12 @@ import sys
 from absl import app, flags, logging
 
 
-def run(main):
-    """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line."""
-    app.run(_without_traceback(main), flags_parser=_parse)
+def run(main, *, positional=False):
+    """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line.
+
+    positional: whether arguments without a flag are taken, as argv[1:].
+    """
+    app.run(_without_traceback(main, positional), flags_parser=_parse)
 
 
 def use_data_dir(config, data_dir):
@@ -29,14 +32,16 @@ def _parse(argv):
         _leave(2, error)
 
 
-def _without_traceback(main):
+def _without_traceback(main, positional):
     def wrapped(argv):
         try:
-            if len(argv) > 1:
+            if len(argv) > 1 and not positional:
                 raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
             return main(argv)
         except (ValueError, OSError) as error:
             _leave(1, error)
+        except KeyboardInterrupt:
+            _leave(130, "stopped before there was anything to save; the same command starts again")
 
     return wrapped
 

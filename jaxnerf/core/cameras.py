@@ -26,8 +26,9 @@ def pixel_grid(height, width, *, offset=0.5):
 def undistort(camera, pixels):
     """Returns where the straight rays behind distorted pixels cross the plane at distance 1.
 
-    Newton's method on the lens model (Brown 1966; Kannala and Brandt 2006); the gradient with respect to pixels, focal, center and
-    distortion is that of the exact inverse (one differentiable Newton step from the solution).
+    Newton's method on the lens model (Brown 1966; Kannala and Brandt 2006). The gradient with respect
+    to pixels, focal, center and distortion is that of the exact inverse: one differentiable Newton
+    step from the solution.
 
     Args:
         camera: one Camera. Its lens is "pinhole"; "opencv" with distortion (k1, k2, p1, p2) or

@@ -125,11 +125,7 @@ def load_views(data, split):
     """Returns the Views of a split, as the data section of a configuration describes them."""
     if data.format == "synthetic":
         return synthetic.load_views(split=split, size=data.size)
-    folder = pathlib.Path(os.environ.get("JAXNERF_SCENES", ""), data.dir)
-    if not data.dir or not folder.is_dir():
-        raise ValueError(
-            f"data.dir is {data.dir!r}: no folder {str(folder)!r}; give the scene's folder with --data_dir"
-        )
+    folder = _scene_folder(data.dir)
     if data.format == "blender":
         return blender.load_views(
             folder,
@@ -142,6 +138,19 @@ def load_views(data, split):
     if data.format == "llff":
         return llff.load_views(folder, split=split, factor=data.factor)
     raise ValueError(f"data.format is {data.format!r}, wanted 'synthetic', 'blender' or 'llff'")
+
+
+def _scene_folder(name):
+    """Returns the folder of that name here, or else under $JAXNERF_SCENES."""
+    scenes = os.environ.get("JAXNERF_SCENES")
+    places = [pathlib.Path(name)] + ([pathlib.Path(scenes, name)] if scenes else [])
+    found = [place for place in places if name and place.is_dir()]
+    if not found:
+        looked = " or ".join(str(place.absolute()) for place in places) if name else "no name"
+        raise ValueError(
+            f"data.dir is {name!r}, looked at {looked}: no such folder; give one with --data_dir"
+        )
+    return found[0]
 
 
 def _background(data):

@@ -55,8 +55,9 @@ def train(experiment, views, folder):
     progress = records.Progress(options.max_steps)
     clock = _Clock(before, first * options.batch_size)
     recent = []
+    done = first >= options.max_steps or 0 < options.max_seconds <= before
     with _Interrupt() as interrupt:
-        for step in range(first + 1, options.max_steps + 1):
+        for step in range(first + 1, first + 1 if done else options.max_steps + 1):
             state, metrics = run(state, data)
             recent.append(metrics)
             jax.block_until_ready(recent[-2:][0])  # one step in flight, no more: a stop is prompt
@@ -143,8 +144,9 @@ def _check_finite(row, options, folder):
     if row["nonfinite_in_a_row"] >= options.max_nonfinite:
         raise ValueError(
             f"{folder}: {row['nonfinite_in_a_row']} steps in a row up to {row['step']} had a loss or "
-            f"gradient that is not finite (loss {row['loss']}, gradient norm {row['grad_norm']}, learning rate "
-            f"{row['lr']:.2g}); nothing of them was kept: lower train.lr_init, or check images and poses"
+            f"gradient that is not finite (loss {row['loss']}, gradient norm {row['grad_norm']}, "
+            f"learning rate {row['lr']:.2g}); nothing of them was kept: lower train.lr_init, or check "
+            "images and poses"
         )
 
 

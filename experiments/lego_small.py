@@ -1,0 +1,36 @@
+"""PSNR against minutes of training: the table for configs/lego_small.py on the real lego scene.
+
+    JAXNERF_SCENES=... python experiments/lego_small.py --workdir=runs/lego_small [--minutes=2,5,10]
+
+Trains to each time in turn, resuming from the one before, scores the 25 test views there, and prints
+the table. Seconds are of training; compilation stands beside them.
+"""
+
+from absl import flags
+from ml_collections import config_flags
+
+from jaxnerf import app
+
+_CONFIG = config_flags.DEFINE_config_file("config", "configs/lego_small.py", "The run.", lock_config=True)
+_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
+_MINUTES = flags.DEFINE_list("minutes", ["2", "5", "10"], "Of training, ascending.")
+
+
+def main(argv):
+    """Trains and scores at each of the times."""
+    del argv
+    from experiments import table
+    from jaxnerf.engine.evaluate import evaluate
+    from jaxnerf.engine.loop import train_and_evaluate
+
+    config = _CONFIG.value
+    for minutes in map(float, _MINUTES.value):
+        config.train.max_seconds = 60 * minutes
+        if not train_and_evaluate(config, _WORKDIR.value):
+            return
+        evaluate(_WORKDIR.value, overwrite=True)
+    table.main(["", _WORKDIR.value])
+
+
+if __name__ == "__main__":
+    app.run(main)

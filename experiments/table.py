@@ -1,0 +1,68 @@
+"""The table of measured results, from the results.json files under workdirs.
+
+    python experiments/table.py WORKDIR ... [--readme=README.md]
+
+Prints one row a scored checkpoint. With --readme the table in that file between the lines
+<!-- results --> and <!-- end of results --> is replaced.
+"""
+
+import json
+import pathlib
+
+from absl import flags
+
+from jaxnerf import app
+from jaxnerf.engine.workdir import write_text
+
+_README = flags.DEFINE_string("readme", None, "File whose table is replaced.")
+MARKS = ("<!-- results -->", "<!-- end of results -->")
+HEADS = ("run", "step", "training", "compiling", "PSNR", "SSIM", "views", "s a frame", "parameters")
+
+
+def main(argv):
+    """Prints the table of the workdirs named on the command line."""
+    paths = sorted(path for folder in argv[1:] for path in pathlib.Path(folder).glob("eval/*/results.json"))
+    if not paths:
+        raise ValueError(
+            f"{argv[1:]}: no eval/*/results.json; run python -m jaxnerf.eval --workdir=... first"
+        )
+    rows = [row(path) for path in sorted(paths, key=lambda path: (path.parts[:-2], int_prefix(path)))]
+    lines = ["| " + " | ".join(cells) + " |" for cells in (HEADS, ["---"] * len(HEADS), *rows)]
+    print("\n".join(lines))
+    if _README.value:
+        replace(pathlib.Path(_README.value), lines)
+
+
+def row(path):
+    """Returns the cells of one results.json."""
+    results = json.loads(path.read_text())
+    run = path.parts[-4] + ("" if path.parent.name.isdigit() else f" ({path.parent.name.split('-')[1]})")
+    return (
+        run,
+        f"{results['step']:,}",
+        f"{results['training_seconds'] / 60:.1f} min",
+        f"{results['compile_seconds']:.0f} s",
+        f"{results['psnr']:.2f} dB",
+        f"{results['ssim']:.3f}",
+        str(results["views"]),
+        f"{results['seconds_per_frame']:.2f}",
+        f"{results['parameters']:,}",
+    )
+
+
+def int_prefix(path):
+    return int(path.parent.name.split("-")[0])
+
+
+def replace(readme, lines):
+    """Replaces what lies between the marks of a file."""
+    text = readme.read_text()
+    if any(mark not in text for mark in MARKS):
+        raise ValueError(f"{readme}: lacks the lines {MARKS}; add them where the table shall stand")
+    head, rest = text.split(MARKS[0], 1)
+    tail = rest.split(MARKS[1], 1)[1]
+    write_text(readme, head + MARKS[0] + "\n" + "\n".join(lines) + "\n" + MARKS[1] + tail)
+
+
+if __name__ == "__main__":
+    app.run(main, positional=True)

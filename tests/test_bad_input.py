@@ -1,0 +1,199 @@
+"""What a user can get wrong costs one line, a code that is not 0, and no file."""
+
+import errno
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+from runs import SMOKE_FLAGS, run, smoke_config
+
+from jaxnerf.engine import pictures, workdir
+from jaxnerf.engine.checkpoint import Checkpoints
+from jaxnerf.engine.evaluate import evaluate
+from jaxnerf.engine.loop import train_and_evaluate
+from jaxnerf.engine.records import read_rows
+
+pytest_plugins = ["engine_fixtures"]
+
+SCENE = ("--config.data.format=blender", "--config.data.dir=nowhere")
+
+
+def files(folder):
+    """Returns the content of every file under a folder."""
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def assert_one_line(result, *parts, code):
+    found, out, err = result
+    lines = err.splitlines()
+    assert found == code, err
+    assert len(lines) == 1 and lines[0].startswith("error: "), err
+    for part in parts:
+        assert part in lines[0]
+
+
+@pytest.mark.parametrize(
+    "flags, part",
+    [
+        (["--config=configs/nothing.py"], "nothing.py"),
+        ([SMOKE_FLAGS[0], "--colour=red"], "colour"),
+        ([SMOKE_FLAGS[0], "--config.train.batchsize=2"], "batchsize"),
+        ([SMOKE_FLAGS[0], "--config.train.batch_size=1.5"], "batch_size"),
+        ([SMOKE_FLAGS[0], *SCENE], "nowhere"),
+        ([SMOKE_FLAGS[0], "more"], "more"),
+        ([], "config"),
+    ],
+)
+def test_a_wrong_command_line_makes_no_workdir(tmp_path, flags, part):
+    code = 1 if part in ("nowhere", "more") else 2
+    assert_one_line(run("train", f"--workdir={tmp_path / 'run'}", *flags), part, code=code)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_configuration_that_is_no_python_is_named(tmp_path):
+    (tmp_path / "wrong.py").write_text("def get_config(:\n")
+    assert_one_line(
+        run("train", f"--workdir={tmp_path}/run", f"--config={tmp_path}/wrong.py"), "wrong.py", code=2
+    )
+
+
+def test_evaluating_an_empty_folder_leaves_it_empty(tmp_path):
+    assert_one_line(run("eval", f"--workdir={tmp_path}"), "config.json: no such file", code=1)
+    assert files(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    "text", ['{"seed": 0, "data": {"for', "[1]", "{}", '"text"', '{"seed": 0, "data": 3}']
+)
+def test_a_corrupt_config_is_named(trained, tmp_path, text):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    (folder / "config.json").write_text(text)
+    before = files(folder)
+    for program in (evaluate, lambda folder: train_and_evaluate(smoke_config(), folder)):
+        with pytest.raises(ValueError, match="config.json|another configuration"):
+            program(folder)
+    assert files(folder) == before
+
+
+def test_a_workdir_of_another_configuration_is_left_alone(trained):
+    before = files(trained)
+    config = smoke_config(batch_size=32)
+    config.fine.width = 32
+    with pytest.raises(
+        ValueError, match="belongs to a run with another .*fine.width 16 -> 32.*batch_size 64 -> 32"
+    ):
+        train_and_evaluate(config, trained)
+    assert files(trained) == before
+    assert_one_line(
+        run("train", f"--workdir={trained}", *SMOKE_FLAGS, "--config.seed=1"), "seed 0 -> 1", code=1
+    )
+    assert files(trained) == before
+
+
+def blender_scene(folder, frames=1):
+    pose = np.eye(4)
+    pose[2, 3] = 4
+    for split, count in (("train", frames), ("test", 0)):
+        entries = [{"file_path": f"./{split}_{i}", "transform_matrix": pose.tolist()} for i in range(count)]
+        (folder / f"transforms_{split}.json").write_text(
+            json.dumps({"camera_angle_x": 0.7, "frames": entries})
+        )
+        for i in range(count):
+            Image.new("RGBA", (12, 12), (200, 100, 0, 128)).save(folder / f"{split}_{i}.png")
+    return folder
+
+
+def scene_config(folder, **data):
+    config = smoke_config(max_steps=1)
+    config.data.update({"format": "blender", "dir": str(folder), **data})
+    return config
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        ({"near": 6.0, "far": 2.0}, "near"),
+        ({"near": 2.0, "far": 2.0}, "near"),
+        ({"factor": 5}, "factor 5 does not divide"),
+        ({"format": "nerf"}, "data.format is 'nerf'"),
+        ({"dir": ""}, "data.dir is ''"),
+    ],
+)
+def test_a_scene_that_does_not_fit_makes_no_workdir(tmp_path, data, message):
+    blender_scene(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        train_and_evaluate(scene_config(tmp_path, **data), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_empty_split_is_named(tmp_path):
+    with pytest.raises(ValueError, match="transforms_train.json"):
+        train_and_evaluate(scene_config(blender_scene(tmp_path, frames=0)), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("batch_size", [0, -64, 62])
+def test_a_batch_that_does_not_split_makes_no_workdir(tmp_path, batch_size):
+    with pytest.raises(ValueError, match=f"batch_size {batch_size} .*change train.batch_size"):
+        train_and_evaluate(smoke_config(batch_size=batch_size), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def full(*args, **options):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_disk_full_of_text_keeps_the_old_file(tmp_path):
+    (tmp_path / "config.json").write_text("old")
+    os.symlink("/dev/full", tmp_path / "config.json.tmp")  # every write to it says that the disk is full
+    with pytest.raises(OSError, match="No space left"):
+        workdir.write_text(tmp_path / "config.json", "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+    assert (tmp_path / "config.json").read_text() == "old"
+
+
+def test_a_disk_full_of_pictures_keeps_the_old_scores(trained, tmp_path, monkeypatch):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    (folder / "eval" / "20").mkdir(parents=True)
+    (folder / "eval" / "20" / "results.json").write_text("{}")
+    before = files(folder)
+    monkeypatch.setattr(pictures, "write_sheet", full)
+    for options in ({"step": 15}, {"overwrite": True}):
+        with pytest.raises(OSError, match="No space left"):
+            evaluate(folder, **options)
+    assert files(folder) == before
+
+
+def test_a_disk_full_of_checkpoints_keeps_the_whole_ones(trained, tmp_path):
+    """On a real small disk, where this may be mounted."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=320k", "none", disk], capture_output=True)
+    if mounted.returncode:
+        pytest.skip(f"no disk may be mounted here: {mounted.stderr.decode().strip()}")
+    try:
+        result = run(
+            "train",
+            f"--workdir={disk}/run",
+            *SMOKE_FLAGS,
+            "--config.train.keep=100",
+            "--config.train.max_steps=1000",
+        )
+        assert result[0] == 1
+        assert "Traceback" not in result[2]
+        assert (
+            result[2].splitlines()[-1].startswith("error: ") and "space" in result[2].splitlines()[-1].lower()
+        )
+        steps = Checkpoints(disk / "run").steps()
+        assert steps and steps == list(range(5, steps[-1] + 1, 5))
+        kept = shutil.copytree(disk / "run", tmp_path / "kept")
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+    assert train_and_evaluate(smoke_config(keep=100, max_steps=steps[-1] + 5), kept)
+    assert [row["step"] for row in read_rows(kept)] == list(range(5, steps[-1] + 6, 5))
+    assert not list(pathlib.Path(kept).rglob("*.tmp"))

@@ -1,0 +1,154 @@
+"""A run that was stopped, politely or not, ends where an uninterrupted one does."""
+
+import functools
+import itertools
+import json
+import os
+import shutil
+import signal
+import time
+
+import jax
+import numpy as np
+import pytest
+from runs import SMOKE_FLAGS, smoke_config, start
+
+from jaxnerf import load_scene, pixel_grid, render_image
+from jaxnerf.engine import records
+from jaxnerf.engine.checkpoint import Checkpoints
+from jaxnerf.engine.load import open_run
+from jaxnerf.engine.loop import train_and_evaluate
+
+pytest_plugins = ["engine_fixtures"]
+
+
+def params(folder, step):
+    return jax.device_get(open_run(folder).params(step))
+
+
+def logged_steps(folder):
+    return [json.loads(line)["step"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def wait_for_step(folder, process, step):
+    """Returns when metrics.jsonl shows the step."""
+    deadline = time.time() + 100
+    while not any(row["step"] >= step for row in records.read_rows(folder)):
+        assert process.poll() is None, process.communicate()[1]
+        assert time.time() < deadline
+        time.sleep(0.01)
+
+
+def long_run(folder):
+    """Starts a run that does not end by itself."""
+    flags = [*SMOKE_FLAGS, "--config.train.max_steps=1000000", "--config.train.log_every=1"]
+    return start("train", f"--workdir={folder}", *flags)
+
+
+@pytest.fixture(scope="module")
+def killed(compiled_once, tmp_path_factory):
+    """The workdir of a run that was killed past its checkpoint of step 10."""
+    folder = tmp_path_factory.mktemp("killed") / "run"
+    process = long_run(folder)
+    wait_for_step(folder, process, 12)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    process.communicate()
+    return folder
+
+
+def test_a_killed_run_goes_on_bit_for_bit(killed, tmp_path):
+    assert not any(name.startswith("eval") for name in os.listdir(killed))
+    last = max(Checkpoints(killed).steps())
+    end = last + 10
+    assert last >= 10
+    with (killed / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 12, "sec')  # as a kill inside a write leaves it
+    options = {"log_every": 1, "max_steps": end}
+    assert train_and_evaluate(smoke_config(**options), killed)
+    assert train_and_evaluate(smoke_config(**options), tmp_path / "whole")
+    assert_equal(params(killed, end), params(tmp_path / "whole", end))
+    assert logged_steps(killed) == list(range(1, end + 1))
+    whole, parts = records.read_rows(tmp_path / "whole"), records.read_rows(killed)
+    for name in ("loss", "psnr_fine", "lr", "grad_norm", "rays"):
+        assert [row[name] for row in parts] == [row[name] for row in whole], name
+    seconds = [row["seconds"] for row in parts]
+    assert all(a < b for a, b in itertools.pairwise(seconds))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_and_leaves_in_peace(compiled_once, tmp_path, number):
+    folder = tmp_path / "run"
+    process = long_run(folder)
+    wait_for_step(folder, process, 7)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "Traceback" not in err
+    last = max(Checkpoints(folder).steps())
+    assert logged_steps(folder) == list(range(1, last + 1))
+    assert err.splitlines()[-1] == f"stopped at step {last} and saved; the same command goes on from there"
+
+
+def test_the_last_few_checkpoints_are_kept(trained):
+    assert Checkpoints(trained).steps() == [10, 15, 20]
+    assert logged_steps(trained) == [5, 10, 15, 20]
+
+
+def test_a_finished_run_is_left_as_it_is(trained, tmp_path, capsys):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    before = params(folder, 20)
+    assert train_and_evaluate(smoke_config(), folder)
+    assert "20 of 20 taken" in capsys.readouterr().err
+    assert Checkpoints(folder).steps() == [10, 15, 20]
+    assert logged_steps(folder) == [5, 10, 15, 20]
+    assert_equal(params(folder, 20), before)
+
+
+def test_a_limit_of_seconds_is_not_passed_again_and_again(trained, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    for _ in range(2):
+        assert train_and_evaluate(smoke_config(max_steps=100, max_seconds=1e-3), folder)
+    assert Checkpoints(folder).steps()[-1] == 20
+
+
+def test_a_broken_checkpoint_is_named_and_nothing_is_lost(trained, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    for path in (folder / "checkpoints" / "20" / "state").rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    with pytest.raises(ValueError, match="checkpoints/20: cannot be read .*remove it"):
+        train_and_evaluate(smoke_config(max_steps=25), folder)
+    assert Checkpoints(folder).steps() == [10, 15, 20]
+    shutil.rmtree(folder / "checkpoints" / "20")
+    assert train_and_evaluate(smoke_config(), folder)
+    assert_equal(params(folder, 20), params(trained, 20))
+    assert logged_steps(folder) == [5, 10, 15, 20]
+
+
+def test_load_scene_gives_the_model_to_other_code(trained):
+    scene, render = load_scene(trained)
+    opened = open_run(trained)
+    views, weights = opened.experiment.load_views("test"), opened.params(20)
+    rays = opened.experiment.view_rays(views, 1, pixel_grid(24, 24))
+    wanted = render_image(functools.partial(opened.render, weights), rays, chunk=250)
+    assert_equal(render_image(render, rays, chunk=250), wanted)
+    points = np.random.default_rng(0).normal(size=(5, 4, 3)).astype(np.float32)
+    answer = jax.jit(scene)(points, points[:, :1])
+    assert [value.shape for value in answer] == [(5, 4), (5, 4, 3)]
+    assert_equal(answer, jax.jit(opened.experiment.model.scene(weights))(points, points[:, :1]))
+
+
+def test_another_checkpoint_compiles_nothing(trained):
+    opened = open_run(trained)
+    rays = opened.experiment.view_rays(opened.experiment.load_views("test"), 0, pixel_grid(24, 24))
+    images = [
+        render_image(lambda rays, step=step: opened.render(opened.params(step), rays), rays, chunk=250)
+        for step in (10, 20)
+    ]
+    assert opened.render._cache_size() == 1
+    assert np.abs(images[0].rgb - images[1].rgb).max() > 1e-4
