@@ -16,7 +16,7 @@ def get_config():
     coarse.depth, coarse.width, coarse.num_freqs, coarse.use_viewdirs = 2, 32, 6, False
     fine.depth, fine.width, fine.view_width, fine.num_freqs = 4, 80, 64, 7
     for network in (coarse, fine):
-        # ReLU would leave some starts black for ever at this learning rate.
+        # A ReLU that has died cannot come back, and this learning rate is high.
         network.density_activation, network.density_bias = "softplus", -1.0
     config.sampling.num_coarse, config.sampling.num_fine = 24, 16
     train = config.train

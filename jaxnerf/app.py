@@ -24,11 +24,20 @@ def _parse(argv):
     try:
         rest = flags.FLAGS(argv)
         if not flags.FLAGS["verbosity"].present:
-            logging.set_verbosity(logging.WARNING)  # orbax tells of every file it touches
+            logging.set_verbosity(logging.FATAL)  # orbax tells of every file it touches
         return rest
     except AttributeError as error:
         _leave(2, f"the configuration has no such field ({error}); configs/default.py lists them all")
-    except (flags.Error, KeyError, TypeError, ValueError, OSError, ImportError) as error:
+    except (
+        flags.Error,
+        KeyError,
+        TypeError,
+        ValueError,
+        OSError,
+        ImportError,
+        SyntaxError,
+        NameError,
+    ) as error:
         _leave(2, error)
 
 

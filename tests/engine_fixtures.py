@@ -3,9 +3,9 @@
 import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
-from runs import smoke_config
 
 from jaxnerf.engine.loop import train_and_evaluate
+from runs import smoke_config
 
 _OPTIONS = {"jax_persistent_cache_min_compile_time_secs": 0.5}
 

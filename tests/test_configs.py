@@ -7,10 +7,10 @@ import re
 import jax
 import optax
 import pytest
-from runs import ROOT
 
 from jaxnerf import Camera, Views
 from jaxnerf.engine.build import build
+from runs import ROOT
 
 NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.py"))
 

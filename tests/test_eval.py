@@ -10,7 +10,6 @@ import imageio.v3 as iio
 import numpy as np
 import oracle
 import pytest
-from runs import smoke_config, start
 
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.engine import evaluate as evaluation
@@ -18,6 +17,7 @@ from jaxnerf.engine import predictions
 from jaxnerf.engine.build import build
 from jaxnerf.engine.evaluate import evaluate, watch
 from jaxnerf.engine.load import open_run
+from runs import smoke_config, start
 
 pytest_plugins = ["engine_fixtures"]
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from runs import smoke_config
 from helpers import assert_same, random_rays
 from test_step import toy_draw, toy_model
 
@@ -13,10 +12,11 @@ from jaxnerf.engine import parallel
 from jaxnerf.engine.build import build
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
+from runs import smoke_config
 
 pytest_plugins = ["engine_fixtures"]
 
-MODES = parallel.MODES
+MODES = ("jit", "sharded", "pmap")
 
 
 def run_steps(step, state, data, num_steps, mode, **options):
@@ -127,5 +127,5 @@ def test_an_uneven_batch_does_not_train(mode):
 
 
 def test_an_unknown_mode_is_named():
-    with pytest.raises(ValueError, match="mode is 'tpu', wanted one of"):
+    with pytest.raises(ValueError, match="parallel is 'tpu', wanted one of"):
         parallel.compile_step(None, None, None, batch_size=4, mode="tpu")

@@ -11,13 +11,13 @@ import time
 import jax
 import numpy as np
 import pytest
-from runs import SMOKE_FLAGS, smoke_config, start
 
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.engine import records
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.load import open_run
 from jaxnerf.engine.loop import train_and_evaluate
+from runs import SMOKE_FLAGS, smoke_config, start
 
 pytest_plugins = ["engine_fixtures"]
 

@@ -2,14 +2,12 @@
 
 import types
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 from helpers import assert_same, random_rays
-from runs import smoke_config
 
 from jaxnerf import Batch
 from jaxnerf.engine import loop
@@ -17,6 +15,7 @@ from jaxnerf.engine.build import build
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
+from runs import smoke_config
 
 OPTIMIZER = optax.adam(0.1)
 

@@ -27,7 +27,13 @@ class Checkpoints:
         """Writes the state under its step and returns when it is on the disk; once a step only."""
         step = int(state.step)
         if step not in self.steps():
-            self._open().save(step, state, force=True)
+            try:
+                self._open().save(step, state, force=True)
+            except Exception as error:  # orbax raises many kinds
+                raise ValueError(
+                    f"{self._folder / str(step)}: cannot be written ({_reason(error)}); make room and start "
+                    "again, which goes on from the one before"
+                ) from error
 
     def load(self, step, like):
         """Returns the state at a step, shaped and placed as like.
@@ -37,11 +43,11 @@ class Checkpoints:
         """
         abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
         try:
+            self._open().reload()  # another process may have written it since
             return self._open().load(step, abstract)
         except Exception as error:  # orbax raises many kinds
-            reason = str(error).splitlines()[0][:200]
             raise ValueError(
-                f"{self._folder / str(step)}: cannot be read as this model's state ({reason}); "
+                f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
                 "remove it to go on from the one before"
             ) from error
 
@@ -54,3 +60,7 @@ class Checkpoints:
             # Opened late: it makes the folder, and a reader should make none.
             self._writer = ocp.training.Checkpointer(self._folder, preservation_policy=self._keep)
         return self._writer
+
+
+def _reason(error):
+    return (str(error).splitlines() or [type(error).__name__])[0][:400]

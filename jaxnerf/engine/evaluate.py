@@ -54,6 +54,21 @@ def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False
     params = run.params(step)
     partial = target.with_name(name + ".tmp")
     shutil.rmtree(partial, ignore_errors=True)
+    try:
+        results = _write_scores(
+            run, folder, views, params, split=split, step=step, chunk=chunk, partial=partial
+        )
+    except BaseException:  # a full disk, Ctrl-C
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    if target.exists():  # a kill between the two moves loses neither result
+        os.replace(target, target.with_name(name + ".old"))
+    os.replace(partial, target)
+    shutil.rmtree(target.with_name(name + ".old"), ignore_errors=True)
+    return results
+
+
+def _write_scores(run, folder, views, params, *, split, step, chunk, partial):
     rows = _render_views(run, functools.partial(run.render, params), views, chunk, partial)
     rays = sum(row.pop("rays") for row in rows)
     # The first view's time would hold the compilation too.
@@ -74,9 +89,6 @@ def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False
         "images": rows,
     }
     workdir.write_text(partial / "results.json", json.dumps(results, indent=2) + "\n")
-    if target.exists():
-        shutil.rmtree(target)
-    os.replace(partial, target)  # whole or not at all
     return results
 
 
@@ -98,10 +110,19 @@ def watch(folder, *, poll_seconds=10.0, config=None, data_dir=None, split=None, 
             views = run.experiment.load_views(split) if views is None else views
             results = score_run(run, folder, split=split, step=waiting[0], chunk=chunk, views=views)
             print(summary(results), flush=True)
-        elif run.steps() and run.steps()[-1] >= run.experiment.train.max_steps:
+        elif _ended(run, folder):
             return
         else:
             said = _wait(f"{folder}: no new checkpoint", said, poll_seconds)
+
+
+def _ended(run, folder):
+    """Returns whether the training has written its last checkpoint, by its steps or by its clock."""
+    options, steps, rows = run.experiment.train, run.steps(), records.read_rows(folder)
+    if not steps:
+        return False
+    late = rows and rows[-1]["step"] == steps[-1] and 0 < options.max_seconds <= rows[-1]["seconds"]
+    return steps[-1] >= options.max_steps or bool(late)
 
 
 def score_predictions(predictions, references, *, names):

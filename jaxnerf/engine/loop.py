@@ -33,6 +33,9 @@ def train_and_evaluate(config, folder):
     """
     experiment = build.build(config)
     views = experiment.load_views("train")  # before the workdir is made: bad input leaves nothing behind
+    options = experiment.train
+    devices = parallel.devices_of(options.parallel)
+    parallel.split_positions(options.batch_size, len(devices), options.block_size)
     workdir.claim(folder, config)
     finished = train(experiment, views, folder)
     if finished and experiment.eval.at_end:
@@ -87,9 +90,6 @@ def train(experiment, views, folder):
 
 def _compile(experiment, state, views):
     options = experiment.train
-    mode = options.parallel
-    if mode == "auto":
-        mode = "jit" if jax.local_device_count() == 1 else "sharded"
     started = time.perf_counter()
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     placed = parallel.compile_step(
@@ -99,7 +99,7 @@ def _compile(experiment, state, views):
         batch_size=options.batch_size,
         block_size=options.block_size,
         samples_per_ray=experiment.samples_per_ray,
-        mode=mode,
+        mode=options.parallel,
     )
     return *placed, time.perf_counter() - started
 

@@ -8,11 +8,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-MODES = ("jit", "sharded", "pmap")
+MODES = ("auto", "jit", "sharded", "pmap")
 CPU_BLOCK_SAMPLES = 12_288
 
 
-def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_per_ray=1, mode="sharded"):
+def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_per_ray=1, mode="auto"):
     """Returns the step compiled for the local devices, and the state and data placed for it.
 
     Args:
@@ -23,7 +23,8 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
         block_size: rays whose gradient is taken at once. 0: all that a device has, or on a CPU as
             many as its cache holds the activations of.
         samples_per_ray: of the largest network, for that choice.
-        mode: "jit" (one device), "sharded" (jit over a mesh of all devices) or "pmap".
+        mode: "jit" (one device), "sharded" (jit over a mesh of all devices), "pmap", or "auto": jit
+            where there is one device, else sharded.
 
     Returns:
         run, state, data: run(state, data) -> (state, metrics) consumes its state.
@@ -31,14 +32,12 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     Raises:
         ValueError: if the batch does not split evenly, or on an unknown mode.
     """
-    if mode not in MODES:
-        raise ValueError(f"compile_step: mode is {mode!r}, wanted one of {MODES}")
-    devices = jax.local_devices()[: 1 if mode == "jit" else None]
+    devices = devices_of(mode)
     block_size = block_size or default_block(batch_size // len(devices), samples_per_ray, devices[0].platform)
     positions = split_positions(batch_size, len(devices), block_size)
     mesh = Mesh(np.array(devices), ("batch",))
     everywhere = NamedSharding(mesh, P())
-    if mode == "jit":
+    if mode == "jit" or (mode == "auto" and len(devices) == 1):
         run, (state, data) = train_step, jax.device_put((state, data), devices[0])
         run = jax.jit(run, donate_argnums=0)
         positions = jnp.asarray(positions[0])
@@ -64,20 +63,27 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     return lambda state, data: compiled(state, data, positions), state, data
 
 
+def devices_of(mode):
+    """Returns the local devices that a mode uses; ValueError if there is no such mode."""
+    if mode not in MODES:
+        raise ValueError(f"train.parallel is {mode!r}, wanted one of {MODES}")
+    return jax.local_devices()[: 1 if mode == "jit" else None]
+
+
 def default_block(share, samples_per_ray, platform):
     """Returns how many of a device's share of rays to take the gradient of at once."""
     if platform != "cpu":
         return share
     # Measured by experiments/step_cost.py: beyond some 12,000 rows of activations the cache spills.
     fitting = max(CPU_BLOCK_SAMPLES // samples_per_ray, 1)
-    return max(size for size in range(1, min(share, fitting) + 1) if share % size == 0) if share else 0
+    return max(size for size in range(1, min(share, fitting) + 1) if share % size == 0) if share > 0 else 0
 
 
 def split_positions(batch_size, num_devices, block_size):
     """Returns [devices, blocks, rays] int32, every place in the batch once, in order."""
     share, uneven = divmod(batch_size, num_devices)
     block_size = min(block_size, share) or share
-    if uneven or not share or share % block_size:
+    if uneven or share < 1 or share % block_size:
         raise ValueError(
             f"batch_size {batch_size} on {num_devices} device(s) in blocks of {block_size} rays does not "
             "come out even; change train.batch_size or train.block_size"

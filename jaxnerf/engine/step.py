@@ -42,7 +42,7 @@ def make_train_step(model, optimizer, draw):
         if axis_name is not None:
             total = jax.lax.pmean(total, axis_name)
         metrics, grads = total
-        metrics["grad_norm"] = optax.global_norm(grads)
+        metrics["grad_norm"] = optax.tree.norm(grads)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import pathlib
 import sys
+import warnings
 
 import imageio.v3 as iio
 import jax
@@ -86,4 +87,7 @@ def _write(path, frames, frames_per_second):
         return
     height, width = (side - side % 2 for side in frames.shape[1:3])  # what the codec takes
     options = {"codec": "libx264", "macro_block_size": 1, "quality": 8, "pixelformat": "yuv420p"}
-    iio.imwrite(path, frames[:, :height, :width], fps=frames_per_second, **options)
+    with warnings.catch_warnings():
+        # JAX warns of forks; this one becomes ffmpeg at once and runs nothing of ours.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        iio.imwrite(path, frames[:, :height, :width], fps=frames_per_second, **options)

@@ -16,6 +16,7 @@ FREE = (
     "train.keep",
 )
 FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "eval.")
+SECTIONS = ("data", "coarse", "fine", "sampling", "train", "eval")
 
 
 def claim(workdir, config):
@@ -46,21 +47,30 @@ def read_config(workdir):
     """Returns the configuration of the run in a workdir; ValueError if there is none."""
     path = pathlib.Path(workdir) / "config.json"
     try:
-        return ConfigDict(json.loads(path.read_text()))
+        content = json.loads(path.read_text())
     except FileNotFoundError:
         raise ValueError(
             f"{path}: no such file, wanted the workdir of a training run; correct --workdir"
         ) from None
     except ValueError as error:
         raise ValueError(f"{path}: malformed JSON ({error}); restore it or train anew") from None
+    if not isinstance(content, dict) or not all(isinstance(content.get(name), dict) for name in SECTIONS):
+        raise ValueError(
+            f"{path}: holds no configuration, wanted an object with {SECTIONS}; restore it or train anew"
+        )
+    return ConfigDict(content)
 
 
 def write_text(path, text):
     """Writes a text file so that it is there whole or not at all."""
     path = pathlib.Path(path)
     partial = path.with_name(path.name + ".tmp")
-    partial.write_text(text)
-    os.replace(partial, path)
+    try:
+        partial.write_text(text)
+        os.replace(partial, path)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def _flat(config):

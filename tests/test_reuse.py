@@ -1,0 +1,174 @@
+"""The public functions inside other people's JAX code, and without anything but jax."""
+
+import functools
+import re
+import shutil
+import subprocess
+import sys
+import venv
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_same
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+from jaxnerf import Camera, look_at, pixel_grid, rays_from_pixels, render_hierarchical, render_rays, turntable
+from runs import ROOT
+
+OPTIONS = {"num_samples": 8, "background": np.ones(3, np.float32)}
+
+
+def fog(params, x, viewdirs):
+    """A soft ball whose colour also depends on the direction."""
+    density = params["density"] * jax.nn.sigmoid(8 * (params["radius"] - jnp.linalg.norm(x, axis=-1)))
+    return density, jnp.broadcast_to(0.5 + 0.25 * viewdirs, x.shape)
+
+
+PARAMS = {"density": np.float32(3.0), "radius": np.float32(1.0)}
+
+
+def render(params, camera):
+    """Returns the colours of a 4 x 4 picture."""
+    rays = rays_from_pixels(camera, pixel_grid(4, 4), near=2.0, far=6.0)
+    return render_rays(None, functools.partial(fog, params), rays, **OPTIONS).rgb
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    """A stack of 4."""
+    poses = turntable(4, center=jnp.zeros(3), radius=4.0, elevation=0.3)
+    return Camera(
+        to_world=jnp.asarray(poses),
+        focal=jnp.full((4, 2), 4.0),
+        center=jnp.full((4, 2), 2.0),
+        height=4,
+        width=4,
+    )
+
+
+@pytest.fixture(scope="module")
+def pictures(cameras):
+    """[4, 4, 4, 3], a camera at a time."""
+    run = jax.jit(render)
+    return np.stack([run(PARAMS, jax.tree.map(lambda leaf, i=i: leaf[i], cameras)) for i in range(4)])
+
+
+def test_vmap_over_cameras(cameras, pictures):
+    assert np.ptp(pictures[..., 0]) > 0.1 and np.ptp(pictures, axis=0).max() > 0.1
+    found = jax.jit(jax.vmap(render, in_axes=(None, 0)))(PARAMS, cameras)
+    np.testing.assert_allclose(found, pictures, atol=1e-6)
+
+
+def test_scan_over_cameras(cameras, pictures):
+    last, found = jax.jit(
+        lambda params, stack: jax.lax.scan(lambda n, camera: (n + 1, render(params, camera)), 0, stack)
+    )(PARAMS, cameras)
+    assert last == 4
+    np.testing.assert_allclose(found, pictures, atol=1e-6)
+
+
+def test_shard_map_over_cameras(cameras, pictures):
+    mesh = Mesh(np.array(jax.devices()), ("camera",))
+    mapped = jax.shard_map(
+        jax.vmap(render, in_axes=(None, 0)), mesh=mesh, in_specs=(P(), P("camera")), out_specs=P("camera")
+    )
+    found = jax.jit(mapped)(PARAMS, cameras)
+    assert len(found.sharding.device_set) == 4
+    np.testing.assert_allclose(found, pictures, atol=1e-6)
+
+
+def test_grad_through_scan_vmap_and_shard_map_is_the_slope(cameras):
+    mesh = Mesh(np.array(jax.devices()), ("camera",))
+
+    def loss(params):
+        return (jax.vmap(render, in_axes=(None, 0))(params, cameras) ** 2).mean()
+
+    def scanned(params):
+        return (
+            jax.lax.scan(lambda s, camera: (s + (render(params, camera) ** 2).mean(), None), 0.0, cameras)[0]
+            / 4
+        )
+
+    def sharded(params):
+        def share(params, stack):
+            return jax.lax.pmean((jax.vmap(render, in_axes=(None, 0))(params, stack) ** 2).mean(), "camera")
+
+        return jax.shard_map(share, mesh=mesh, in_specs=(P(), P("camera")), out_specs=P())(params, cameras)
+
+    wanted = jax.jit(jax.grad(loss))(PARAMS)
+    value = jax.jit(loss)
+    for name in PARAMS:
+        up, down = ({**PARAMS, name: PARAMS[name] + step} for step in (1e-2, -1e-2))
+        assert float(wanted[name]) == pytest.approx(float(value(up) - value(down)) / 2e-2, rel=1e-2), name
+    for other in (scanned, sharded):
+        assert_same(jax.jit(jax.grad(other))(PARAMS), wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_a_camera_can_be_learned(cameras):
+    """Gradients reach the pose through rays, samples and scene."""
+
+    def loss(eye):
+        camera = jax.tree.map(lambda leaf: leaf[0], cameras)
+        pose = look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))
+        camera = Camera(**{**vars(camera), "to_world": pose})
+        return (render(PARAMS, camera)[..., 0] ** 2).mean()
+
+    eye = jnp.array([3.0, 2.0, 1.5])
+    slope = np.asarray(jax.jit(jax.grad(loss))(eye))
+    assert np.isfinite(slope).all() and np.abs(slope).max() > 1e-4
+
+
+def test_the_hierarchy_composes_with_keys_a_ray(cameras):
+    scene = functools.partial(fog, PARAMS)
+
+    def both(keys, camera):
+        rays = rays_from_pixels(camera, pixel_grid(4, 4), near=2.0, far=6.0)
+        return [r.rgb for r in render_hierarchical(keys, scene, scene, rays, num_coarse=4, num_fine=4)]
+
+    keys = jax.random.split(jax.random.key(0), (4, 4, 4))
+    whole = jax.jit(jax.vmap(both))(keys, cameras)
+    one = jax.jit(both)(keys[2], jax.tree.map(lambda leaf: leaf[2], cameras))
+    assert_same([rgb[2] for rgb in whole], one)
+
+
+@pytest.fixture(scope="session")
+def bare(tmp_path_factory):
+    """A python that has jax and this package's wheel, and nothing else."""
+    folder = tmp_path_factory.mktemp("bare")
+    source = folder / "source"  # a build leaves files behind, so it works on a copy
+    source.mkdir()
+    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    shutil.copytree(ROOT / "jaxnerf", source / "jaxnerf", ignore=shutil.ignore_patterns("__pycache__"))
+    venv.create(folder / "venv", with_pip=True)
+    python = folder / "venv" / "bin" / "python"
+    pip = [python, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", source, "--no-deps", "-w", folder], check=True)
+    subprocess.run([*pip, "install", f"jax=={jax.__version__}"], check=True)
+    subprocess.run([*pip, "install", "--no-deps", *folder.glob("jaxnerf-*.whl")], check=True)
+    return python
+
+
+def test_the_readmes_first_example_needs_jax_alone(bare, tmp_path):
+    found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (tmp_path / "example.py").write_text(found.group(1))
+    result = subprocess.run([bare, "example.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "(100, 100, 3)" in result.stdout
+    for name in ("flax", "absl", "imageio", "ml_collections", "optax", "orbax", "PIL"):
+        assert subprocess.run([bare, "-c", f"import {name}"], capture_output=True).returncode == 1, name
+    place = subprocess.run(
+        [bare, "-c", "import jaxnerf; print(jaxnerf.__file__)"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert str(bare.parent.parent) in place.stdout
+
+
+def test_importing_it_loads_none_of_the_rest():
+    code = "import jaxnerf, sys; print(*sorted({name.split('.')[0] for name in sys.modules}))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"absl", "ml_collections", "imageio", "flax", "optax", "orbax", "PIL"} & set(
+        result.stdout.split()
+    )
