@@ -21,7 +21,7 @@ _PREDICTIONS = flags.DEFINE_string(
 
 def main(argv):
     del argv
-    from jaxnerf.engine import evaluate, predictions, workdir
+    from jaxnerf.engine import evaluate, predictions, watch, workdir
 
     if not (_WORKDIR.value or _PREDICTIONS.value):
         raise ValueError("nothing to score: give --workdir=DIR of a run, or --predictions=DIR of images")
@@ -35,7 +35,7 @@ def main(argv):
             _PREDICTIONS.value, config=config, split=_SPLIT.value, overwrite=_OVERWRITE.value
         )
     elif _WATCH.value:
-        evaluate.watch(
+        watch.watch(
             _WORKDIR.value,
             config=config,
             data_dir=_DATA_DIR.value,

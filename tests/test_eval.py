@@ -15,8 +15,9 @@ from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.engine import evaluate as evaluation
 from jaxnerf.engine import predictions
 from jaxnerf.engine.build import build
-from jaxnerf.engine.evaluate import evaluate, watch
+from jaxnerf.engine.evaluate import evaluate
 from jaxnerf.engine.load import open_run
+from jaxnerf.engine.watch import watch
 from runs import smoke_config, start
 
 pytest_plugins = ["engine_fixtures"]

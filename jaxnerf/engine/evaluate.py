@@ -5,7 +5,6 @@ import json
 import os
 import pathlib
 import shutil
-import sys
 import time
 
 import jax
@@ -76,7 +75,7 @@ def _write_scores(run, folder, views, params, *, split, step, chunk, partial):
     seconds = sum(row["seconds"] for row in timed) / len(timed)
     trained = [row for row in records.read_rows(folder) if row["step"] <= step]
     results = {
-        **{key: _mean(row[key] for row in rows) for key in ("psnr", "ssim", "psnr_float")},
+        **means(rows),
         "views": len(rows),
         "rays_per_second": rays / len(rows) / seconds,
         "seconds_per_frame": seconds,
@@ -90,60 +89,6 @@ def _write_scores(run, folder, views, params, *, split, step, chunk, partial):
     }
     workdir.write_text(partial / "results.json", json.dumps(results, indent=2) + "\n")
     return results
-
-
-def watch(folder, *, poll_seconds=10.0, config=None, data_dir=None, split=None, chunk=None):
-    """Scores every new checkpoint of a running training until its last step; says when it waits."""
-    views, said = None, None
-    while True:
-        try:
-            run = open_run(folder, config, data_dir=data_dir)
-            break
-        except ValueError as error:
-            said = _wait(f"{error}", said, poll_seconds)
-    split = split or run.experiment.eval.split
-    while True:
-        scored = pathlib.Path(folder) / "eval"
-        suffix = "" if split == run.experiment.eval.split else f"-{split}"
-        waiting = [step for step in run.steps() if not (scored / f"{step}{suffix}").exists()]
-        if waiting:
-            views = run.experiment.load_views(split) if views is None else views
-            results = score_run(run, folder, split=split, step=waiting[0], chunk=chunk, views=views)
-            print(summary(results), flush=True)
-        elif _ended(run, folder):
-            return
-        else:
-            said = _wait(f"{folder}: no new checkpoint", said, poll_seconds)
-
-
-def _ended(run, folder):
-    """Returns whether the training has written its last checkpoint, by its steps or by its clock."""
-    options, steps, rows = run.experiment.train, run.steps(), records.read_rows(folder)
-    if not steps:
-        return False
-    late = rows and rows[-1]["step"] == steps[-1] and 0 < options.max_seconds <= rows[-1]["seconds"]
-    return steps[-1] >= options.max_steps or bool(late)
-
-
-def score_predictions(predictions, references, *, names):
-    """Returns results for images made elsewhere: the same metrics on 8-bit images, row by row.
-
-    Args:
-        predictions, references: iterables of [H, W, 3] colours in [0, 1], in the same order.
-        names: one a pair.
-
-    Raises:
-        ValueError: if a pair's sizes differ; names it.
-    """
-    rows = []
-    for name, predicted, reference in zip(names, predictions, references, strict=True):
-        if predicted.shape != reference.shape:
-            raise ValueError(
-                f"{name}: is {predicted.shape}, its reference {reference.shape}; make both one size"
-            )
-        rows.append({"name": name, **_scores(predicted, reference)})
-    means = {key: _mean(row[key] for row in rows) for key in ("psnr", "ssim", "psnr_float")}
-    return {**means, "views": len(rows), "images": rows}
 
 
 def summary(results):
@@ -163,7 +108,7 @@ def reference(views, index):
 
 
 def _render_views(run, render, views, chunk, folder):
-    rows, shown = [], []
+    rows, shown, progress = [], [], records.Progress(len(views.names))
     for index, name in enumerate(views.names):
         height, width = (int(value) for value in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
@@ -172,13 +117,13 @@ def _render_views(run, render, views, chunk, folder):
         image = render_image(render, rays, chunk=chunk)
         seconds = time.perf_counter() - started
         truth = reference(views, index)
-        rows.append({"name": name, **_scores(image.rgb, truth), "seconds": seconds, "rays": height * width})
+        rows.append({"name": name, **scores(image.rgb, truth), "seconds": seconds, "rays": height * width})
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
         pictures.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
         if index % -(-len(views.names) // pictures.SHEET_ROWS) == 0:
             shown.append((truth, image))
-        print(f"\r{index + 1}/{len(views.names)} views", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
+        progress.show(index + 1, f"{name}: {rows[-1]['psnr']:.2f} dB in {seconds:.2f} s")
+    progress.close()
     pictures.write_sheet(folder / "sheet.png", shown)
     return rows
 
@@ -189,16 +134,10 @@ def _pair_scores(image, truth):
     return {"psnr": psnr(rounded, target), "ssim": ssim(rounded, target), "psnr_float": psnr(image, truth)}
 
 
-def _scores(image, truth):
+def scores(image, truth):
     return {key: float(value) for key, value in _pair_scores(jnp.asarray(image), jnp.asarray(truth)).items()}
 
 
-def _mean(values):
-    return float(np.mean(list(values)))
-
-
-def _wait(text, said, seconds):
-    if text != said:
-        print(f"{text}; looking again every {seconds:g} s", file=sys.stderr, flush=True)
-    time.sleep(seconds)
-    return text
+def means(rows):
+    """Returns the means of the rows' metrics, each over the images."""
+    return {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "ssim", "psnr_float")}

@@ -1,9 +1,6 @@
 """The training loop: resume, step, log, save, stop cleanly."""
 
-import contextlib
-import signal
 import sys
-import threading
 import time
 
 import jax
@@ -13,6 +10,7 @@ from jaxnerf.core.metrics import decibels
 from jaxnerf.data.batches import live_pixels
 from jaxnerf.engine import build, parallel, records, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
+from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
@@ -56,10 +54,10 @@ def train(experiment, views, folder):
     before = log.rows[-1]["seconds"] if log.rows else 0.0
     print(_header(experiment, views, state, compile_seconds), file=sys.stderr)
     progress = records.Progress(options.max_steps)
-    clock = _Clock(before, first * options.batch_size)
+    clock = Clock(before, first * options.batch_size)
     recent = []
     done = first >= options.max_steps or 0 < options.max_seconds <= before
-    with _Interrupt() as interrupt:
+    with Interrupt() as interrupt:
         for step in range(first + 1, first + 1 if done else options.max_steps + 1):
             state, metrics = run(state, data)
             recent.append(metrics)
@@ -173,46 +171,3 @@ def _header(experiment, views, state, compile_seconds):
 
 def _point(values):
     return "(" + ", ".join(f"{value:.2f}" for value in values) + ")"
-
-
-class _Clock:
-    """Seconds of training, without compilation and saving, counted on from an earlier start."""
-
-    def __init__(self, seconds, rays):
-        self._started = time.perf_counter() - seconds
-        self._last = (seconds, rays)
-
-    def seconds(self):
-        return time.perf_counter() - self._started
-
-    def rate(self, rays):
-        """Returns rays a second since the last call."""
-        (seconds, before), self._last = self._last, (self.seconds(), rays)
-        return (rays - before) / max(self._last[0] - seconds, 1e-9)
-
-    @contextlib.contextmanager
-    def paused(self):
-        entered = time.perf_counter()
-        yield
-        self._started += time.perf_counter() - entered
-
-
-class _Interrupt:
-    """Turns the first Ctrl-C or SIGTERM into a flag; a second one ends the program as usual."""
-
-    def __enter__(self):
-        self.caught = False
-        self._old = {}
-        if threading.current_thread() is threading.main_thread():  # elsewhere signals are not ours
-            self._old = {
-                number: signal.signal(number, self._catch) for number in (signal.SIGINT, signal.SIGTERM)
-            }
-        return self
-
-    def __exit__(self, *_):
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def _catch(self, *_):
-        self.caught = True
-        self.__exit__()

@@ -1,20 +1,21 @@
 """Scores of images that were made elsewhere, against a scene's photographs or a folder of references."""
 
 import json
-import pathlib
+from pathlib import Path
 
 import numpy as np
 
 from jaxnerf.data.images import read_image
 from jaxnerf.engine import build, workdir
-from jaxnerf.engine.evaluate import reference, score_predictions
+from jaxnerf.engine.evaluate import means, reference, scores
 
 
 def score_folder(folder, *, config=None, split=None, overwrite=False):
     """Scores a folder of images and writes results.json into it.
 
     Args:
-        folder: holds the images, or color/ with them; sorted by name.
+        folder: holds the images, or color/ with them. They pair with the views of the same names where
+            all names are those, else in the order of their own.
         config: ConfigDict whose scene is the reference; when None the folder's own gt-color/ is.
         split: of that scene; the configuration's eval.split when None.
         overwrite: whether an earlier results.json is replaced.
@@ -25,7 +26,7 @@ def score_folder(folder, *, config=None, split=None, overwrite=False):
     Raises:
         ValueError: if folder, images or references are missing or do not pair up.
     """
-    folder = pathlib.Path(folder)
+    folder = Path(folder)
     target = folder / "results.json"
     if target.exists() and not overwrite:
         raise ValueError(f"{target}: is there already; give --overwrite to score again")
@@ -45,10 +46,31 @@ def score_folder(folder, *, config=None, split=None, overwrite=False):
         raise ValueError(
             f"{paths[0].parent}: has {len(paths)} images, the reference {len(truths)}; wanted one each"
         )
+    names = [Path(str(truth)).stem for truth in truths]
+    if sorted(names) == sorted(path.stem for path in paths):
+        paths.sort(key=lambda path: names.index(path.stem))
     results = score_predictions(map(_colors, paths), references, names=[path.name for path in paths])
     results["conventions"] = conventions
     workdir.write_text(target, json.dumps(results, indent=2) + "\n")
     return results
+
+
+def score_predictions(predictions, references, *, names):
+    """Returns results for images made elsewhere: the same metrics on 8-bit images, row by row.
+
+    Args:
+        predictions, references: iterables of [H, W, 3] colours in [0, 1], in the same order.
+        names: one a pair.
+
+    Raises:
+        ValueError: if a pair's sizes differ; names it.
+    """
+    rows = []
+    for name, image, truth in zip(names, predictions, references, strict=True):
+        if image.shape != truth.shape:
+            raise ValueError(f"{name}: is {image.shape}, its reference {truth.shape}; make both one size")
+        rows.append({"name": name, **scores(image, truth)})
+    return {**means(rows), "views": len(rows), "images": rows}
 
 
 def _images(folder):
@@ -61,5 +83,11 @@ def _images(folder):
 
 
 def _colors(path):
-    pixels = read_image(path)[..., :3]
+    pixels = read_image(path)
+    if pixels.shape[-1] == 4:
+        if pixels[..., 3].min() < np.iinfo(pixels.dtype).max:
+            raise ValueError(
+                f"{path}: is partly transparent, wanted the colours to score; composite it first"
+            )
+        pixels = pixels[..., :3]
     return (pixels / np.iinfo(pixels.dtype).max).astype(np.float32)

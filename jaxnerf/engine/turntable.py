@@ -5,7 +5,6 @@ import functools
 import importlib.util
 import os
 import pathlib
-import sys
 import warnings
 
 import imageio.v3 as iio
@@ -16,6 +15,7 @@ from jaxnerf.core.cameras import pixel_grid, turntable
 from jaxnerf.core.rendering import render_image
 from jaxnerf.engine.load import newest_step, open_run
 from jaxnerf.engine.pictures import to_8_bits
+from jaxnerf.engine.records import Progress
 
 
 def render_turntable(
@@ -47,14 +47,14 @@ def render_turntable(
     render = functools.partial(run.render, run.params(step))
     height, width = (int(value) for value in views.size[0])
     pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
-    frames = []
+    frames, progress = [], Progress(num_frames)
     for pose in orbit(views.cameras, num_frames):
         camera = dataclasses.replace(jax.tree.map(lambda leaf: leaf[:1], views.cameras), to_world=pose[None])
         rays = run.experiment.view_rays(dataclasses.replace(views, cameras=camera), 0, pixels)
         image = render_image(render, rays, chunk=chunk or run.experiment.eval.chunk)
         frames.append(to_8_bits(image.rgb))
-        print(f"\r{len(frames)}/{num_frames} frames", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
+        progress.show(len(frames), "frames")
+    progress.close()
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_stem(target.stem + ".tmp")
     _write(partial, np.stack(frames), frames_per_second)
