@@ -17,7 +17,7 @@ $(BIN)/.dev: $(BIN)/.installed
 demo: $(BIN)/.installed
 	$(BIN)/python -m jaxnerf.train --config=configs/quickstart.py --workdir=$(DEMO)
 	$(BIN)/python -m jaxnerf.eval --workdir=$(DEMO) --overwrite
-	$(BIN)/python -m jaxnerf.render --workdir=$(DEMO)
+	$(BIN)/python -m jaxnerf.render --workdir=$(DEMO) --overwrite
 	$(BIN)/python experiments/table.py $(DEMO)
 
 test: $(BIN)/.dev
