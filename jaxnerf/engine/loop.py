@@ -1,5 +1,6 @@
 """The training loop: resume, step, log, save, stop cleanly."""
 
+import functools
 import sys
 import time
 
@@ -44,8 +45,7 @@ def train_and_evaluate(config, folder):
 def train(experiment, views, folder):
     """Runs the loop of train_and_evaluate on Views that were read; returns whether it came to its end."""
     options = experiment.train
-    state = create_state(experiment.model, experiment.optimizer, experiment.seed)
-    run, state, data, compile_seconds = _compile(experiment, state, views)
+    run, state, data, compile_seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, keep=options.keep)
     if checkpoints.steps():
         state = checkpoints.load(checkpoints.steps()[-1], state)
@@ -86,13 +86,13 @@ def train(experiment, views, folder):
     return not interrupt.caught
 
 
-def _compile(experiment, state, views):
+def _compile(experiment, views):
     options = experiment.train
     started = time.perf_counter()
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     placed = parallel.compile_step(
         step,
-        state,
+        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed),
         (views, live_pixels(views)),
         batch_size=options.batch_size,
         block_size=options.block_size,

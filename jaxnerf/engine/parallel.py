@@ -1,11 +1,12 @@
 """The one place that knows about devices: the same step under jit, sharded jit and pmap."""
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding
+from jax.sharding import Mesh, NamedSharding, SingleDeviceSharding
 from jax.sharding import PartitionSpec as P
 
 MODES = ("auto", "jit", "sharded", "pmap")
@@ -17,7 +18,7 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
 
     Args:
         train_step: see step.make_train_step.
-        state: TrainState.
+        state: TrainState, or a function that makes one, which then runs while the step compiles.
         data: what the step's draw takes; copied to every device.
         batch_size: rays a step, over all devices.
         block_size: rays whose gradient is taken at once. 0: all that a device has, or on a CPU as
@@ -36,30 +37,34 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     block_size = block_size or default_block(batch_size // len(devices), samples_per_ray, devices[0].platform)
     positions = split_positions(batch_size, len(devices), block_size)
     mesh = Mesh(np.array(devices), ("batch",))
-    everywhere = NamedSharding(mesh, P())
-    if mode == "jit" or (mode == "auto" and len(devices) == 1):
-        run, (state, data) = train_step, jax.device_put((state, data), devices[0])
-        run = jax.jit(run, donate_argnums=0)
-        positions = jnp.asarray(positions[0])
+    single = mode == "jit" or (mode == "auto" and len(devices) == 1)
+    everywhere = SingleDeviceSharding(devices[0]) if single else NamedSharding(mesh, P())
+    step = functools.partial(train_step, axis_name="batch")
+    if single:
+        run, positions = jax.jit(train_step, donate_argnums=0), jnp.asarray(positions[0])
+    elif mode == "pmap":
+        axes = {"in_axes": (None, None, 0), "out_axes": None}
+        run = jax.pmap(step, "batch", devices=devices, donate_argnums=0, **axes)
     else:
-        state, data = jax.device_put((state, data), everywhere)
-        step = functools.partial(train_step, axis_name="batch")
-        if mode == "pmap":
-            run = jax.pmap(
-                step, "batch", in_axes=(None, None, 0), out_axes=None, devices=devices, donate_argnums=0
-            )
-        else:
-            # With check_vma the gradient of replicated parameters would be summed once more.
-            sharded = jax.shard_map(
-                lambda state, data, positions: step(state, data, positions[0]),
-                mesh=mesh,
-                in_specs=(P(), P(), P("batch")),
-                out_specs=P(),
-                check_vma=False,
-            )
-            run = jax.jit(sharded, donate_argnums=0)
-            positions = jax.device_put(positions, NamedSharding(mesh, P("batch")))
-    compiled = run.lower(state, data, positions).compile()
+        # With check_vma the gradient of replicated parameters would be summed once more.
+        sharded = jax.shard_map(
+            lambda state, data, positions: step(state, data, positions[0]),
+            mesh=mesh,
+            in_specs=(P(), P(), P("batch")),
+            out_specs=P(),
+            check_vma=False,
+        )
+        run = jax.jit(sharded, donate_argnums=0)
+        positions = jax.device_put(positions, NamedSharding(mesh, P("batch")))
+    make = state if callable(state) else lambda: state
+    shapes = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=everywhere), jax.eval_shape(make)
+    )
+    data = jax.device_put(data, everywhere)
+    with ThreadPoolExecutor(1) as pool:
+        made = pool.submit(make)
+        compiled = run.lower(shapes, data, positions).compile()
+        state = jax.device_put(made.result(), everywhere)
     return lambda state, data: compiled(state, data, positions), state, data
 
 
