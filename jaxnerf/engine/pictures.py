@@ -37,8 +37,14 @@ def write_sheet(path, pairs):
 
 def _sheet_row(truth, image):
     step = -(-max(truth.shape) // 400)  # a sheet is to be looked at, not measured
-    rgb, opacity, disparity = (np.asarray(x) for x in (image.rgb, image.opacity, image.disparity))
-    bright = disparity / max(disparity.max(), 1e-9)
-    grey = [np.repeat(plane[..., None], 3, axis=-1) for plane in (opacity, bright)]
+    rgb, opacity, depth = (np.asarray(x) for x in (image.rgb, image.opacity, image.depth))
+    grey = [np.repeat(plane[..., None], 3, axis=-1) for plane in (opacity, _near_is_bright(depth))]
     panels = [truth, rgb, np.abs(rgb - truth) * 4, *grey]
     return np.concatenate([panel[::step, ::step] for panel in panels], axis=1)
+
+
+def _near_is_bright(depth):
+    """Returns depth [H, W] as grey in [0, 1], black where nothing stops the ray before infinity."""
+    finite = np.isfinite(depth)
+    near, far = (depth[finite].min(), depth[finite].max()) if finite.any() else (0.0, 1.0)
+    return np.where(finite, (far - np.where(finite, depth, far)) / max(far - near, 1e-9), 0.0)
