@@ -79,7 +79,7 @@ def default_block(share, samples_per_ray, platform):
     """Returns how many of a device's share of rays to take the gradient of at once."""
     if platform != "cpu":
         return share
-    # Measured by experiments/step_cost.py: beyond some 12,000 rows of activations the cache spills.
+    # The best size in experiments/step_cost.py; the activations of a whole batch would leave the cache.
     fitting = max(CPU_BLOCK_SAMPLES // samples_per_ray, 1)
     return max(size for size in range(1, min(share, fitting) + 1) if share % size == 0) if share > 0 else 0
 
