@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_same
 
+from helpers import assert_same
 from jaxnerf import Camera, Views
 from jaxnerf.data import batches
 

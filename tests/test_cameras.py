@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
 
+from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
 from jaxnerf import Camera, look_at, ndc_rays, ndc_to_t, pixel_grid, positions, rays_from_pixels, undistort
 
 OPENCV = [[0.0] * 4, [0.08, -0.02, 0.004, -0.003], [-0.25, 0.06, 0.002, 0.001], [-0.3, 0.0, 0.0, 0.0]]

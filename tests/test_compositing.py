@@ -2,9 +2,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 
 import jaxnerf
+from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 
 composite, transmittance = compiled(jaxnerf.composite), compiled(jaxnerf.transmittance)
 weights_from_density = compiled(jaxnerf.weights_from_density)

@@ -2,8 +2,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_batch_is_vmap_is_jit, compiled
 
+from helpers import assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import positional_encoding
 
 encode = compiled(positional_encoding, "num_freqs", "include_input")

@@ -8,9 +8,9 @@ import time
 
 import imageio.v3 as iio
 import numpy as np
-import oracle
 import pytest
 
+import oracle
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.engine import evaluate as evaluation
 from jaxnerf.engine import predictions

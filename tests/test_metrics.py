@@ -2,11 +2,11 @@ import dm_pix
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracle
 import pytest
 import skimage.metrics
-from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 
+import oracle
+from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import mse, psnr, round_to_8_bits, ssim
 
 

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import assert_same, random_rays
-from test_step import toy_draw, toy_model
 
+from helpers import assert_same, random_rays
 from jaxnerf.engine import parallel
 from jaxnerf.engine.build import build
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
 from runs import smoke_config
+from test_step import toy_draw, toy_model
 
 pytest_plugins = ["engine_fixtures"]
 

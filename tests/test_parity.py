@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracle
 import pytest
-from helpers import compiled, random_rays
 
 import jaxnerf
+import oracle
+from helpers import compiled, random_rays
 
 SEEDS = [0, 1, 2]
 RAYS = 5

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import all_finite, assert_same, compiled, random_rays
 
+from helpers import all_finite, assert_same, compiled, random_rays
 from jaxnerf import Samples, positions, render_hierarchical, render_image, render_rays, render_samples
 
 SHAPE = (4, 3)

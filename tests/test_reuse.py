@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_same
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
+from helpers import assert_same
 from jaxnerf import Camera, look_at, pixel_grid, rays_from_pixels, render_hierarchical, render_rays, turntable
 from runs import ROOT
 

@@ -1,9 +1,9 @@
 import jax
 import numpy as np
 import pytest
-from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 
 import jaxnerf
+from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 
 RAYS, SEGMENTS, POINTS = 6, 8, 5
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import assert_same, random_rays
 
+from helpers import assert_same, random_rays
 from jaxnerf import Batch
 from jaxnerf.engine import loop
 from jaxnerf.engine.build import build
