@@ -74,7 +74,7 @@ class MLP(linen.Module):
         """Returns density [..., S] and rgb [..., S, 3] before their activations.
 
         Inside, features come first, [F, N]: encoding and all three products of a layer's forward and
-        backward pass then run along memory, two to four times as fast on a CPU for a small network.
+        backward pass then run along memory, which on a CPU a small network gains most from.
         """
         shape = x.shape[:-1]
         encoded = encode_planes(_planes(x), num_freqs=self.num_freqs).astype(self.compute_dtype)
