@@ -42,7 +42,7 @@ def get_config():
             "sampling": {
                 "num_coarse": 64,  # samples a ray of the coarse network
                 "num_fine": 128,  # points more for the fine network
-                "rule": "segments",  # "segments", or "points" as in the paper
+                "rule": "segments",  # "segments", "gauss" (pairs, fourth order) or "points" (the paper)
                 "in_disparity": False,  # coarse samples in equal steps of 1 / t
                 "importance_floor": 0.0,  # added to the weights before they guide samples
                 "density_noise": 0.0,  # 1 / world unit, deviation of noise on the density in training

@@ -26,7 +26,7 @@ SURFACE = {
     "importance_points": "key edges weights | num_points floor=0.0",
     "merge_edges": "edges points |",
     "positions": "rays t |",
-    "weights_from_density": "density length |",
+    "weights_from_density": "density length | rule='segments'",
     "transmittance": "density length |",
     "composite": "weights values | background=None transmittance=None",
     "expected_depth": "weights t transmittance | far",

@@ -116,31 +116,36 @@ def ndc_rays(rays, camera, *, near_plane=1.0):
         near_plane: distance in world units.
 
     Returns:
-        Rays [...] with near 0 and far 1; viewdirs untouched. A ray that does not go towards -z
-        never meets the box and gets near = far = 0.
+        Rays [...] with near 0 and far 1; viewdirs untouched. A ray that does not go towards -z, or so
+        nearly across it that its place overflows, never meets the box and gets near = far = 0.
 
     Raises:
         ValueError: if the camera's size is unknown.
     """
     if camera.height is None or camera.width is None:
         raise ValueError("ndc_rays: the camera has no height and width; NDC wants them, set both in px")
+    focal = jnp.asarray(camera.focal)
+    scale = 2 * focal / jnp.array([camera.width, camera.height], focal.dtype) / near_plane
+    scale = scale.reshape(*(1,) * rays.near.ndim, 2)
+    height = rays.origins[..., 2:]
+
+    def lateral_and_slope(depth):
+        # Both from the given origin: going to the near plane first would subtract large terms.
+        slant = rays.directions[..., :2] / depth[..., None]
+        lateral = scale * (rays.origins[..., :2] - (near_plane + height) * slant)
+        return jnp.concatenate([lateral, scale * (height * slant - rays.origins[..., :2])], axis=-1)
+
     forward = rays.directions[..., 2] < 0
     depth = jnp.where(forward, rays.directions[..., 2], -1)
-    shift = -(near_plane + rays.origins[..., 2]) / depth
-    origins = rays.origins + shift[..., None] * rays.directions  # now at z = -near_plane
-    focal = jnp.asarray(camera.focal)
-    scale = (2 * focal / jnp.array([camera.width, camera.height], focal.dtype)).reshape(
-        *(1,) * shift.ndim, 2
-    ) * jnp.ones_like(origins[..., :2])
-    lateral = scale * origins[..., :2] / near_plane
-    slope = -scale * rays.directions[..., :2] / depth[..., None] - lateral
-    plane = jnp.ones_like(shift)[..., None]
+    forward &= jnp.isfinite(jax.lax.stop_gradient(lateral_and_slope(depth))).all(axis=-1)
+    projected = lateral_and_slope(jnp.where(forward, rays.directions[..., 2], -1))
+    plane = jnp.ones_like(projected[..., :1])
     return Rays(
-        origins=jnp.concatenate([lateral, -plane], axis=-1),
-        directions=jnp.concatenate([slope, 2 * plane], axis=-1),
+        origins=jnp.concatenate([projected[..., :2], -plane], axis=-1),
+        directions=jnp.concatenate([projected[..., 2:], 2 * plane], axis=-1),
         viewdirs=rays.viewdirs,
-        near=jnp.zeros_like(shift),
-        far=jnp.where(forward, 1.0, 0.0).astype(shift.dtype),
+        near=jnp.zeros_like(plane[..., 0]),
+        far=jnp.where(forward, plane[..., 0], 0),
     )
 
 

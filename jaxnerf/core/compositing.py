@@ -1,13 +1,19 @@
 """From densities to what a ray sees: weights, colour, depth (Eq. 3 and its sums)."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 
 from jaxnerf.core.structs import check_shapes
 
+# Beyond this optical depth exp(-x) is 0 in every float type, so that nothing changes where a depth
+# that is larger, or infinite, is replaced by it: sums and products then stay finite.
+_OPAQUE = 1e4
 
-def weights_from_density(density, length):
-    """Returns the share of the pixel's colour that each segment contributes.
+
+def weights_from_density(density, length, *, rule="segments"):
+    """Returns the share of the pixel's colour that each sample contributes.
 
     Density is constant inside a segment, which makes the quadrature exact:
 
@@ -17,18 +23,29 @@ def weights_from_density(density, length):
 
     Args:
         density: [..., S] sigma >= 0, in 1 / world unit, ordered near to far.
-        length: [..., S] l >= 0, in world units. Zero removes the segment: neither the value nor
+        length: [..., S] l >= 0, in world units. Zero removes the sample: neither the value nor
             the gradient sees its density, even where that is NaN or infinite.
+        rule: the rule of the samples, see samples_from_edges. "gauss" moves a part of each cell's
+            second weight to its first, which makes the colour, too, of fourth order.
 
     Returns:
-        [..., S] weights in [0, 1]. An infinite density in a segment of positive length is opaque.
+        [..., S] weights in [0, 1], at least float32. An infinite density over a positive length is
+        opaque. The gradient is that of Eq. 3 to rounding, also in fog so thick that it cancels.
 
     Raises:
-        ValueError: if the shapes differ; nothing is broadcast here.
+        ValueError: if the shapes differ (nothing is broadcast here), the rule is unknown, or "gauss" has
+            an odd S.
     """
     depth = _optical_depth("weights_from_density", density, length)
-    before = _sum_before(depth)
-    return jnp.exp(-before) * _absorbed(depth)
+    weights = _weights(depth)
+    if rule in ("segments", "points"):
+        return weights
+    if rule != "gauss" or depth.shape[-1] % 2:
+        raise ValueError(
+            f"weights_from_density: rule {rule!r} with {depth.shape[-1]} samples, wanted 'segments', "
+            "'points', or 'gauss' with two samples a cell"
+        )
+    return _follow_transmittance(weights, depth)
 
 
 def transmittance(density, length):
@@ -62,19 +79,19 @@ def composite(weights, values, *, background=None, transmittance=None):
 
     Args:
         weights: [..., S].
-        values: [..., S, C], colours or anything else a sample has.
+        values: [..., S, C], colours or anything else a sample has, finite also where the weight is 0.
         background: None for black (nothing is added), [C], or [..., C] one a ray.
         transmittance: [...] what passes through; 1 - sum of weights when not given.
 
     Returns:
-        [..., C].
+        [..., C], at least float32.
 
     Raises:
         ValueError: on other shapes.
     """
-    weights, values = jnp.asarray(weights), jnp.asarray(values)
+    weights, values = _at_least_float32(weights, values)
     check_shapes("composite", weights=(weights, "... S"), values=(values, "... S C"))
-    colour = (weights[..., None] * values).sum(axis=-2)
+    colour = _sum_over_samples(weights, values)
     if background is None:
         return colour
     background = jnp.asarray(background, colour.dtype)
@@ -99,12 +116,12 @@ def expected_depth(weights, t, transmittance, *, far):
 
     Returns:
         [...] in t. An empty ray has depth far; never NaN, as nothing is added where nothing passes.
+        What is infinite has gradient 0.
 
     Raises:
         ValueError: on other shapes.
     """
-    weights, t, far = jnp.asarray(weights), jnp.asarray(t), jnp.asarray(far)
-    transmittance = jnp.asarray(transmittance)
+    weights, t, transmittance, far = _at_least_float32(weights, t, transmittance, far)
     check_shapes(
         "expected_depth",
         weights=(weights, "... S"),
@@ -112,10 +129,7 @@ def expected_depth(weights, t, transmittance, *, far):
         transmittance=(transmittance, "..."),
         far=(far, "..."),
     )
-    passing = transmittance > 0
-    behind = jnp.where(passing, transmittance * jnp.where(passing, far, 0), 0)
-    seen = weights > 0  # a sample at infinity that has no weight has no place either
-    return (weights * jnp.where(seen, t, 0)).sum(axis=-1) + behind
+    return _share_of(weights, t).sum(axis=-1) + _share_of(transmittance, far)
 
 
 def expected_disparity(weights, t):
@@ -126,31 +140,108 @@ def expected_disparity(weights, t):
         t: [..., S] in t, > 0 where a weight is.
 
     Returns:
-        [...] in 1 / t; 0 for an empty ray, also with samples at t = 0.
+        [...] in 1 / t; 0 for an empty ray, also with samples at t = 0. A weight at t = 0 makes it
+        inf, with gradient 0.
 
     Raises:
         ValueError: if the shapes differ.
     """
-    weights, t = jnp.asarray(weights), jnp.asarray(t)
+    weights, t = _at_least_float32(weights, t)
     check_shapes("expected_disparity", weights=(weights, "... S"), t=(t, "... S"))
-    seen = weights > 0
-    return jnp.where(seen, weights / jnp.where(seen, t, 1), 0).sum(axis=-1)
+    touching = t == 0
+    return _share_of(weights, jnp.where(touching, jnp.inf, 1 / jnp.where(touching, 1, t))).sum(axis=-1)
+
+
+def _sum_over_samples(weights, values):
+    """Returns the weighted sums; few channels one by one, as an inner axis of 3 fills no vector register."""
+    if values.shape[-1] > 4:
+        return (weights[..., None] * values).sum(axis=-2)
+    return jnp.stack([(weights * values[..., i]).sum(axis=-1) for i in range(values.shape[-1])], axis=-1)
+
+
+def _share_of(weight, place):
+    """Returns weight times place, where 0 times inf is 0 and an infinite product has no gradient."""
+    endless = jnp.isinf(place)
+    return jnp.where(endless & (weight > 0), place, weight * jnp.where(endless, 0, place))
+
+
+def _at_least_float32(*arrays):
+    arrays = [jnp.asarray(array) for array in arrays]
+    dtype = jnp.result_type(jnp.float32, *(array.dtype for array in arrays))
+    return [array.astype(dtype) for array in arrays]
 
 
 def _optical_depth(function, density, length):
-    """Returns sigma l, with what counts for nothing selected out on both sides of the product.
+    """Returns sigma l, with what has no length or lets nothing through selected out of the product.
 
-    That is a segment of no length, and empty space without an end (0 times inf).
+    Both operands are replaced there, as the derivative of a product multiplies by them. Empty space
+    without an end (0 times inf) counts for nothing.
     """
-    density, length = jnp.asarray(density), jnp.asarray(length)
+    density, length = _at_least_float32(density, length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))
-    kept = (length > 0) & ~(jnp.isinf(length) & (density == 0))
-    return jnp.where(kept, jnp.where(kept, density, 0) * jnp.where(kept, length, 0), 0)
+    opaque = density * length > _OPAQUE
+    empty = (length <= 0) | (jnp.isinf(length) & (density == 0))
+    plain = ~(opaque | empty)
+    depth = jnp.where(plain, density, 0) * jnp.where(plain, length, 0)
+    return jnp.where(opaque & ~empty, _OPAQUE, depth)
 
 
-def _sum_before(x):
-    """Returns the sum of all earlier entries; never inf - inf, as a sum less its last term would be."""
-    return jnp.concatenate([jnp.zeros_like(x[..., :1]), jnp.cumsum(x[..., :-1], axis=-1)], axis=-1)
+@jax.custom_jvp
+def _weights(depth):
+    return jnp.exp(-_previous(_running_sum(depth))) * _absorbed(depth)
+
+
+@_weights.defjvp
+def _weights_jvp(primals, tangents):
+    """Differentiates w_i = T_i - T_{i+1} as it stands.
+
+    In reverse the colours of neighbours are then subtracted before they are summed, where the derivative
+    of the product subtracts two sums: those cancel in thick fog of one colour.
+    """
+    (depth,), (tangent,) = primals, tangents
+    behind = jnp.exp(-_running_sum(depth)) * _running_sum(tangent)
+    return _weights(depth), behind - _previous(behind)
+
+
+def _follow_transmittance(weights, depth):
+    """Returns the weights of half cells, turned into those of the Gauss points in them.
+
+    At the points the integrand is sigma exp(-tau), and of a cell's optical depth tau 1 / sqrt(3) lies
+    between them, where half cells have 1 / 2. So the ratio of the first weight to the second grows by
+    exp((1 / sqrt(3) - 1 / 2) tau); their sum stays, and with it the fourth order of the opacity. The growth
+    ends at tau = 4: in a cell that a wall begins in, the little there is before it must not take its place.
+    """
+    following = jnp.concatenate([depth[..., 1:], jnp.zeros_like(depth[..., :1])], axis=-1)
+    growth = jnp.expm1((1 / math.sqrt(3) - 1 / 2) * jnp.minimum(depth + following, 4))
+    absorbed = _absorbed(depth)
+    rest = _absorbed(depth + following) + absorbed * growth
+    share = jnp.where(rest > 0, absorbed * growth / jnp.where(rest > 0, rest, 1), 0)
+    first = (jnp.arange(depth.shape[-1]) % 2 == 0).reshape((1,) * (depth.ndim - 1) + (-1,))
+    second = jnp.concatenate([weights[..., 1:], jnp.zeros_like(weights[..., :1])], axis=-1)
+    moved = jnp.where(first, share * second, 0)
+    return weights + moved - _previous(moved)
+
+
+def _running_sum(x, block=16):
+    """Returns the sum of all entries up to each.
+
+    By products with a triangle of ones, block by block: three times as fast as jnp.cumsum on a CPU, and
+    as close. Entries must be finite, or a whole block is NaN.
+    """
+    size = x.shape[-1]
+    if size <= block:
+        ones = jnp.triu(jnp.ones((size, size), x.dtype))
+        return jnp.matmul(x, ones, precision="highest")
+    count = -(-size // block)
+    padding = [(0, 0)] * (x.ndim - 1) + [(0, count * block - size)]
+    blocks = jnp.pad(x, padding).reshape(*x.shape[:-1], count, block)
+    inside = _running_sum(blocks, block)
+    total = inside + _previous(_running_sum(inside[..., -1], block))[..., None]
+    return total.reshape(*x.shape[:-1], -1)[..., :size]
+
+
+def _previous(x):
+    return jnp.concatenate([jnp.zeros_like(x[..., :1]), x[..., :-1]], axis=-1)
 
 
 @jax.custom_jvp

@@ -39,18 +39,20 @@ def render_samples(scene, rays, samples, *, background=None):
         t=(samples.t, "... S"),
         delta=(samples.delta, "... S"),
     )
-    kept = samples.delta > 0
+    kept = ~(samples.delta <= 0)  # NaN is kept, and shows
     t = jnp.where(kept, samples.t, jnp.broadcast_to(rays.near[..., None], samples.t.shape))
-    density, rgb = scene(positions(rays, t), rays.viewdirs[..., None, :])
+    x = positions(rays, t)
+    x = jnp.where(kept[..., None], x, jax.lax.stop_gradient(x))  # nor may a slope of NaN come back
+    density, rgb = scene(x, rays.viewdirs[..., None, :])
     if density.shape != t.shape or rgb.shape != (*t.shape, 3):
         raise ValueError(
             f"render_samples: the scene returned density {density.shape} and rgb {rgb.shape} for positions "
             f"{(*t.shape, 3)}, wanted {t.shape} and {(*t.shape, 3)}"
         )
-    density, rgb = jnp.where(kept, density, 0), jnp.where(kept[..., None], rgb, 0)
-    length = samples.delta * norm(rays.directions)[..., None]
-    density, rgb = density.astype(length.dtype), rgb.astype(length.dtype)  # a field may compute in less
-    weights = compositing.weights_from_density(density, length)
+    density = jnp.where(kept, density, 0)
+    rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # as composite sums them
+    length = _length(samples.delta, rays.directions)
+    weights = compositing.weights_from_density(density, length, rule=samples.rule)
     passing = compositing.transmittance(density, length)
     return Rendering(
         rgb=compositing.composite(weights, rgb, background=background, transmittance=passing),
@@ -79,8 +81,9 @@ def render_rays(
         key: None for fixed samples, one key, or one key a ray [...], for stratified ones (Eq. 2).
         scene: see render_samples.
         rays: Rays [...].
-        num_samples: S.
-        rule: "segments", or "points" for the released codes' quadrature.
+        num_samples: S, how often the scene is asked; even for "gauss".
+        rule: "segments"; "gauss", of fourth order, see samples_from_edges; or "points" for the released
+            codes' quadrature.
         in_disparity: equal steps in 1 / t (wants near > 0).
         background: see render_samples.
         render: render_samples, or a function of the same meaning.
@@ -89,9 +92,13 @@ def render_rays(
         Rendering [...].
 
     Raises:
-        ValueError: on an unknown rule, and as uniform_edges and render_samples.
+        ValueError: on an unknown rule or an odd number for "gauss", and as uniform_edges and render_samples.
     """
-    samples = _even_samples(key, rays, num_samples, rule, in_disparity)
+    if rule == "points":
+        samples = _even_points(key, rays, num_samples, in_disparity)
+    else:
+        edges = _even_edges("num_samples", rays, num_samples, rule, in_disparity)
+        samples = sampling.samples_from_edges(key, edges, rule=rule)
     return render(scene, rays, samples, background=background)
 
 
@@ -116,7 +123,8 @@ def render_hierarchical(
         rays: Rays [...].
         num_coarse: samples of the coarse scene.
         num_fine: importance points. The fine scene is asked at num_coarse + num_fine samples.
-        rule: "segments": the points cut the coarse segments, and each piece is asked once.
+        rule: "segments": the points cut the coarse segments, and each piece is asked once. "gauss":
+            half as many points do, and each piece is asked twice; both numbers must be even.
             "points": the paper's sorted union of both sets of points, with a last delta of 1e10.
         in_disparity: equal coarse steps in 1 / t.
         importance_floor: see importance_points; the released codes have 1e-5.
@@ -129,23 +137,26 @@ def render_hierarchical(
         ValueError: as render_rays.
     """
     coarse_key, point_key, fine_key = sampling.split_key(key, 3)
-    if rule == "segments":
-        edges = sampling.uniform_edges(
-            rays.near, rays.far, num_segments=num_coarse, in_disparity=in_disparity
-        )
-        samples = sampling.samples_from_edges(coarse_key, edges)
+    if rule == "points":
+        samples = _even_points(coarse_key, rays, num_coarse, in_disparity)
     else:
-        samples = _even_samples(coarse_key, rays, num_coarse, rule, in_disparity)
+        edges = _even_edges("num_coarse", rays, num_coarse, rule, in_disparity)
+        samples = sampling.samples_from_edges(coarse_key, edges, rule=rule)
     first = render_samples(coarse, rays, samples, background=background)
-    options = {"num_points": num_fine, "floor": importance_floor}
-    if rule == "segments":
-        points = sampling.importance_points(point_key, edges, first.weights, **options)
-        samples = sampling.samples_from_edges(fine_key, sampling.merge_edges(edges, points))
-    else:
+    if rule == "points":
         # The released codes draw between the middles of the coarse points, from the inner weights.
-        middles = sampling.midpoints(samples.t)
-        points = sampling.importance_points(point_key, middles, first.weights[..., 1:-1], **options)
+        middles, inner = sampling.midpoints(samples.t), first.weights[..., 1:-1]
+        points = sampling.importance_points(
+            point_key, middles, inner, num_points=num_fine, floor=importance_floor
+        )
         samples = sampling.samples_from_points(sampling.merge_edges(samples.t, points))
+    else:
+        cells = _cells("num_fine", num_fine, rule)
+        weights = first.weights.reshape(*edges.shape[:-1], edges.shape[-1] - 1, -1).sum(axis=-1)
+        points = sampling.importance_points(
+            point_key, edges, weights, num_points=cells, floor=importance_floor
+        )
+        samples = sampling.samples_from_edges(fine_key, sampling.merge_edges(edges, points), rule=rule)
     return first, render_samples(fine, rays, samples, background=background)
 
 
@@ -178,15 +189,31 @@ def render_image(render, rays, *, chunk):
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
 
 
-def _even_samples(key, rays, num_samples, rule, in_disparity):
-    if rule == "segments":
-        edges = sampling.uniform_edges(
-            rays.near, rays.far, num_segments=num_samples, in_disparity=in_disparity
+def _length(delta, directions):
+    """Returns delta in world units; kept apart from an endless one, whose derivative would be 0 times inf."""
+    size = norm(directions)[..., None]
+    endless = jnp.isinf(delta)
+    return jnp.where(endless & (size > 0), jnp.inf, jnp.where(endless, 0, delta) * size)
+
+
+def _even_points(key, rays, num_samples, in_disparity):
+    t = sampling.stratified_points(
+        key, rays.near, rays.far, num_points=num_samples, in_disparity=in_disparity
+    )
+    return sampling.samples_from_points(t)
+
+
+def _even_edges(name, rays, num_samples, rule, in_disparity):
+    cells = _cells(name, num_samples, rule)
+    return sampling.uniform_edges(rays.near, rays.far, num_segments=cells, in_disparity=in_disparity)
+
+
+def _cells(name, num_samples, rule):
+    """Returns how many segments a rule divides so many samples between."""
+    if rule not in ("segments", "gauss"):
+        raise ValueError(f"rule is {rule!r}, wanted 'segments', 'gauss' or 'points'")
+    if rule == "gauss" and num_samples % 2:
+        raise ValueError(
+            f"{name} is {num_samples}, wanted an even number for rule 'gauss', which asks in pairs"
         )
-        return sampling.samples_from_edges(key, edges)
-    if rule == "points":
-        t = sampling.stratified_points(
-            key, rays.near, rays.far, num_points=num_samples, in_disparity=in_disparity
-        )
-        return sampling.samples_from_points(t)
-    raise ValueError(f"rule is {rule!r}, wanted 'segments' or 'points'")
+    return num_samples // 2 if rule == "gauss" else num_samples

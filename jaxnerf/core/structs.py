@@ -40,7 +40,7 @@ class Samples:
 
     t: jax.Array  # [..., S] where the scene is asked, near to far
     delta: jax.Array  # [..., S] the length in t that each answer stands for, 0 = ignore
-    rule: str = "segments"  # the quadrature: density and colour constant over each delta
+    rule: str = "segments"  # the quadrature: "segments", "gauss" (two a cell) or "points"
 
 
 @pytree()

@@ -89,8 +89,8 @@ def build(config):
 def build_model(config):
     """Returns the Model: coarse and fine networks, or one network when sampling.num_fine is 0."""
     sampling, background = config.sampling, _background(config.data)
-    if sampling.rule not in ("segments", "points"):
-        raise ValueError(f"sampling.rule is {sampling.rule!r}, wanted 'segments' or 'points'")
+    if sampling.rule not in ("segments", "gauss", "points"):
+        raise ValueError(f"sampling.rule is {sampling.rule!r}, wanted 'segments', 'gauss' or 'points'")
     names = ("coarse", "fine") if sampling.num_fine else ("fine",)
     fields = {name: mlp_field(**_network(config[name])) for name in names}
     options = {"rule": sampling.rule, "in_disparity": sampling.in_disparity, "background": background}
