@@ -27,7 +27,7 @@ def main(argv):
             f"{argv[1:]}: no eval/*/results.json; run python -m jaxnerf.eval --workdir=... first"
         )
     rows = [row(path) for path in sorted(paths, key=lambda path: (path.parts[:-2], int_prefix(path)))]
-    lines = ["| " + " | ".join(cells) + " |" for cells in (HEADS, ["---"] * len(HEADS), *rows)]
+    lines = markdown(HEADS, rows)
     print("\n".join(lines))
     if _README.value:
         replace(pathlib.Path(_README.value), lines)
@@ -54,14 +54,19 @@ def int_prefix(path):
     return int(path.parent.name.split("-")[0])
 
 
-def replace(readme, lines):
+def markdown(heads, rows):
+    """Returns the lines of a table."""
+    return ["| " + " | ".join(cells) + " |" for cells in (heads, ["---"] * len(heads), *rows)]
+
+
+def replace(readme, lines, marks=MARKS):
     """Replaces what lies between the marks of a file."""
     text = readme.read_text()
-    if any(mark not in text for mark in MARKS):
-        raise ValueError(f"{readme}: lacks the lines {MARKS}; add them where the table shall stand")
-    head, rest = text.split(MARKS[0], 1)
-    tail = rest.split(MARKS[1], 1)[1]
-    write_text(readme, head + MARKS[0] + "\n" + "\n".join(lines) + "\n" + MARKS[1] + tail)
+    if any(mark not in text for mark in marks):
+        raise ValueError(f"{readme}: lacks the lines {marks}; add them where the table shall stand")
+    head, rest = text.split(marks[0], 1)
+    tail = rest.split(marks[1], 1)[1]
+    write_text(readme, head + marks[0] + "\n" + "\n".join(lines) + "\n" + marks[1] + tail)
 
 
 if __name__ == "__main__":

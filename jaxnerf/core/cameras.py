@@ -65,7 +65,8 @@ def undistort(camera, pixels):
         angle = norm(points)
         inside = converged & (angle < 0.5 * math.pi)
         angle = jnp.where(inside, angle, 0)
-        stretch = jnp.where(angle > 1e-4, jnp.tan(angle) / jnp.where(angle > 1e-4, angle, 1), 1)
+        wide = angle > 1e-4  # below, the series is exact, and its derivative has no 0 / 0
+        stretch = jnp.where(wide, jnp.tan(angle) / jnp.where(wide, angle, 1), 1 + angle**2 / 3)
         points, converged = jnp.where(inside[:, None], points * stretch[:, None], 0), inside
     return points.reshape(target.shape), converged.reshape(target.shape[:-1])
 
@@ -173,7 +174,7 @@ def ndc_to_t(t, rays, camera=None, *, near_plane=1.0):
 def norm(vectors):
     """Returns the length [...] of vectors [..., D] without over- or underflow; 0, with gradient 0, for 0."""
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
-    nonzero = largest > 0
+    nonzero = largest != 0  # NaN stays NaN
     largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
     squares = ((vectors / largest) ** 2).sum(axis=-1, keepdims=True)
     return jnp.where(nonzero, largest * jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)[..., 0]
@@ -182,7 +183,7 @@ def norm(vectors):
 def normalize(vectors):
     """Returns vectors [..., D] at unit length; 0, with gradient 0, for a zero vector."""
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
-    nonzero = largest > 0
+    nonzero = largest != 0  # NaN stays NaN
     scaled = vectors / jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
     squares = (scaled**2).sum(axis=-1, keepdims=True)
     return jnp.where(nonzero, scaled / jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)
@@ -198,7 +199,7 @@ def look_at(eye, target, up):
     back = normalize(eye - target)
     right = jnp.cross(normalize(up), back)
     spare = jnp.cross(jnp.roll(back, 1), back)
-    right = normalize(jnp.where(norm(right) > 1e-6, right, spare))
+    right = normalize(jnp.where(norm(right) > 1e-6, right, spare))  # shorter, it would be rounding alone
     return jnp.stack([right, jnp.cross(back, right), back, eye], axis=-1)
 
 
@@ -258,7 +259,12 @@ def _invert(distort, distortion, goal):
 
     fixed = jax.lax.stop_gradient(goal)
     start = jax.lax.stop_gradient(distortion)
-    point = jax.lax.fori_loop(0, 20, lambda _, point: newton(point, start, fixed)[0], fixed)
+
+    def follow(i, point):
+        # From the axis outwards: a step from the goal itself may begin past a fold of the lens.
+        return newton(point, start, fixed * jnp.minimum((i + 1) / 24, 1))[0]
+
+    point = jax.lax.fori_loop(0, 32, follow, jnp.zeros_like(fixed))
     residual = norm(distort(start, point) - fixed)
     # Past a fold of the lens the same pixel is met again: the image must grow all the way there.
     fractions = jnp.linspace(0, 1, 32, dtype=goal.dtype)

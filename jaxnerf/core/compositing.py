@@ -188,19 +188,36 @@ def _optical_depth(function, density, length):
 
 @jax.custom_jvp
 def _weights(depth):
-    return jnp.exp(-_previous(_running_sum(depth))) * _absorbed(depth)
+    return _previous(jnp.exp(-_running_sum(depth)), first=1) * _absorbed(depth)
 
 
 @_weights.defjvp
-def _weights_jvp(primals, tangents):
+def _weights_jvp(primals, tangents, *, long_ray=4096):
     """Differentiates w_i = T_i - T_{i+1} as it stands.
 
-    In reverse the colours of neighbours are then subtracted before they are summed, where the derivative
-    of the product subtracts two sums: those cancel in thick fog of one colour.
+    In reverse the colours of neighbours are then subtracted before they are summed. The derivative of the
+    product subtracts the sum behind a sample from its own colour: in thick fog of one colour nothing is
+    left of that. Roundings of the differences add up, so that rays of more than long_ray samples go another
+    way to the same end.
     """
     (depth,), (tangent,) = primals, tangents
-    behind = jnp.exp(-_running_sum(depth)) * _running_sum(tangent)
-    return _weights(depth), behind - _previous(behind)
+    weights, behind = _weights(depth), jnp.exp(-_running_sum(depth))
+    if depth.shape[-1] > long_ray:
+        return weights, _change_of_long_ray(weights, behind, tangent)
+    change = behind * _running_sum(tangent)
+    return weights, change - _previous(change)
+
+
+def _change_of_long_ray(weights, behind, tangent):
+    """Differentiates Eq. 3, and takes the heaviest weight's share from the sum of all, which is known.
+
+    In reverse, the heaviest sample's colour comes off all others before they are summed.
+    """
+    plain = behind * tangent - weights * _previous(_running_sum(tangent))
+    total = behind[..., -1:] * tangent.sum(axis=-1, keepdims=True)
+    heaviest = _places(weights) == weights.argmax(axis=-1, keepdims=True)
+    others = jnp.where(heaviest, 0, plain)
+    return jnp.where(heaviest, total - others.sum(axis=-1, keepdims=True), others)
 
 
 def _follow_transmittance(weights, depth):
@@ -216,9 +233,8 @@ def _follow_transmittance(weights, depth):
     absorbed = _absorbed(depth)
     rest = _absorbed(depth + following) + absorbed * growth
     share = jnp.where(rest > 0, absorbed * growth / jnp.where(rest > 0, rest, 1), 0)
-    first = (jnp.arange(depth.shape[-1]) % 2 == 0).reshape((1,) * (depth.ndim - 1) + (-1,))
     second = jnp.concatenate([weights[..., 1:], jnp.zeros_like(weights[..., :1])], axis=-1)
-    moved = jnp.where(first, share * second, 0)
+    moved = jnp.where(_places(depth) % 2 == 0, share * second, 0)
     return weights + moved - _previous(moved)
 
 
@@ -240,8 +256,12 @@ def _running_sum(x, block=16):
     return total.reshape(*x.shape[:-1], -1)[..., :size]
 
 
-def _previous(x):
-    return jnp.concatenate([jnp.zeros_like(x[..., :1]), x[..., :-1]], axis=-1)
+def _places(x):
+    return jnp.arange(x.shape[-1]).reshape((1,) * (x.ndim - 1) + (-1,))
+
+
+def _previous(x, first=0):
+    return jnp.concatenate([jnp.full_like(x[..., :1], first), x[..., :-1]], axis=-1)
 
 
 @jax.custom_jvp

@@ -89,7 +89,7 @@ def _next_octave(turns, _):
     """
     high, low = turns
     quarters = 4 * high
-    nearest = jnp.floor(quarters + 0.5)
+    nearest = jnp.round(quarters)
     angle = (quarters - nearest + 4 * low) * (math.pi / 2)  # within pi / 4
     quadrant = nearest.astype(jnp.int32)
     square = angle * angle
@@ -99,7 +99,7 @@ def _next_octave(turns, _):
     sine = jnp.where((quadrant & 2) == 2, -sine, sine)
     cosine = jnp.where(((quadrant + 1) & 2) == 2, -cosine, cosine)
     doubled = 2 * high
-    return (doubled - jnp.floor(doubled + 0.5), 2 * low), jnp.stack([sine, cosine])  # both exact
+    return (doubled - jnp.round(doubled), 2 * low), jnp.stack([sine, cosine])  # both exact
 
 
 def _fraction_of_turn(x):
@@ -110,7 +110,7 @@ def _fraction_of_turn(x):
     for part, pieces in ((leading, _PIECES), (x - leading, _PIECES[:-1])):
         for piece in pieces:
             product = part * piece  # exact: 12 by 12 bits
-            term = product - jnp.floor(product + 0.5)
+            term = product - jnp.round(product)
             total = high + term
             rest = total - high
             low = low + ((high - (total - rest)) + (term - rest))  # Knuth's exact sum

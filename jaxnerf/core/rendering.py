@@ -52,6 +52,8 @@ def render_samples(scene, rays, samples, *, background=None):
     density = jnp.where(kept, density, 0)
     rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # as composite sums them
     length = _length(samples.delta, rays.directions)
+    dtype = jnp.result_type(length.dtype, density.dtype, rgb.dtype)
+    density, rgb = density.astype(dtype), rgb.astype(dtype)  # once, or each sum rounds its slopes to bfloat16
     weights = compositing.weights_from_density(density, length, rule=samples.rule)
     passing = compositing.transmittance(density, length)
     return Rendering(

@@ -35,7 +35,7 @@ def uniform_edges(near, far, *, num_segments, in_disparity=False):
             raise ValueError(
                 f"uniform_edges: near has {near.min()}, disparity 1 / t wants near > 0; raise near"
             )
-        inner = 1 / ((1 - s) / near + s / far)
+        inner = near / ((1 - s) + s * (near / far))
     else:
         inner = near + (far - near) * s
     inner = jnp.clip(inner, near, far)  # a rounding past the end would put samples outside

@@ -60,7 +60,8 @@ def ball(density, *, center=(0.0, 0.0, 0.0), radius=1.0, rgb=GREY, rgb_slope=Non
 
     def interval(rays):
         middle, square, size = _closest(rays, center)
-        half = jnp.sqrt(jnp.maximum(radius**2 - square, 0)) / size
+        hits = square < radius**2
+        half = jnp.where(hits, jnp.sqrt(jnp.where(hits, radius**2 - square, 1)), 0) / size
         return middle - half, middle + half
 
     return _homogeneous(density, inside, interval, rgb, rgb_slope)
