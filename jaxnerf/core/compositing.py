@@ -229,10 +229,13 @@ def _follow_transmittance(weights, depth):
     ends at tau = 4: in a cell that a wall begins in, the little there is before it must not take its place.
     """
     following = jnp.concatenate([depth[..., 1:], jnp.zeros_like(depth[..., :1])], axis=-1)
-    growth = jnp.expm1((1 / math.sqrt(3) - 1 / 2) * jnp.minimum(depth + following, 4))
-    absorbed = _absorbed(depth)
-    rest = _absorbed(depth + following) + absorbed * growth
-    share = jnp.where(rest > 0, absorbed * growth / jnp.where(rest > 0, rest, 1), 0)
+    rate = 1 / math.sqrt(3) - 1 / 2
+    both = depth + following
+    thin = both < 1e-12  # the derivative squares it, and the square must not underflow
+    held = jnp.where(thin, 1, both)
+    ratio = jnp.where(thin, rate, jnp.expm1(rate * jnp.minimum(held, 4)) / _absorbed(held))
+    grown = _absorbed(depth) * ratio
+    share = grown / (1 + grown)
     second = jnp.concatenate([weights[..., 1:], jnp.zeros_like(weights[..., :1])], axis=-1)
     moved = jnp.where(_places(depth) % 2 == 0, share * second, 0)
     return weights + moved - _previous(moved)

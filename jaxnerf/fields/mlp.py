@@ -67,7 +67,7 @@ class MLP(linen.Module):
     use_viewdirs: bool = True  # False: colour from position alone, no bottleneck and no view layer
     density_activation: str = "relu"
     density_bias: float = 0.0  # added before the activation
-    compute_dtype: Any = jnp.float32  # of the layers; encodings and the outputs stay float32
+    compute_dtype: Any = jnp.float32  # of the layers; the outputs are float32 at least
 
     @linen.compact
     def __call__(self, x, viewdirs):
@@ -83,7 +83,8 @@ class MLP(linen.Module):
             joins = layer == 0 or layer == self.skip_layer + 1
             inputs = ((encoded,) if joins else ()) + hidden
             hidden = (jax.nn.relu(Dense(self.width, name=f"trunk_{layer}")(*inputs)),)
-        density = Dense(1, name="density")(*hidden).astype(jnp.float32).reshape(shape)
+        dtype = jnp.promote_types(jnp.float32, self.compute_dtype)
+        density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
         if self.use_viewdirs:
             # The direction is encoded and multiplied once a ray, and broadcast over its samples.
             directions = encode_planes(_planes(viewdirs), num_freqs=self.num_view_freqs)
@@ -91,7 +92,7 @@ class MLP(linen.Module):
             bottleneck = Dense(self.width, name="bottleneck")(*hidden).reshape(-1, *shape)
             view = Dense(self.view_width, name="view")(bottleneck, directions)
             hidden = (jax.nn.relu(view).reshape(self.view_width, -1),)
-        rgb = Dense(3, name="rgb")(*hidden).astype(jnp.float32)
+        rgb = Dense(3, name="rgb")(*hidden).astype(dtype)
         return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 
