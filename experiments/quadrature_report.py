@@ -54,8 +54,8 @@ def report():
         raise ValueError(f"{out}: no *.json; run experiments/quadrature.py first")
     closed = measured.pop("closed", None)
     lines = closed_table(closed) if closed else []
-    for name, run in measured.items():
-        lines += ["", *trained_table(name, run)] if lines else trained_table(name, run)
+    for run in measured.values():
+        lines += ["", *trained_table(run)] if lines else trained_table(run)
     print("\n".join(lines))
     draw(
         ([closed] if closed else []) + list(measured.values()),
@@ -75,16 +75,20 @@ def closed_table(closed):
         for medium in media:
             curve = select(rows, medium=medium, rule=rule, sampling=sampling)
             needs = [need(curve, bound) for bound in BOUNDS]
-            counts = " / ".join("-" if row is None else str(row["evaluations"]) for row in needs)
-            times = " / ".join("-" if row is None else f"{row['microseconds']:.1f}" for row in needs)
-            line.append(f"{order(curve):.1f}; {counts}; {times} us")
+            costs = [
+                "never" if row is None else f"{row['evaluations']} ({row['microseconds']:.1f} us)"
+                for row in needs
+            ]
+            line.append(
+                f"{round(order(curve), 1) + 0.0:.1f}: " + ("never" if needs[0] is None else ", ".join(costs))
+            )
         cells.append(line)
     last = [select(rows, medium=medium, rule="gauss", sampling="uniform")[-1] for medium in media]
     floors = [f"{row['medium']} {row['rms32']:.0e}" for row in last if row["rms"] < 0.1 * row["rms32"]]
     bounds = " and ".join(f"{bound:.0e}" for bound in BOUNDS)
     return [
         f"Closed forms, {closed['rays']} rays each: order of the colour's RMS error in float64; evaluations, "
-        f"and microseconds a ray in float32, for {bounds}. {closed['machine']}.",
+        f"with microseconds a ray in float32, for {bounds}. {closed['machine']}.",
         "",
         *table.markdown(("rule", "sampling", *media), cells),
         "",
@@ -93,7 +97,7 @@ def closed_table(closed):
     ]
 
 
-def trained_table(name, run):
+def trained_table(run):
     """Returns lines: what each rule needs for an error, the cheapest, and its score on the photographs."""
     rows, cells = run["rows"], []
     cheapest = {bound: min(cost(rows, bound).items(), key=lambda pair: pair[1]) for bound in TRAINED_BOUNDS}
@@ -104,19 +108,19 @@ def trained_table(name, run):
             best = cheapest[bound][0] == (rule, sampling) and row is not None
             text = "-" if row is None else f"{row['evaluations']}, {1e3 * row['seconds']:.0f} ms"
             line.append(f"**{text}**" if best else text)
-        line += [f"{row['psnr']:.2f}" for row in curve]
+        line += [f"{row['psnr']:.2f}" for row in curve[:3]]
         cells.append(line)
     heads = [f"RMS {bound:.0e}" for bound in TRAINED_BOUNDS]
-    heads += [f"PSNR {row['evaluations']}" for row in curve]
+    heads += [f"PSNR {row['evaluations']}" for row in curve[:3]]
     verdicts = [
         f"{bound:.0e}: " + ("no rule" if math.isinf(seconds) else f"{rule}, {sampling}")
         for bound, ((rule, sampling), seconds) in cheapest.items()
     ]
     return [
-        f"{name} (step {run['step']}), {run['rays']} test rays: evaluations of the fine network, and time of "
-        f"all rays, for an RMS error of the colour from {run['reference']} segments in float64, with PSNR "
-        f"{run['psnr']:.2f} dB against the photographs, and which doubling changed by at most "
-        f"{run['self_difference']:.0e}; PSNR at each number of evaluations. {run['machine']}.",
+        f"{run['name']} (step {run['step']}), {run['rays']} test rays: evaluations of the fine network, and "
+        f"time of all rays, for an RMS error of the colour. The truth, {run['reference']} float64 segments, "
+        f"changed by at most {run['self_difference']:.0e} in its last doubling, scores {run['psnr']:.2f} dB "
+        f"on the photos; PSNR beside it at so many evaluations. {run['machine']}.",
         "",
         *table.markdown(("rule", "sampling", *heads), cells),
         "",
@@ -153,7 +157,7 @@ def cost(rows, bound):
 
 def order(curve):
     """Returns the order of convergence over the last factor of 4 that lies above rounding."""
-    errors = [row["rms"] for row in curve if row["rms"] > 1e-12]
+    errors = [row["rms"] for row in curve if row["rms"] > 1e-12]  # rounding in float64 is below
     return math.log2(errors[-3] / errors[-1]) / 2 if len(errors) > 2 else math.nan
 
 

@@ -37,18 +37,26 @@ HEADS = ("family", "cases", "checks", "failed", "worst value", "worst gradient",
 
 def main(argv):
     del argv
-    if not _COST_ONLY.value:
-        lines = table.markdown(HEADS, [family(*group) for group in _families()])
-        outside, _ = importance.floor_bias(importance.FLOOR)
-        print("\n".join(lines), end="\n\n")
-        print(
-            f"A floor of {importance.FLOOR:g} puts {100 * outside:.1f} % of the samples outside the weight,\n"
-            f"where that is {importance.OPACITY:g} in one of {importance.SEGMENTS} segments.\n"
-        )
-        if flags.FLAGS.readme:
-            table.replace(pathlib.Path(flags.FLAGS.readme), lines, MARKS)
+    lines = [] if _COST_ONLY.value else _table()
     for line in cost():
         print(line, flush=True)
+        lines.append(line + "  ")
+    if flags.FLAGS.readme and not _COST_ONLY.value:
+        table.replace(pathlib.Path(flags.FLAGS.readme), lines, MARKS)
+
+
+def _table():
+    """Prints every case, then the families, and returns the lines of the families."""
+    lines = table.markdown(HEADS, [family(*group) for group in _families()])
+    outside, _ = importance.floor_bias(importance.FLOOR)
+    lines += [
+        "",
+        f"A floor of {importance.FLOOR:g} on the weights puts {100 * outside:.1f} % of the samples outside "
+        f"the weight, where that is {importance.OPACITY:g} in one of {importance.SEGMENTS} segments.",
+        "",
+    ]
+    print("\n".join(lines))
+    return lines
 
 
 def family(name, cases, others):
