@@ -22,6 +22,7 @@ from jaxnerf.core.compositing import (
 )
 from jaxnerf.core.encoding import positional_encoding
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
+from jaxnerf.core.occupancy import Grid, create_grid, render_packed, update_grid
 from jaxnerf.core.rendering import positions, render_hierarchical, render_image, render_rays, render_samples
 from jaxnerf.core.sampling import (
     importance_points,
@@ -65,6 +66,8 @@ __all__ = [
     "Rendering", "weights_from_density", "transmittance", "composite", "expected_depth", "expected_disparity",
     # whole renderers
     "SceneFn", "render_samples", "render_rays", "render_hierarchical", "render_image",
+    # only where there is something
+    "Grid", "create_grid", "update_grid", "render_packed",
     # encodings, metrics, data
     "positional_encoding", "mse", "psnr", "ssim", "round_to_8_bits", "Views", "Batch",
     # trained models

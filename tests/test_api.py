@@ -36,11 +36,14 @@ SURFACE = {
     "render_hierarchical": "key coarse fine rays | num_coarse num_fine rule='segments' in_disparity=False "
     "importance_floor=0.0 background=None",
     "render_image": "render rays | chunk",
+    "create_grid": "lower upper possible | assumed",
+    "update_grid": "key grid scene cells | threshold decay=0.6 smoothing=0.2 chunk=8192",
+    "render_packed": "scene grid rays samples | capacity stop=0.0 background=None",
     "psnr": "a b | mask=None",
     "ssim": "a b |",
     "load_scene": "workdir |",
 }
-TYPES = ["Rays", "Samples", "Rendering", "Camera", "Views", "Batch", "SceneFn"]
+TYPES = ["Rays", "Samples", "Rendering", "Camera", "Views", "Batch", "Grid", "SceneFn"]
 SOURCE = r"Eqs?\. ?\d|Section \d|Appendix|arXiv|\d{4} code|released codes?|\([A-Z][a-z]+ .*\d{4}"
 
 

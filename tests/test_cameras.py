@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
-from jaxnerf import Camera, look_at, ndc_rays, ndc_to_t, pixel_grid, positions, rays_from_pixels, undistort
+from jaxnerf import (
+    Camera,
+    Rays,
+    look_at,
+    ndc_rays,
+    ndc_to_t,
+    pixel_grid,
+    positions,
+    rays_from_pixels,
+    undistort,
+)
 
 OPENCV = [[0.0] * 4, [0.08, -0.02, 0.004, -0.003], [-0.25, 0.06, 0.002, 0.001], [-0.3, 0.0, 0.0, 0.0]]
 FISHEYE = [[0.0] * 4, [0.03, -0.01, 0.004, -0.001], [-0.04, 0.01, -0.003, 0.0005]]
@@ -201,3 +211,22 @@ def test_wrong_arguments():
         ndc_to_t(jnp.ones(3), rays)
     with pytest.raises(ValueError, match="target"):
         look_at(jnp.zeros(3), jnp.ones(2), jnp.ones(3))
+
+
+@pytest.mark.parametrize(
+    "d", [(0.0, 0.0, -1e-20), (1e-3, 0.0, -1e-20), (1.0, 0.0, -1e-25), (0.3, 0.1, -1e-3)]
+)
+def test_slopes_of_grazing_ndc_rays_are_finite(d):
+    given, camera = (jnp.array([[0.1, 0.2, 0.5]]), jnp.array([d])), a_camera()
+
+    @jax.jit
+    def slopes(origins, directions):
+        def total(origins, directions):
+            ends = jnp.ones(1)
+            rays = Rays(origins=origins, directions=directions, viewdirs=directions, near=ends, far=ends)
+            got = ndc_rays(rays, camera)
+            return got.origins.sum() + got.directions.sum()
+
+        return jax.grad(total, argnums=(0, 1))(origins, directions)
+
+    assert all_finite(slopes(*given))

@@ -154,3 +154,9 @@ def test_wrong_shapes():
         jaxnerf.expected_depth(np.ones((2, 3)), np.ones((2, 3)), np.ones(2), far=np.ones(3))
     with pytest.raises(ValueError, match="expected_disparity: t"):
         jaxnerf.expected_disparity(np.ones((2, 3)), np.ones((2, 4)))
+
+
+def test_slopes_of_disparity_near_the_camera():
+    """1 / t^2 overflows long before w / t^2 does, which is 0 for an empty sample."""
+    slope = compiled(jax.grad(jaxnerf.expected_disparity, argnums=1))
+    np.testing.assert_allclose(slope(jnp.array([0.0, 0.1]), jnp.array([1e-20, 1.0])), [0, -0.1], rtol=1e-6)

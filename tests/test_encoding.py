@@ -90,3 +90,10 @@ def test_wrong_arguments():
         positional_encoding(jnp.ones(3), num_freqs=-1)
     with pytest.raises(ValueError, match="num_freqs"):
         positional_encoding(jnp.ones(3), num_freqs=0, include_input=False)
+
+
+def test_half_precision_is_raised_first():
+    x = jnp.array([[3.7, 900.0]], jnp.float16)
+    got = encode(x, num_freqs=16)
+    assert got.dtype == np.float32
+    np.testing.assert_array_equal(got, encode(x.astype(jnp.float32), num_freqs=16))

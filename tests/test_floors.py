@@ -47,7 +47,7 @@ def upward(path, source):
         top, *rest = name.split(".")
         if top == "jaxnerf":
             higher = not rest or floor(rest) > floor(own)
-            sibling = own[0] == "core" and rest[:1] == ["core"] and rest[1:2] != ["structs"]
+            sibling = own[0] == "core" and rest[:1] == ["core"] and rest[1] not in ("structs", "numerics")
             if higher or (sibling and own[1] not in ("rendering", "occupancy", "__init__")):
                 wrong.append(name)
         elif own[0] == "core" and top != "jax" and top not in sys.stdlib_module_names:

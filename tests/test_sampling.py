@@ -4,6 +4,7 @@ import pytest
 
 import jaxnerf
 from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
+from jaxnerf.core.sampling import stratified_points
 
 RAYS, SEGMENTS, POINTS = 6, 8, 5
 
@@ -197,6 +198,7 @@ def test_wrong_arguments():
         "far": lambda: jaxnerf.uniform_edges(ones(2), ones(3), num_segments=2),
         "num_segments": lambda: jaxnerf.uniform_edges(ones(2), ones(2), num_segments=0),
         "near": lambda: jaxnerf.uniform_edges(np.zeros(2), ones(2), num_segments=2, in_disparity=True),
+        "far is inf": lambda: stratified_points(None, ones(2), np.full(2, np.inf), num_points=4),
         "edges": lambda: jaxnerf.samples_from_edges(None, ones((2, 1))),
         "rule": lambda: jaxnerf.samples_from_edges(None, ones(3), rule="other"),
         "key": lambda: jaxnerf.samples_from_edges(jax.random.split(jax.random.key(0), 3), ones((2, 4))),
@@ -209,3 +211,28 @@ def test_wrong_arguments():
     }.items():
         with pytest.raises(ValueError, match=message):
             call()
+
+
+@pytest.mark.parametrize("u", [0.0, 0.25, 0.5, 1.0])
+def test_the_slope_of_inverse_cdf_is_whole_at_ties(u):
+    slope = jax.grad(lambda u: jaxnerf.inverse_cdf(np.arange(5.0), np.ones(4), u[None])[0])(f32(u))
+    assert slope == 4
+
+
+def test_weights_of_half_precision_are_raised_first():
+    weights = jax.numpy.asarray(np.random.default_rng(10).uniform(size=128), jax.numpy.bfloat16)
+    given = f32(np.linspace(2, 6, 129)), weights
+    got = importance_points(None, *given, num_points=192)
+    want = importance_points(None, given[0], weights.astype("float32"), num_points=192)
+    assert got.dtype == np.float32
+    np.testing.assert_array_equal(got, want)
+    assert samples_from_edges(None, given[0].astype(jax.numpy.bfloat16)).t.dtype == np.float32
+
+
+@pytest.mark.parametrize("near, far, count", [(2, 6, 100), (2, 6, 192), (0, 1, 100), (1000, 1000.5, 192)])
+def test_draws_lie_in_the_exact_bins(near, far, count):
+    """Edges are rounded; a draw that meets one would count in the bin before."""
+    edges = uniform_edges(f32(near), f32(far), num_segments=count)
+    t = samples_from_edges(jax.random.key(11), np.broadcast_to(edges, (20_000, count + 1))).t
+    bins = (np.asarray(t, np.float64) - near) / (far - near) * count
+    np.testing.assert_array_equal(np.floor(bins), np.broadcast_to(np.arange(count), t.shape))

@@ -8,6 +8,7 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxnerf.core.numerics import divide
 from jaxnerf.core.structs import Rays, check_shapes
 
 
@@ -28,7 +29,7 @@ def undistort(camera, pixels):
 
     Newton's method on the lens model (Brown 1966; Kannala and Brandt 2006). The gradient with respect
     to pixels, focal, center and distortion is that of the exact inverse: one differentiable Newton
-    step from the solution.
+    step from the solution. It has no second derivative.
 
     Args:
         camera: one Camera. Its lens is "pinhole"; "opencv" with distortion (k1, k2, p1, p2) or
@@ -118,7 +119,7 @@ def ndc_rays(rays, camera, *, near_plane=1.0):
 
     Returns:
         Rays [...] with near 0 and far 1; viewdirs untouched. A ray that does not go towards -z, or so
-        nearly across it that its place overflows, never meets the box and gets near = far = 0.
+        nearly across it that its place or slope overflows, never meets the box and gets near = far = 0.
 
     Raises:
         ValueError: if the camera's size is unknown.
@@ -132,13 +133,14 @@ def ndc_rays(rays, camera, *, near_plane=1.0):
 
     def lateral_and_slope(depth):
         # Both from the given origin: going to the near plane first would subtract large terms.
-        slant = rays.directions[..., :2] / depth[..., None]
+        slant = divide(rays.directions[..., :2], jnp.broadcast_to(depth[..., None], (*depth.shape, 2)))
         lateral = scale * (rays.origins[..., :2] - (near_plane + height) * slant)
         return jnp.concatenate([lateral, scale * (height * slant - rays.origins[..., :2])], axis=-1)
 
     forward = rays.directions[..., 2] < 0
     depth = jnp.where(forward, rays.directions[..., 2], -1)
-    forward &= jnp.isfinite(jax.lax.stop_gradient(lateral_and_slope(depth))).all(axis=-1)
+    slope = jax.lax.stop_gradient(lateral_and_slope(depth) / depth[..., None])  # in depth, the steepest
+    forward &= jnp.isfinite(slope).all(axis=-1)
     projected = lateral_and_slope(jnp.where(forward, rays.directions[..., 2], -1))
     plane = jnp.ones_like(projected[..., :1])
     return Rays(

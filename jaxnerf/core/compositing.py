@@ -1,10 +1,12 @@
 """From densities to what a ray sees: weights, colour, depth (Eq. 3 and its sums)."""
 
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
 
+from jaxnerf.core.numerics import at_least_float32, divide
 from jaxnerf.core.structs import check_shapes
 
 # Beyond this optical depth exp(-x) is 0 in every float type, so that nothing changes where a depth
@@ -89,7 +91,7 @@ def composite(weights, values, *, background=None, transmittance=None):
     Raises:
         ValueError: on other shapes.
     """
-    weights, values = _at_least_float32(weights, values)
+    weights, values = at_least_float32(weights, values)
     check_shapes("composite", weights=(weights, "... S"), values=(values, "... S C"))
     colour = _sum_over_samples(weights, values)
     if background is None:
@@ -116,12 +118,12 @@ def expected_depth(weights, t, transmittance, *, far):
 
     Returns:
         [...] in t. An empty ray has depth far; never NaN, as nothing is added where nothing passes.
-        What is infinite has gradient 0.
+        What multiplies an infinite t or far gets no gradient from it.
 
     Raises:
         ValueError: on other shapes.
     """
-    weights, t, transmittance, far = _at_least_float32(weights, t, transmittance, far)
+    weights, t, transmittance, far = at_least_float32(weights, t, transmittance, far)
     check_shapes(
         "expected_depth",
         weights=(weights, "... S"),
@@ -129,7 +131,7 @@ def expected_depth(weights, t, transmittance, *, far):
         transmittance=(transmittance, "..."),
         far=(far, "..."),
     )
-    return _share_of(weights, t).sum(axis=-1) + _share_of(transmittance, far)
+    return share_of(weights, t).sum(axis=-1) + share_of(transmittance, far)
 
 
 def expected_disparity(weights, t):
@@ -146,10 +148,35 @@ def expected_disparity(weights, t):
     Raises:
         ValueError: if the shapes differ.
     """
-    weights, t = _at_least_float32(weights, t)
+    weights, t = at_least_float32(weights, t)
     check_shapes("expected_disparity", weights=(weights, "... S"), t=(t, "... S"))
+    return share_over(weights, t).sum(axis=-1)
+
+
+def packed_weights(density, length, starts, *, longest):
+    """Returns the weights of samples of many rays in one row, ray after ray.
+
+    Args:
+        density, length: [K], as in weights_from_density.
+        starts: [K] bool, the first sample of each ray.
+        longest: no ray has more samples.
+
+    Returns:
+        [K] weights, and [K] optical depths sigma l, of which none exceeds what lets nothing through.
+
+    Raises:
+        ValueError: if the shapes differ.
+    """
+    depth = _optical_depth("packed_weights", density, length)
+    check_shapes("packed_weights", density=(density, "K"), starts=(starts, "K"))
+    return _packed_weights(depth, starts, longest), depth
+
+
+def share_over(weight, t):
+    """Returns weight over t, where 0 / 0 is 0 and an infinite quotient by 0 has no gradient."""
     touching = t == 0
-    return _share_of(weights, jnp.where(touching, jnp.inf, 1 / jnp.where(touching, 1, t))).sum(axis=-1)
+    quotient = divide(jnp.where(touching, 0, weight), jnp.where(touching, 1, t))
+    return jnp.where(touching & (weight != 0), jnp.inf * jax.lax.stop_gradient(weight), quotient)
 
 
 def _sum_over_samples(weights, values):
@@ -159,16 +186,10 @@ def _sum_over_samples(weights, values):
     return jnp.stack([(weights * values[..., i]).sum(axis=-1) for i in range(values.shape[-1])], axis=-1)
 
 
-def _share_of(weight, place):
+def share_of(weight, place):
     """Returns weight times place, where 0 times inf is 0 and an infinite product has no gradient."""
     endless = jnp.isinf(place)
     return jnp.where(endless & (weight > 0), place, weight * jnp.where(endless, 0, place))
-
-
-def _at_least_float32(*arrays):
-    arrays = [jnp.asarray(array) for array in arrays]
-    dtype = jnp.result_type(jnp.float32, *(array.dtype for array in arrays))
-    return [array.astype(dtype) for array in arrays]
 
 
 def _optical_depth(function, density, length):
@@ -177,7 +198,7 @@ def _optical_depth(function, density, length):
     Both operands are replaced there, as the derivative of a product multiplies by them. Empty space
     without an end (0 times inf) counts for nothing.
     """
-    density, length = _at_least_float32(density, length)
+    density, length = at_least_float32(density, length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))
     opaque = density * length > _OPAQUE
     empty = (length <= 0) | (jnp.isinf(length) & (density == 0))
@@ -206,6 +227,22 @@ def _weights_jvp(primals, tangents, *, long_ray=4096):
         return weights, _change_of_long_ray(weights, behind, tangent)
     change = behind * _running_sum(tangent)
     return weights, change - _previous(change)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _packed_weights(depth, starts, longest):
+    behind = jnp.exp(-_running_sum_since(starts, depth, longest))
+    return jnp.where(starts, 1, _previous(behind)) * _absorbed(depth)
+
+
+@_packed_weights.defjvp
+def _packed_weights_jvp(longest, primals, tangents):
+    """As _weights_jvp."""
+    depth, starts = primals
+    behind = jnp.exp(-_running_sum_since(starts, depth, longest))
+    change = behind * _running_sum_since(starts, tangents[0], longest)
+    weights = jnp.where(starts, 1, _previous(behind)) * _absorbed(depth)
+    return weights, change - jnp.where(starts, 0, _previous(change))
 
 
 def _change_of_long_ray(weights, behind, tangent):
@@ -257,6 +294,19 @@ def _running_sum(x, block=16):
     inside = _running_sum(blocks, block)
     total = inside + _previous(_running_sum(inside[..., -1], block))[..., None]
     return total.reshape(*x.shape[:-1], -1)[..., :size]
+
+
+def _running_sum_since(starts, x, longest):
+    """Returns the sum of all entries [K] from the last start up to each (Hillis and Steele 1986)."""
+    step = 1
+    while step < min(longest, x.size):
+        nothing, closed = jnp.zeros(step, x.dtype), jnp.ones(step, bool)
+        x, starts = (
+            jnp.where(starts, x, x + jnp.concatenate([nothing, x[:-step]])),
+            starts | jnp.concatenate([closed, starts[:-step]]),
+        )
+        step *= 2
+    return x
 
 
 def _places(x):

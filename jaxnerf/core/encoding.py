@@ -6,6 +6,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from jaxnerf.core.numerics import at_least_float32
+
 # 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half a float32's
 # digits is exact. Six pieces hold |x| 2^k up to 1e6 * 2^15 to 2^-27 of a turn.
 _TURNS = 0x28BE60DB9391054A7F
@@ -30,7 +32,7 @@ def positional_encoding(x, *, num_freqs, include_input=True):
 
     Returns:
         [..., D (1 + 2F)], or [..., D 2F] without the input, ordered as in Eq. 4, each entry D
-        wide. Infinite x gives NaN in its sines and cosines. The gradient of sin 2^k x is
+        wide and at least float32. Infinite x gives NaN in its sines and cosines. The gradient of sin 2^k x is
         2^k cos 2^k x, as exact.
 
     Raises:
@@ -44,6 +46,7 @@ def positional_encoding(x, *, num_freqs, include_input=True):
         )
     if x.ndim == 0 or not jnp.issubdtype(x.dtype, jnp.floating):
         raise ValueError(f"positional_encoding: x is {x.dtype}{list(x.shape)}, wanted floating [..., D]")
+    (x,) = at_least_float32(x)
     planes = encode_planes(
         jnp.moveaxis(x, -1, 0).reshape(x.shape[-1], -1), num_freqs=num_freqs, include_input=include_input
     )

@@ -5,6 +5,7 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxnerf.core.numerics import at_least_float32
 from jaxnerf.core.structs import check_shapes
 
 
@@ -13,7 +14,7 @@ def mse(a, b, *, mask=None):
 
     NaN where the mask is empty. Raises ValueError if the shapes differ.
     """
-    a, b = jnp.asarray(a), jnp.asarray(b)
+    a, b = at_least_float32(a, b)
     check_shapes("mse", a=(a, "... H W C"), b=(b, "... H W C"))
     if mask is None:
         return ((a - b) ** 2).mean(axis=(-3, -2, -1))
@@ -69,7 +70,7 @@ def ssim(a, b):
     Raises:
         ValueError: if the shapes differ, or a side is under 11 pixels.
     """
-    a, b = jnp.asarray(a), jnp.asarray(b)
+    a, b = at_least_float32(a, b)
     check_shapes("ssim", a=(a, "... H W C"), b=(b, "... H W C"))
     size, deviation = 11, 1.5
     if min(a.shape[-3:-1]) < size:

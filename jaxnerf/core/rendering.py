@@ -44,14 +44,10 @@ def render_samples(scene, rays, samples, *, background=None):
     x = positions(rays, t)
     x = jnp.where(kept[..., None], x, jax.lax.stop_gradient(x))  # nor may a slope of NaN come back
     density, rgb = scene(x, rays.viewdirs[..., None, :])
-    if density.shape != t.shape or rgb.shape != (*t.shape, 3):
-        raise ValueError(
-            f"render_samples: the scene returned density {density.shape} and rgb {rgb.shape} for positions "
-            f"{(*t.shape, 3)}, wanted {t.shape} and {(*t.shape, 3)}"
-        )
+    check_answer("render_samples", density, rgb, x)
     density = jnp.where(kept, density, 0)
     rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # as composite sums them
-    length = _length(samples.delta, rays.directions)
+    length = world_length(samples.delta, rays.directions)
     dtype = jnp.result_type(length.dtype, density.dtype, rgb.dtype)
     density, rgb = density.astype(dtype), rgb.astype(dtype)  # once, or each sum rounds its slopes to bfloat16
     weights = compositing.weights_from_density(density, length, rule=samples.rule)
@@ -191,7 +187,16 @@ def render_image(render, rays, *, chunk):
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
 
 
-def _length(delta, directions):
+def check_answer(function, density, rgb, x):
+    """Raises a ValueError unless a scene's answer has the shapes that positions x [..., 3] want."""
+    if density.shape != x.shape[:-1] or rgb.shape != x.shape:
+        raise ValueError(
+            f"{function}: the scene returned density {density.shape} and rgb {rgb.shape} for positions "
+            f"{x.shape}, wanted {x.shape[:-1]} and {x.shape}"
+        )
+
+
+def world_length(delta, directions):
     """Returns delta in world units; kept apart from an endless one, whose derivative would be 0 times inf."""
     size = norm(directions)[..., None]
     endless = jnp.isinf(delta)

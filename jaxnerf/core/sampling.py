@@ -5,6 +5,7 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxnerf.core.numerics import at_least_float32, divide, hold
 from jaxnerf.core.structs import Samples, check_shapes
 
 
@@ -31,14 +32,14 @@ def uniform_edges(near, far, *, num_segments, in_disparity=False):
     near, far = near[..., None].astype(dtype), far[..., None].astype(dtype)
     s = (jnp.arange(1, num_segments, dtype=dtype) / num_segments).reshape((1,) * (near.ndim - 1) + (-1,))
     if in_disparity:
-        if not isinstance(near, jax.core.Tracer) and not bool((near > 0).all()):
+        if _is_known(~(near > 0).all()):
             raise ValueError(
                 f"uniform_edges: near has {near.min()}, disparity 1 / t wants near > 0; raise near"
             )
         inner = near / ((1 - s) + s * (near / far))
     else:
         inner = near + (far - near) * s
-    inner = jnp.clip(inner, near, far)  # a rounding past the end would put samples outside
+    inner = hold(inner, near, far)  # a rounding past the end would put samples outside
     return jnp.concatenate([near, inner, far], axis=-1)
 
 
@@ -62,7 +63,7 @@ def samples_from_edges(key, edges, *, rule="segments"):
     Raises:
         ValueError: on fewer than two edges, other shapes of the key, or another rule.
     """
-    edges = jnp.asarray(edges)
+    (edges,) = at_least_float32(edges)
     _check_edges("samples_from_edges", edges)
     if rule == "gauss":
         return _gauss_samples(edges if key is None else _moved_edges(key, edges))
@@ -89,7 +90,7 @@ def samples_from_points(t, *, last_delta=1e10):
     Raises:
         ValueError: if t has no sample axis.
     """
-    t = jnp.asarray(t)
+    (t,) = at_least_float32(t)
     check_shapes("samples_from_points", t=(t, "... S"))
     last = jnp.full_like(t[..., :1], last_delta)
     return Samples(t=t, delta=jnp.concatenate([jnp.diff(t), last], axis=-1), rule="points")
@@ -115,7 +116,7 @@ def inverse_cdf(edges, weights, u):
     Raises:
         ValueError: on other shapes.
     """
-    edges, weights, u = jnp.asarray(edges), jnp.asarray(weights), jnp.asarray(u)
+    edges, weights, u = at_least_float32(edges, weights, u)
     check_shapes("inverse_cdf", edges=(edges, "... E"), weights=(weights, "... S"), u=(u, "... N"))
     if edges.shape[-1] != weights.shape[-1] + 1:
         raise ValueError(
@@ -134,8 +135,8 @@ def inverse_cdf(edges, weights, u):
     lower_sum, upper_sum = _take(cdf, index), _take(cdf, index + 1)
     lower, upper = _take(edges, index), _take(edges, index + 1)
     width = upper_sum - lower_sum
-    share = jnp.where(width > 0, (target - lower_sum) / jnp.where(width > 0, width, 1.0), 0.0)
-    return jnp.clip(_part_way(lower, upper, share), lower, upper)
+    share = jnp.where(width > 0, divide(target - lower_sum, jnp.where(width > 0, width, 1)), 0)
+    return hold(_part_way(lower, upper, share), lower, upper)
 
 
 def importance_points(key, edges, weights, *, num_points, floor=0.0):
@@ -158,7 +159,7 @@ def importance_points(key, edges, weights, *, num_points, floor=0.0):
     Raises:
         ValueError: on other shapes, or N < 1.
     """
-    edges, weights = jax.lax.stop_gradient((jnp.asarray(edges), jnp.asarray(weights)))
+    edges, weights = jax.lax.stop_gradient(at_least_float32(edges, weights))
     if num_points < 1:
         raise ValueError(f"importance_points: num_points is {num_points}, wanted at least 1")
     shape = (*weights.shape[:-1], num_points)
@@ -182,7 +183,7 @@ def merge_edges(edges, points):
     Raises:
         ValueError: if the leading axes differ.
     """
-    edges, points = jnp.asarray(edges), jnp.asarray(points)
+    edges, points = at_least_float32(edges, points)
     check_shapes("merge_edges", edges=(edges, "... E"), points=(points, "... N"))
     return jnp.sort(jnp.concatenate([edges, points], axis=-1), axis=-1)
 
@@ -204,6 +205,8 @@ def stratified_points(key, near, far, *, num_points, in_disparity=False):
     """
     if num_points < 2:
         raise ValueError(f"stratified_points: num_points is {num_points}, wanted at least 2")
+    if _is_known(jnp.isinf(jnp.asarray(far)).any()):
+        raise ValueError("stratified_points: far is inf, where the last point would lie; give a finite far")
     points = uniform_edges(near, far, num_segments=num_points - 1, in_disparity=in_disparity)
     if key is None:
         return points
@@ -258,7 +261,7 @@ def _per_ray(function, keys):
 def _gauss_samples(edges):
     lower, upper = edges[..., :-1], edges[..., 1:]
     shares = [0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12)]
-    t = jnp.stack([jnp.clip(_part_way(lower, upper, share), lower, upper) for share in shares], axis=-1)
+    t = jnp.stack([hold(_part_way(lower, upper, share), lower, upper) for share in shares], axis=-1)
     half = 0.5 * _width(lower, upper)
     delta = jnp.stack([half, half], axis=-1)
     flat = (*lower.shape[:-1], 2 * lower.shape[-1])
@@ -274,9 +277,14 @@ def _moved_edges(key, edges):
 def _between(key, lower, upper):
     """A draw in [lower, upper) or the middle, never past either end by rounding."""
     if key is None:
-        return jnp.clip(_part_way(lower, upper, 0.5), lower, upper)
+        return hold(_part_way(lower, upper, 0.5), lower, upper)
     draw = _part_way(lower, upper, uniform(key, lower.shape).astype(lower.dtype))
-    return jnp.clip(draw, lower, jnp.nextafter(*jax.lax.stop_gradient((upper, lower))))
+    # Edges are rounded themselves: a draw this close to one may lie in the next of the exact bins.
+    finite_upper = jnp.where(jnp.isinf(upper), lower, upper)
+    rounding = 2 * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(finite_upper))
+    margin = jnp.minimum(rounding, 0.25 * (finite_upper - lower))
+    below = jnp.nextafter(*jax.lax.stop_gradient((upper, lower)))
+    return hold(draw, lower + margin, jnp.minimum(upper - margin, below))
 
 
 def _part_way(lower, upper, share):
@@ -303,6 +311,11 @@ def _count_below(sums, target):
 
 def _take(values, index):
     return jnp.take_along_axis(values, index, axis=-1)
+
+
+def _is_known(condition):
+    """Returns whether a condition holds already while the program is traced."""
+    return not isinstance(condition, jax.core.Tracer) and bool(condition)
 
 
 def _check_edges(function, edges):

@@ -117,10 +117,10 @@ def check_shapes(function, **arrays):
         shape, axes = jnp.shape(array), pattern.split()
         tail = [axis for axis in axes if axis != "..."]
         leading = shape[: len(shape) - len(tail)]
-        found = dict(zip(tail, shape[len(leading) :], strict=False))
+        found = zip(tail, shape[len(leading) :], strict=False)
         fits = len(shape) >= len(tail) if "..." in axes else len(shape) == len(tail)
         fits = fits and ("..." not in axes or known.setdefault("...", leading) == leading)
-        for axis, length in found.items():
+        for axis, length in found:
             wanted = int(axis) if axis.isdigit() else known.setdefault(axis, length)
             fits = fits and length == wanted
         if not fits:

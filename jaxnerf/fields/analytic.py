@@ -7,8 +7,8 @@ from where its light stops on average:
     T = exp(-tau(far)),   D = near + integral of exp(-tau(t)) dt,   C = (1 - T) c(o) + rgb_slope d (D - T far)
 
 tau is in closed form everywhere. So is the integral in homogeneous media; in the others Gauss-Legendre
-panels sum exp(-tau), within 1e-9 in float64 (tests/test_analytic.py). Parameters may be traced: the
-answers are differentiable, in them and in the rays.
+panels sum exp(-tau), within 1e-9 in float64 up to optical depths of some hundreds. Parameters may be
+traced: the answers are differentiable, in them and in the rays.
 """
 
 import math
@@ -29,7 +29,7 @@ class Exact(NamedTuple):
     """What a ray [...] truly sees; far must be finite."""
 
     rgb: jax.Array  # [..., 3] over a black background
-    opacity: jax.Array  # [...] with all its digits also in thin fog
+    opacity: jax.Array  # [...] with all its digits also in thin fog, but in the tail of a blob
     transmittance: jax.Array  # [...]
     depth: jax.Array  # [...] in t, what passes through counts at far
 
