@@ -1,4 +1,4 @@
-"""The demo: the embedded scene at 100 x 100 in under two minutes on two CPU cores."""
+"""The demo: the embedded scene at 100 x 100 in two to three minutes on two CPU cores."""
 
 from configs import lego_small
 

@@ -6,10 +6,16 @@ Trains to each time in turn, resuming from the one before, scores the 25 test vi
 the table. Seconds are of training; compilation stands beside them.
 """
 
+import pathlib
+import sys
+
+import table
 from absl import flags
 from ml_collections import config_flags
 
 from jaxnerf import app
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent))  # configurations import configs
 
 _CONFIG = config_flags.DEFINE_config_file("config", "configs/lego_small.py", "The run.", lock_config=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
@@ -19,7 +25,6 @@ _MINUTES = flags.DEFINE_list("minutes", ["2", "5", "10"], "Of training, ascendin
 def main(argv):
     """Trains and scores at each of the times."""
     del argv
-    from experiments import table
     from jaxnerf.engine.evaluate import evaluate
     from jaxnerf.engine.loop import train_and_evaluate
 

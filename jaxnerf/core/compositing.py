@@ -179,17 +179,17 @@ def share_over(weight, t):
     return jnp.where(touching & (weight != 0), jnp.inf * jax.lax.stop_gradient(weight), quotient)
 
 
+def share_of(weight, place):
+    """Returns weight times place, where 0 times inf is 0 and an infinite product has no gradient."""
+    endless = jnp.isinf(place)
+    return jnp.where(endless & (weight > 0), place, weight * jnp.where(endless, 0, place))
+
+
 def _sum_over_samples(weights, values):
     """Returns the weighted sums; few channels one by one, as an inner axis of 3 fills no vector register."""
     if values.shape[-1] > 4:
         return (weights[..., None] * values).sum(axis=-2)
     return jnp.stack([(weights * values[..., i]).sum(axis=-1) for i in range(values.shape[-1])], axis=-1)
-
-
-def share_of(weight, place):
-    """Returns weight times place, where 0 times inf is 0 and an infinite product has no gradient."""
-    endless = jnp.isinf(place)
-    return jnp.where(endless & (weight > 0), place, weight * jnp.where(endless, 0, place))
 
 
 def _optical_depth(function, density, length):
@@ -281,8 +281,8 @@ def _follow_transmittance(weights, depth):
 def _running_sum(x, block=16):
     """Returns the sum of all entries up to each.
 
-    By products with a triangle of ones, block by block: three times as fast as jnp.cumsum on a CPU, and
-    as close. Entries must be finite, or a whole block is NaN.
+    By products with a triangle of ones, block by block: faster on a CPU than jnp.cumsum, and as close.
+    Entries must be finite, or a whole block is NaN.
     """
     size = x.shape[-1]
     if size <= block:
