@@ -11,7 +11,7 @@ def mlp():
             "width": 256,  # features a layer
             "skip_layer": 4,  # the encoded position joins again after the layer of this index
             "view_width": 128,  # features of the layer that sees the direction
-            "num_freqs": 10,  # octaves of the position
+            "num_freqs": 10,  # octaves of the position; 0, with space.skip_empty, fits the images
             "num_view_freqs": 4,  # octaves of the direction
             "use_viewdirs": True,  # False: colour does not depend on the direction
             "density_activation": "relu",  # "relu" or "softplus"
@@ -34,9 +34,11 @@ def get_config():
                 "near": 2.0,  # in t; the embedded scene brings its own
                 "far": 6.0,  # in t
                 "background": "white",  # behind alpha and behind the scene: "white", "black" or "none"
+                "hold_out": 0,  # every n-th training view is in the split "held_out" instead
                 "pixel_offset": 0.5,  # px; 0.5 looks through pixel centres, 0 is what the 2020 code did
                 "ndc": False,  # normalised device coordinates, for forward-facing captures
             },
+            "field": "mlp",  # what "fine" is: "mlp", or "grid": the features below, with space.skip_empty
             "coarse": mlp(),  # guides the fine samples
             "fine": mlp(),  # is what counts; absent when sampling.num_fine is 0
             "sampling": {
@@ -46,6 +48,28 @@ def get_config():
                 "in_disparity": False,  # coarse samples in equal steps of 1 / t
                 "importance_floor": 0.0,  # added to the weights before they guide samples
                 "density_noise": 0.0,  # 1 / world unit, deviation of noise on the density in training
+            },
+            "features": {  # the fast field
+                "resolutions": (),  # vertices along the longest side, a level each; () fits the images
+                "features": 4,  # of a vertex
+                "table_size": 2**17,  # vertices of a level that have their own features
+                "view_width": 64,  # of the hidden layer for colour
+                "use_viewdirs": True,
+                "scale": 4.0,  # of the features over their table, whose learning rate it multiplies
+            },
+            "space": {  # where the scene is asked; what is 0 or () fits cameras, masks and images
+                "skip_empty": False,  # one field on equal steps where something is; no coarse network
+                "masks": True,  # alpha 0 shows that nothing is there
+                "lower": (),  # world units, the box; outside of it there is nothing
+                "upper": (),
+                "step": 0.0,  # world units between samples
+                "resolution": 0,  # cells along the longest side
+                "threshold": 0.01,  # share of light that a step absorbs, below which a cell is empty
+                "update_every": 64,  # steps between looks at the cells
+                "look_at_once": 2**18,  # cells
+                "samples_per_ray": 13,  # room in training's pool; rays without room are left out and counted
+                "hide_beyond": 4.0,  # optical depth by the grid's guess behind which training asks no more
+                "hide_from": 400,  # step
             },
             "train": {
                 "batch_size": 1024,  # rays a step, over all devices
@@ -69,6 +93,10 @@ def get_config():
             "eval": {
                 "split": "test",
                 "chunk": 4096,  # rays rendered at once
+                "samples": 1.0,  # along a ray, times those of training
+                "skip_empty": False,  # leaves out what a network trained along whole rays shows to be empty
+                "stop": 1e-3,  # where empty space is skipped: a ray ends where no more than this passes
+                "samples_at_once": 16_384,  # where empty space is skipped
                 "at_end": False,  # score the split when training ends
             },
         }

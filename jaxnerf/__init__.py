@@ -22,7 +22,8 @@ from jaxnerf.core.compositing import (
 )
 from jaxnerf.core.encoding import positional_encoding
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
-from jaxnerf.core.occupancy import Grid, create_grid, render_packed, update_grid
+from jaxnerf.core.occupancy import Grid, create_grid, grid_of_scene, restrict_scene, update_grid
+from jaxnerf.core.packing import render_packed
 from jaxnerf.core.rendering import positions, render_hierarchical, render_image, render_rays, render_samples
 from jaxnerf.core.sampling import (
     importance_points,
@@ -30,6 +31,7 @@ from jaxnerf.core.sampling import (
     merge_edges,
     samples_from_edges,
     samples_from_points,
+    stepped_edges,
     uniform_edges,
 )
 from jaxnerf.core.structs import Batch, Camera, Rays, Rendering, Samples, SceneFn, Views
@@ -60,14 +62,14 @@ __all__ = [
     "Camera", "Rays", "pixel_grid", "undistort", "rays_from_pixels", "ndc_rays", "ndc_to_t", "look_at",
     "turntable",
     # samples along rays
-    "Samples", "uniform_edges", "samples_from_edges", "samples_from_points", "inverse_cdf", 
+    "Samples", "uniform_edges", "stepped_edges", "samples_from_edges", "samples_from_points", "inverse_cdf",
     "importance_points", "merge_edges", "positions",
     # from densities to colour
     "Rendering", "weights_from_density", "transmittance", "composite", "expected_depth", "expected_disparity",
     # whole renderers
     "SceneFn", "render_samples", "render_rays", "render_hierarchical", "render_image",
     # only where there is something
-    "Grid", "create_grid", "update_grid", "render_packed",
+    "Grid", "create_grid", "update_grid", "grid_of_scene", "restrict_scene", "render_packed",
     # encodings, metrics, data
     "positional_encoding", "mse", "psnr", "ssim", "round_to_8_bits", "Views", "Batch",
     # trained models

@@ -14,6 +14,13 @@ _CHUNK = flags.DEFINE_integer("chunk", None, "Rays at once; config.eval.chunk wh
 _WATCH = flags.DEFINE_bool("watch", False, "Score new checkpoints as they come, until training's last step.")
 _POLL = flags.DEFINE_float("poll_seconds", 10.0, "How often --watch looks.", lower_bound=0.01)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier result.")
+_SKIP_EMPTY = flags.DEFINE_bool("skip_empty", None, "Find what a dense model shows to be empty, and skip it.")
+_ERROR_BUDGET = flags.DEFINE_float(
+    "error_budget",
+    None,
+    "Render as cheaply as the RMS colour error against the model's own exact rendering stays within this.",
+    lower_bound=0.0,
+)
 _PREDICTIONS = flags.DEFINE_string(
     "predictions", None, "Score the images in this folder (or its color/) in place of a run's renderings."
 )
@@ -21,7 +28,7 @@ _PREDICTIONS = flags.DEFINE_string(
 
 def main(argv):
     del argv
-    from jaxnerf.engine import evaluate, predictions, watch, workdir
+    from jaxnerf.engine import budget, evaluate, predictions, watch, workdir
 
     if not (_WORKDIR.value or _PREDICTIONS.value):
         raise ValueError("nothing to score: give --workdir=DIR of a run, or --predictions=DIR of images")
@@ -45,12 +52,18 @@ def main(argv):
         )
         return
     else:
+        settings = {} if _SKIP_EMPTY.value is None else {"skip_empty": _SKIP_EMPTY.value}
+        if _ERROR_BUDGET.value is not None:
+            settings = budget.choose(
+                _WORKDIR.value, _ERROR_BUDGET.value, config=config, split=_SPLIT.value, step=_STEP.value
+            )
         results = evaluate.evaluate(
             _WORKDIR.value,
             config=config,
             split=_SPLIT.value,
             step=_STEP.value,
             chunk=_CHUNK.value,
+            settings=settings,
             overwrite=_OVERWRITE.value,
         )
     print(evaluate.summary(results))

@@ -52,13 +52,7 @@ def undistort(camera, pixels):
     target = (pixels - center) / focal
     if camera.distortion is None or camera.lens == "pinhole":
         return target, jnp.ones(target.shape[:-1], bool)
-    distortion = jnp.asarray(camera.distortion)
-    if (camera.lens, distortion.size) not in (("opencv", 4), ("opencv", 5), ("fisheye", 4)):
-        raise ValueError(
-            f"undistort: lens {camera.lens!r} with {distortion.size} coefficients, wanted 'opencv' with 4 or "
-            "5 (k1, k2, p1, p2[, k3]) or 'fisheye' with 4 (k1, k2, k3, k4); pad with zeros"
-        )
-    distort = _brown if camera.lens == "opencv" else _equidistant
+    distort, distortion = _lens("undistort", camera)
     flat = target.reshape(-1, 2)
     points, converged = jax.vmap(lambda goal: _invert(distort, distortion, goal))(flat)
     if camera.lens == "fisheye":
@@ -104,6 +98,49 @@ def rays_from_pixels(camera, pixels, *, near, far):
         near=near,
         far=jnp.where(converged, far, near),
     )
+
+
+def project(camera, x):
+    """Returns where a camera sees points of the world: what rays_from_pixels undoes.
+
+    Args:
+        camera: one Camera (use jax.vmap for a stack).
+        x: [..., 3] world units.
+
+    Returns:
+        pixels [..., 2] px, (x, y); and depth [...] in world units along the camera's axis, > 0 in front,
+        the t of rays_from_pixels. A point that no pixel sees, as it is not in front or past a fold of the
+        lens, gets pixels inf, with gradient 0: outside every image.
+
+    Raises:
+        ValueError: on other shapes or an unknown lens.
+    """
+    x = jnp.asarray(x)
+    check_shapes("project", x=(x, "... 3"), to_world=(camera.to_world, "3 4"))
+    to_world, lead = jnp.asarray(camera.to_world), (1,) * (x.ndim - 1)
+    focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
+    offset = x - to_world[:, 3].reshape(*lead, 3)
+    # Sums of products, as a matrix unit may round the camera to ten bits.
+    local = (to_world[:, :3].reshape(*lead, 3, 3) * offset[..., None]).sum(axis=-2)
+    depth = -local[..., 2]
+    seen = depth > 0
+    points = jnp.stack([local[..., 0], -local[..., 1]], axis=-1) / jnp.where(seen, depth, 1)[..., None]
+    if camera.distortion is not None and camera.lens != "pinhole":
+        distort, distortion = _lens("project", camera)
+        if camera.lens == "fisheye":
+            radius = norm(points)
+            wide = radius > 1e-4  # below, the series is exact, and its derivative has no 0 / 0
+            angle = jnp.where(wide, jnp.arctan(radius) / jnp.where(wide, radius, 1), 1 - radius**2 / 3)
+            points = points * angle[..., None]
+        flat = points.reshape(-1, 2)
+
+        def has_image(point):
+            return _growing(distort, distortion, point) & jnp.isfinite(distort(distortion, point)).all()
+
+        seen &= jax.vmap(has_image)(jax.lax.stop_gradient(flat)).reshape(seen.shape)
+        flat = jnp.where(seen.reshape(-1, 1), flat, 0)
+        points = jax.vmap(lambda point: distort(distortion, point))(flat).reshape(points.shape)
+    return jnp.where(seen[..., None], points * focal + center, jnp.inf), depth
 
 
 def ndc_rays(rays, camera, *, near_plane=1.0):
@@ -227,6 +264,17 @@ def turntable(num_frames, *, center, radius, elevation, up=(0.0, 0.0, 1.0)):
     return jax.vmap(pose)(2 * math.pi * jnp.arange(num_frames) / num_frames)
 
 
+def _lens(function, camera):
+    """Returns the forward model distort(distortion, point) of a camera's lens, and its distortion."""
+    distortion = jnp.asarray(camera.distortion)
+    if (camera.lens, distortion.size) not in (("opencv", 4), ("opencv", 5), ("fisheye", 4)):
+        raise ValueError(
+            f"{function}: lens {camera.lens!r} with {distortion.size} coefficients, wanted 'opencv' with 4 "
+            "or 5 (k1, k2, p1, p2[, k3]) or 'fisheye' with 4 (k1, k2, k3, k4); pad with zeros"
+        )
+    return _brown if camera.lens == "opencv" else _equidistant, distortion
+
+
 def _brown(distortion, point):
     """The "opencv" lens: radial and tangential terms on the plane at distance 1 (Brown 1966)."""
     k1, k2, p1, p2 = distortion[:4]
@@ -249,6 +297,15 @@ def _equidistant(distortion, point):
     return point * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
 
 
+def _growing(distort, distortion, point):
+    """Returns whether the image grows from the axis to a point [2]: past a fold a pixel is met again."""
+    fractions = jnp.linspace(0, 1, 32, dtype=point.dtype)
+    _, slopes = jax.vmap(
+        lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),))
+    )(fractions)
+    return ((slopes * point[None]).sum(axis=-1)[1:] > 0).all() | (norm(point) == 0)
+
+
 def _invert(distort, distortion, goal):
     """Returns the point [2] with distort(point) = goal [2], and whether it is one on the lens's own side."""
 
@@ -268,14 +325,8 @@ def _invert(distort, distortion, goal):
 
     point = jax.lax.fori_loop(0, 32, follow, jnp.zeros_like(fixed))
     residual = norm(distort(start, point) - fixed)
-    # Past a fold of the lens the same pixel is met again: the image must grow all the way there.
-    fractions = jnp.linspace(0, 1, 32, dtype=goal.dtype)
-    _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(start, s * point), (s,), (jnp.ones_like(s),)))(
-        fractions
-    )
-    growing = ((slopes * point[None]).sum(axis=-1)[1:] > 0).all() | (norm(point) == 0)
     tolerance = 8 * jnp.finfo(goal.dtype).eps * (1 + norm(fixed))
-    converged = (residual <= tolerance) & growing
+    converged = (residual <= tolerance) & _growing(distort, start, point)
     point = jax.lax.stop_gradient(jnp.where(converged, point, 0))
     refined, _ = newton(point, distortion, goal)
     return jnp.where(converged, refined, 0), converged

@@ -74,6 +74,14 @@ def opacity(density, length):
     return _absorbed(_optical_depth("opacity", density, length).sum(axis=-1))
 
 
+def sum_before(values):
+    """Returns [..., S], the sum of all values [..., S] before each, which must be finite.
+
+    Of optical depths it is the one in the exponent of T_i (Eq. 3).
+    """
+    return _previous(_running_sum(values))
+
+
 def composite(weights, values, *, background=None, transmittance=None):
     """Returns the weighted sum of values along each ray, over a background.
 

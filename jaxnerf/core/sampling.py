@@ -43,6 +43,36 @@ def uniform_edges(near, far, *, num_segments, in_disparity=False):
     return jnp.concatenate([near, inner, far], axis=-1)
 
 
+def stepped_edges(key, near, far, *, step, num_segments):
+    """Returns the edges of segments of one length, so that a ray has as many as it is long.
+
+    What the marching of arXiv:2201.05989 does with one draw a ray, in place of Eq. 2's one a segment.
+
+    Args:
+        key: None, one key, or one key a ray [...]: moves all edges of a ray by one draw of up to a step,
+            which costs one number a ray. None moves none.
+        near, far: [...] in t, near <= far, both finite.
+        step: [...] or a number, in t, > 0.
+        num_segments: S >= 1. Those past far are empty; where S steps do not reach far, the last is longer.
+
+    Returns:
+        [..., S + 1] ascending edges; the first is near and the last is far, exactly.
+
+    Raises:
+        ValueError: on other shapes or S < 1.
+    """
+    near, far = at_least_float32(jnp.asarray(near), jnp.asarray(far))
+    check_shapes("stepped_edges", near=(near, "..."), far=(far, "..."))
+    if num_segments < 1:
+        raise ValueError(f"stepped_edges: num_segments is {num_segments}, wanted at least 1")
+    moved = 0.0 if key is None else uniform(key, (*near.shape, 1))
+    count = jnp.arange(1, num_segments, dtype=near.dtype).reshape((1,) * near.ndim + (-1,))
+    step = jnp.broadcast_to(jnp.asarray(step, near.dtype), near.shape)
+    inner = near[..., None] + (count - moved) * step[..., None]
+    inner = jnp.minimum(inner, far[..., None])
+    return jnp.concatenate([near[..., None], inner, far[..., None]], axis=-1)
+
+
 def samples_from_edges(key, edges, *, rule="segments"):
     """Returns the samples of each segment: one anywhere in it or in its middle, or two Gauss points.
 

@@ -52,3 +52,11 @@ def _check_rotation(rotation, source, tolerance=1e-3):
 
 def _wrong(source, found, wanted):
     return ValueError(f"{source}: the camera-to-world matrix has {found}, wanted {wanted}")
+
+
+def gaze_center(to_world):
+    """Returns the point [3] nearest to the axes of cameras [V, 3, 4], in the mean of squares; float64."""
+    poses = np.asarray(to_world, np.float64)
+    eyes, axes = poses[:, :, 3], poses[:, :, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projections onto the planes across the axes
+    return np.linalg.lstsq(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0], rcond=None)[0]

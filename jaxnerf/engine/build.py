@@ -1,30 +1,20 @@
 """From a configuration to the functions of a run. Nothing else reads the configuration."""
 
 import functools
-import os
-import pathlib
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import optax
 
-from jaxnerf.core.rendering import render_hierarchical, render_rays
-from jaxnerf.core.sampling import split_key
-from jaxnerf.data import batches, blender, llff, synthetic
+from jaxnerf.data import batches
+from jaxnerf.engine.models import Model, hierarchical_model
+from jaxnerf.engine.packed import packed_model, skip_empty_afterwards
+from jaxnerf.engine.scenes import background_of, load_views
+from jaxnerf.engine.space import make_space, survey
+from jaxnerf.fields.grid import grid_field
 from jaxnerf.fields.mlp import mlp_field
-
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
-
-
-class Model(NamedTuple):
-    """What is learned, and how rays are rendered through it."""
-
-    init: Callable[[jax.Array], Any]  # key -> params
-    render: Callable[..., tuple]  # (keys [B] or None, params, Rays [B]) -> Renderings, the last counts
-    scene: Callable[[Any], Callable]  # params -> the scene that counts
 
 
 class Experiment(NamedTuple):
@@ -34,9 +24,10 @@ class Experiment(NamedTuple):
     optimizer: optax.GradientTransformation
     schedule: Callable[[int], float]  # step -> learning rate
     load_views: Callable[[str], Any]  # split -> Views
-    draw: Callable[..., tuple]  # (step, positions, (Views, live)) -> (keys, Batch)
+    draw: Callable[..., tuple]  # (step, positions, (Views, live, cells)) -> (keys, Batch)
     view_rays: Callable[..., Any]  # (Views, index, pixels) -> Rays
     world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in world units
+    survey: Callable[..., tuple]  # Views -> possible cells, live pixels, cells to look at; each may be None
     samples_per_ray: int  # of the network that has most
     seed: int
     pixel_offset: float
@@ -56,7 +47,7 @@ def build(config):
     options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
 
     def draw(step, positions, data):
-        views, live = data
+        views, live, _ = data
         batching = config.train.batching
         return batches.draw_batch(config.seed, step, positions, views, live, batching=batching, **options)
 
@@ -70,7 +61,8 @@ def build(config):
         draw=draw,
         view_rays=functools.partial(batches.view_rays, ndc=config.data.ndc),
         world_depth=functools.partial(batches.world_depth, ndc=config.data.ndc),
-        samples_per_ray=config.sampling.num_coarse + config.sampling.num_fine,
+        survey=functools.partial(_survey, config, model),
+        samples_per_ray=_samples_per_ray(config),
         seed=config.seed,
         pixel_offset=config.data.pixel_offset,
         train=SimpleNamespace(**config.train),
@@ -87,82 +79,98 @@ def build(config):
 
 
 def build_model(config):
-    """Returns the Model: coarse and fine networks, or one network when sampling.num_fine is 0."""
-    sampling, background = config.sampling, _background(config.data)
+    """Returns the Model: the paper's two networks, or one field and where it is worth asking."""
+    space = config.get("space")
+    if space and space.skip_empty:
+        return _packed_model(config)
+    sampling, background = config.sampling, background_of(config.data)
     if sampling.rule not in ("segments", "gauss", "points"):
         raise ValueError(f"sampling.rule is {sampling.rule!r}, wanted 'segments', 'gauss' or 'points'")
-    names = ("coarse", "fine") if sampling.num_fine else ("fine",)
-    fields = {name: mlp_field(**_network(config[name])) for name in names}
-    options = {"rule": sampling.rule, "in_disparity": sampling.in_disparity, "background": background}
-
-    def init(key):
-        keys = jax.random.split(key, len(names))
-        return {name: fields[name].init(key) for name, key in zip(names, keys, strict=True)}
-
-    def render(keys, params, rays):
-        noise = sampling.density_noise if keys is not None else 0.0
-        keys, *noise_keys = split_key(keys, 1 + len(names)) if noise else (keys, *[None] * len(names))
-        scenes = [
-            functools.partial(fields[name].apply, params[name], key=noise_key, density_noise=noise)
-            for name, noise_key in zip(names, noise_keys, strict=True)
-        ]
-        if len(scenes) == 1:
-            return (render_rays(keys, *scenes, rays, num_samples=sampling.num_coarse, **options),)
-        return render_hierarchical(
-            keys,
-            *scenes,
-            rays,
-            num_coarse=sampling.num_coarse,
-            num_fine=sampling.num_fine,
-            importance_floor=sampling.importance_floor,
-            **options,
-        )
-
-    return Model(init, render, lambda params: functools.partial(fields["fine"].apply, params["fine"]))
-
-
-def load_views(data, split):
-    """Returns the Views of a split, as the data section of a configuration describes them."""
-    if data.format == "synthetic":
-        return synthetic.load_views(split=split, size=data.size)
-    folder = _scene_folder(data.dir)
-    if data.format == "blender":
-        return blender.load_views(
-            folder,
-            split=split,
-            factor=data.factor,
-            near=data.near,
-            far=data.far,
-            background=_background(data),
-        )
-    if data.format == "llff":
-        return llff.load_views(folder, split=split, factor=data.factor)
-    raise ValueError(f"data.format is {data.format!r}, wanted 'synthetic', 'blender' or 'llff'")
-
-
-def _scene_folder(name):
-    """Returns the folder of that name here, or else under $JAXNERF_SCENES."""
-    scenes = os.environ.get("JAXNERF_SCENES")
-    places = [pathlib.Path(name)] + ([pathlib.Path(scenes, name)] if scenes else [])
-    found = [place for place in places if name and place.is_dir()]
-    if not found:
-        looked = " or ".join(str(place.absolute()) for place in places) if name else "no name"
+    if config.get("field", "mlp") != "mlp":
         raise ValueError(
-            f"data.dir is {name!r}, looked at {looked}: no such folder; give one with --data_dir"
+            f"field is {config.field!r} with space.skip_empty off, wanted 'mlp'; or set space.skip_empty"
         )
-    return found[0]
+    names = ("coarse", "fine") if sampling.num_fine else ("fine",)
+    for name in names:
+        if not config[name].num_freqs:
+            raise ValueError(
+                f"{name}.num_freqs is 0, wanted at least 1; only space.skip_empty fits it to images"
+            )
+    fields = {name: mlp_field(**_network(config[name])) for name in names}
+    view_samples = config.eval.get("samples", 1.0)
+    return hierarchical_model(fields, background=background, view_samples=view_samples, **sampling)
 
 
-def _background(data):
-    if data.background not in BACKGROUNDS:
-        raise ValueError(f"data.background is {data.background!r}, wanted one of {sorted(BACKGROUNDS)}")
-    return BACKGROUNDS[data.background]
+def skipping_model(config, model):
+    """Returns a dense model that skips empty space in pictures, and the extraction of its grid from params.
+
+    The space section must have no open sizes.
+    """
+    return skip_empty_afterwards(model, _space(config, None), **_view_options(config))
+
+
+def _packed_model(config):
+    space = config.space
+    if config.sampling.density_noise:
+        raise ValueError("sampling.density_noise has no effect with space.skip_empty; set one of them to 0")
+    if config.field == "grid":
+        field = grid_field(lower=space.lower, upper=space.upper, **config.features)
+    elif config.field == "mlp":
+        field = mlp_field(**_network(config.fine))
+    else:
+        raise ValueError(f"field is {config.field!r}, wanted 'mlp' or 'grid'")
+    return packed_model(
+        field,
+        _space(config, field),
+        samples_per_ray=space.samples_per_ray,
+        hide_beyond=space.hide_beyond,
+        hide_from=space.hide_from,
+        **_view_options(config),
+    )
+
+
+def _space(config, field):
+    space = config.space
+    open_sizes = [name for name in ("lower", "upper", "resolution", "step") if not space[name]]
+    if open_sizes:
+        raise ValueError(f"space.{open_sizes[0]} is open, wanted a number; engine.fit chooses it from views")
+    names = ("resolution", "step", "threshold", "update_every", "look_at_once")
+    options = {name: space[name] for name in names}
+    return make_space(space.lower, space.upper, seed=config.seed, field=field, **options)
+
+
+def _view_options(config):
+    return {
+        "stop": config.eval.stop,
+        "view_samples": config.eval.samples,
+        "samples_at_once": config.eval.samples_at_once,
+        "background": background_of(config.data),
+    }
 
 
 def _network(section):
     options = dict(section)
     options["compute_dtype"] = jnp.dtype(options["compute_dtype"])
     return options
+
+
+def _samples_per_ray(config):
+    space = config.get("space")
+    if space and space.skip_empty:
+        return space.samples_per_ray
+    return config.sampling.num_coarse + config.sampling.num_fine
+
+
+def _survey(config, model, views):
+    if model.space is None:
+        return None, batches.live_pixels(views), None
+    return survey(
+        views,
+        model.space,
+        masks=config.space.masks and not config.data.ndc,
+        ndc=config.data.ndc,
+        pixel_offset=config.data.pixel_offset,
+    )
 
 
 def _schedule(train):

@@ -19,7 +19,7 @@ from jaxnerf.engine import pictures, records, workdir
 from jaxnerf.engine.load import newest_step, open_run
 
 
-def evaluate(folder, *, config=None, split=None, step=None, chunk=None, overwrite=False):
+def evaluate(folder, *, config=None, split=None, step=None, chunk=None, settings=None, overwrite=False):
     """Scores one checkpoint and writes <workdir>/eval/<step>/.
 
     Args:
@@ -29,6 +29,7 @@ def evaluate(folder, *, config=None, split=None, step=None, chunk=None, overwrit
             is written to eval/<step>-<split>.
         step: of the checkpoint; the newest when None.
         chunk: rays rendered at once; the configuration's eval.chunk when None.
+        settings: see open_run.
         overwrite: whether an earlier result of the same step and split is replaced.
 
     Returns:
@@ -37,7 +38,7 @@ def evaluate(folder, *, config=None, split=None, step=None, chunk=None, overwrit
     Raises:
         ValueError: if there is no such run, checkpoint or split, or the result is already there.
     """
-    run = open_run(folder, config)
+    run = open_run(folder, config, settings=settings)
     return score_run(run, folder, split=split, step=step, chunk=chunk, overwrite=overwrite)
 
 
@@ -50,12 +51,12 @@ def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False
     if target.exists() and not overwrite:
         raise ValueError(f"{target}: is there already; give --overwrite to score again, or another --step")
     views = run.experiment.load_views(split) if views is None else views
-    params = run.params(step)
+    weights = run.weights(step)
     partial = target.with_name(name + ".tmp")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         results = _write_scores(
-            run, folder, views, params, split=split, step=step, chunk=chunk, partial=partial
+            run, folder, views, weights, split=split, step=step, chunk=chunk, partial=partial
         )
     except BaseException:  # a full disk, Ctrl-C
         shutil.rmtree(partial, ignore_errors=True)
@@ -67,8 +68,8 @@ def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False
     return results
 
 
-def _write_scores(run, folder, views, params, *, split, step, chunk, partial):
-    rows = _render_views(run, functools.partial(run.render, params), views, chunk, partial)
+def _write_scores(run, folder, views, weights, *, split, step, chunk, partial):
+    rows = _render_views(run, functools.partial(run.render, weights), views, chunk, partial)
     rays = sum(row.pop("rays") for row in rows)
     # The first view's time would hold the compilation too.
     timed = rows[1:] or rows
@@ -83,7 +84,8 @@ def _write_scores(run, folder, views, params, *, split, step, chunk, partial):
         "rays_seen": trained[-1]["rays"] if trained else None,
         "training_seconds": trained[-1]["seconds"] if trained else None,
         "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(params)),
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(weights[0])),
+        "settings": {name: vars(run.experiment.eval).get(name) for name in ("samples", "stop", "skip_empty")},
         "conventions": {**run.experiment.conventions, "split": split, "chunk": chunk},
         "images": rows,
     }
@@ -114,7 +116,7 @@ def _render_views(run, render, views, chunk, folder):
         pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
         started = time.perf_counter()
         rays = run.experiment.view_rays(views, index, pixels)
-        image = render_image(render, rays, chunk=chunk)
+        image = jax.block_until_ready(render_image(render, rays, chunk=chunk))
         seconds = time.perf_counter() - started
         truth = reference(views, index)
         rows.append({"name": name, **scores(image.rgb, truth), "seconds": seconds, "rays": height * width})

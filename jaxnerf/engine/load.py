@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxnerf.core.structs import without_weights
-from jaxnerf.engine import build, workdir
+from jaxnerf.engine import build, fit, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.state import create_state
 
@@ -16,34 +15,48 @@ class Trained(NamedTuple):
 
     experiment: build.Experiment
     steps: Any  # () -> steps of the finished checkpoints, ascending
-    params: Any  # step -> params
-    render: Any  # (params, Rays [...]) -> Rendering [...] without weights, jitted once for all steps
+    weights: Any  # step -> (params, grid or None)
+    render: Any  # (weights, Rays [...]) -> Rendering [...] without weights, jitted once for all steps
 
 
-def open_run(folder, config=None, *, data_dir=None):
+def open_run(folder, config=None, *, data_dir=None, settings=None):
     """Returns the Trained run in a workdir, with its own configuration unless one is given.
+
+    Args:
+        folder: the workdir.
+        config: ConfigDict; sizes that it leaves open are those of the workdir's.
+        data_dir: the scene's folder in place of the configuration's.
+        settings: fields of the configuration's eval section to replace, by name.
 
     Raises:
         ValueError: if there is no run; names the folder.
     """
-    config = workdir.read_config(folder) if config is None else config
+    own = workdir.read_config(folder) if config is None or fit.is_open(config) else None
+    config = own if config is None else fit.fill_from(config, own)
     if data_dir:
         config.data.dir = data_dir
+    config.eval.update(settings or {})
     experiment = build.build(config)
     checkpoints = Checkpoints(folder)
-    model = experiment.model
+    model, trained = experiment.model, experiment.model
+    extract = None
+    if config.eval.get("skip_empty") and model.space is None:
+        config, _ = fit.fit_config(fit.skipping(config), experiment.load_views(config.eval.split))
+        model, extract = build.skipping_model(config, model)
 
     @functools.cache
     def template():
-        return create_state(model, experiment.optimizer, experiment.seed)
+        return create_state(trained, experiment.optimizer, experiment.seed)
 
     @jax.jit
-    def render(params, rays):
-        return without_weights(model.render(None, params, rays)[-1])
+    def render(weights, rays):
+        return model.view(*weights, rays)
 
-    return Trained(
-        experiment, checkpoints.steps, lambda step: checkpoints.load(step, template()).params, render
-    )
+    def weights(step):
+        state = checkpoints.load(step, template())
+        return state.params, extract(state.params) if extract else state.grid
+
+    return Trained(experiment, checkpoints.steps, weights, render)
 
 
 def newest_step(run, folder, step=None):
@@ -59,5 +72,5 @@ def newest_step(run, folder, step=None):
 def load_scene(folder):
     """See jaxnerf.load_scene."""
     run = open_run(folder)
-    params = run.params(newest_step(run, folder))
-    return run.experiment.model.scene(params), functools.partial(run.render, params)
+    weights = run.weights(newest_step(run, folder))
+    return run.experiment.model.scene(*weights), functools.partial(run.render, weights)

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 
 from jaxnerf.core.metrics import decibels
-from jaxnerf.data.batches import live_pixels
 from jaxnerf.engine import build, parallel, records, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
+from jaxnerf.engine.fit import fit_config
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
 
@@ -30,12 +30,17 @@ def train_and_evaluate(config, folder):
     Raises:
         ValueError: on bad input, or when too many steps in a row were not finite.
     """
+    started = time.perf_counter()
+    views = build.load_views(
+        config.data, "train"
+    )  # before the workdir is made: bad input leaves nothing behind
+    config, chosen = fit_config(config, views)
     experiment = build.build(config)
-    views = experiment.load_views("train")  # before the workdir is made: bad input leaves nothing behind
     options = experiment.train
     devices = parallel.devices_of(options.parallel)
     parallel.split_positions(options.batch_size, len(devices), options.block_size)
     workdir.claim(folder, config)
+    print("\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *chosen]), file=sys.stderr)
     finished = train(experiment, views, folder)
     if finished and experiment.eval.at_end:
         evaluate(folder)
@@ -45,16 +50,16 @@ def train_and_evaluate(config, folder):
 def train(experiment, views, folder):
     """Runs the loop of train_and_evaluate on Views that were read; returns whether it came to its end."""
     options = experiment.train
-    run, state, data, compile_seconds = _compile(experiment, views)
+    run, state, data, survey_seconds, compile_seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, keep=options.keep)
     if checkpoints.steps():
         state = checkpoints.load(checkpoints.steps()[-1], state)
     first = int(state.step)
     log = records.Records(folder, first_step=first)
     before = log.rows[-1]["seconds"] if log.rows else 0.0
-    print(_header(experiment, views, state, compile_seconds), file=sys.stderr)
+    print(_header(experiment, views, state, survey_seconds, compile_seconds), file=sys.stderr)
     progress = records.Progress(options.max_steps)
-    clock = Clock(before, first * options.batch_size)
+    clock = Clock(before, first * options.batch_size - int(state.counters.get("left_out", 0)))
     recent = []
     done = first >= options.max_steps or 0 < options.max_seconds <= before
     with Interrupt() as interrupt:
@@ -89,23 +94,26 @@ def train(experiment, views, folder):
 def _compile(experiment, views):
     options = experiment.train
     started = time.perf_counter()
+    possible, live, cells = experiment.survey(views)
+    surveyed = time.perf_counter() - started
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     placed = parallel.compile_step(
         step,
-        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed),
-        (views, live_pixels(views)),
+        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, possible),
+        (views, live, cells),
         batch_size=options.batch_size,
         block_size=options.block_size,
         samples_per_ray=experiment.samples_per_ray,
         mode=options.parallel,
     )
-    return *placed, time.perf_counter() - started
+    return *placed, surveyed, time.perf_counter() - started - surveyed
 
 
 def _row(experiment, step, recent, clock, compile_seconds):
     """Returns the metrics since the last row: means of the errors, the rest as it stands."""
     values = {name: np.array([float(metrics[name]) for metrics in recent]) for name in recent[0]}
-    rays = step * experiment.train.batch_size
+    left_out = int(values["left_out"][-1]) if "left_out" in values else 0
+    rays = step * experiment.train.batch_size - left_out
     return {
         "step": step,
         "seconds": clock.seconds(),
@@ -119,6 +127,7 @@ def _row(experiment, step, recent, clock, compile_seconds):
         "grad_norm": values["grad_norm"][-1],
         "nonfinite": int(values["nonfinite"][-1]),
         "nonfinite_in_a_row": int(values["nonfinite_in_a_row"][-1]),
+        "left_out": left_out,
     }
 
 
@@ -127,6 +136,9 @@ def _text(row, options, late):
     if options.max_seconds:
         left = min(left, options.max_seconds - row["seconds"])
     missed = f"  {row['nonfinite']} steps not finite" if row["nonfinite"] else ""
+    if row["left_out"]:
+        drawn = row["rays"] + row["left_out"]
+        missed += f"  {row['left_out'] / drawn:.0%} of rays found the pool full"
     return (
         f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{_minutes(row['seconds'])} done, {_minutes(0.0 if late else left)} left{missed}"
@@ -148,7 +160,7 @@ def _check_finite(row, options, folder):
         )
 
 
-def _header(experiment, views, state, compile_seconds):
+def _header(experiment, views, state, survey_seconds, compile_seconds):
     """Returns the lines that say once what runs on what."""
     device = jax.local_devices()[0]
     counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
@@ -156,12 +168,18 @@ def _header(experiment, views, state, compile_seconds):
     near, far = np.min(views.near), np.max(views.far)
     dtype = jax.tree.leaves(state.params)[0].dtype
     shares = ", ".join(f"{name} {count:,}" for name, count in counts.items())
+    space = []
+    if state.grid is not None:
+        cells = "x".join(map(str, state.grid.possible.shape))
+        share = float(state.grid.possible.mean())
+        space = [f"space       {share:.1%} of {cells} cells possible, found in {survey_seconds:.1f} s"]
     return "\n".join(
         [
             f"device      {jax.local_device_count()} x {device.device_kind} ({device.platform})",
             f"precision   parameters {dtype}; compiled in {compile_seconds:.1f} s",
             f"parameters  {sum(counts.values()):,} ({shares})",
             f"views       {len(views.offset)}, {views.pixels.shape[0]:,} pixels, t from {near:g} to {far:g}",
+            *space,
             f"cameras     within {_point(eyes.min(0))} to {_point(eyes.max(0))}",
             f"steps       {int(state.step)} of {experiment.train.max_steps} taken, "
             f"{experiment.train.batch_size} rays each",

@@ -80,7 +80,7 @@ def default_block(share, samples_per_ray, platform):
     if platform != "cpu":
         return share
     # The best size in experiments/step_cost.py; the activations of a whole batch would leave the cache.
-    fitting = max(CPU_BLOCK_SAMPLES // samples_per_ray, 1)
+    fitting = max(CPU_BLOCK_SAMPLES // int(samples_per_ray), 1)
     return max(size for size in range(1, min(share, fitting) + 1) if share % size == 0) if share > 0 else 0
 
 

@@ -15,20 +15,28 @@ class TrainState:
     step: jax.Array  # int32, steps taken
     params: Any  # {"coarse": ..., "fine": ...}, float32
     opt_state: Any  # of optax
-    grid: Any  # occupancy, None without
-    counters: dict[str, jax.Array]  # int32: "nonfinite" steps left out, "nonfinite_in_a_row"
+    grid: Any  # core.occupancy.Grid; None where all of space is asked
+    counters: dict[str, jax.Array]  # int32, see step.make_train_step
 
 
-def create_state(model, optimizer, seed):
-    """Returns the TrainState at step 0, the same for the same seed."""
+def create_state(model, optimizer, seed, possible=None):
+    """Returns the TrainState at step 0, the same for the same seed.
+
+    possible: [X, Y, Z] bool, of a model with a space: what of it is not known to be empty. None: all.
+    """
+    if model.space is not None and possible is None:
+        possible = jnp.ones(model.space.shape, bool)
 
     @jax.jit  # run op by op, initialisation would take longer than compiling it
-    def create():
+    def create(possible):
         params = model.init(jax.random.key(seed))
         zero = jnp.zeros((), jnp.int32)
         counters = {"nonfinite": zero, "nonfinite_in_a_row": zero}
+        if model.space is not None:
+            counters["left_out"] = zero
+        grid = None if model.space is None else model.space.create(possible)
         return TrainState(
-            step=zero, params=params, opt_state=optimizer.init(params), grid=None, counters=counters
+            step=zero, params=params, opt_state=optimizer.init(params), grid=grid, counters=counters
         )
 
-    return create()
+    return create(possible)

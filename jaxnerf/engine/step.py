@@ -11,60 +11,83 @@ def make_train_step(model, optimizer, draw):
     """Returns the pure training step.
 
     Args:
-        model: its render(keys, params, rays) returns a tuple of Renderings; the last one counts.
+        model: models.Model. Of its Renderings in training the last one counts.
         optimizer: an optax gradient transformation.
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see data.batches.draw_batch.
 
     Returns:
-        train_step(state, data, positions, *, axis_name=None) -> (state, metrics). positions is
-        [N, B] int32, the places of this device's rays in the whole batch: N blocks that are run
-        one after the other and whose gradients add up, so that B rays' activations stay in the
-        cache (or in the memory) whatever the batch. With an axis_name the gradient is also the
-        mean over that axis of devices. metrics are scalars: "loss", "mse" (last rendering),
-        "mse_coarse" (first), "grad_norm" and "nonfinite".
+        train_step(state, data, positions, *, axis_name=None) -> (state, metrics). data is
+        (views, live, cells): what draw takes, and the cells [L] that the grid is looked at in.
+        positions is [N, B] int32, the places of this device's rays in the whole batch: N blocks
+        that are run one after the other and whose gradients add up, so that B rays' activations
+        stay in the cache (or in the memory) whatever the batch. With an axis_name all sums are
+        also over that axis of devices. metrics are scalars: "loss", "mse" (last rendering),
+        "mse_coarse" (first), "grad_norm", "rays" that counted, and the counters.
 
-        A step whose loss or gradient is not finite leaves parameters and optimiser as they were
-        and is counted.
+        The counters: "nonfinite" steps, whose loss or gradient was not finite; they leave parameters,
+        optimiser and grid as they were. "nonfinite_in_a_row". And, of a model with a space, "left_out"
+        rays: a full pool had no room for some of their samples, so they count for nothing.
     """
 
-    def loss_fn(params, keys, batch):
-        renderings = model.render(keys, params, batch.rays)
-        errors = [((rendering.rgb - batch.rgb) ** 2).mean() for rendering in renderings]
-        return sum(errors), {"mse_coarse": errors[0], "mse": errors[-1]}
+    def loss_fn(params, grid, step, keys, batch):
+        renderings = model.render(keys, params, grid, batch.rays, step)
+        whole = renderings[-1].dropped == 0
+        errors = [_sum_where(whole, (rendering.rgb - batch.rgb) ** 2) for rendering in renderings]
+        return sum(errors), {"mse_coarse": errors[0], "mse": errors[-1], "rays": whole.sum()}
 
-    def block(params, step, data, positions):
-        keys, batch = draw(step, positions, data)
-        (loss, metrics), grads = jax.value_and_grad(loss_fn, has_aux=True)(params, keys, batch)
-        return {"loss": loss, **metrics}, grads
+    def block(state, data, positions):
+        keys, batch = draw(state.step, positions, data)
+        (loss, sums), grads = jax.value_and_grad(loss_fn, has_aux=True)(
+            state.params, state.grid, state.step, keys, batch
+        )
+        return {"loss": loss, **sums}, grads
 
     def train_step(state, data, positions, *, axis_name=None):
-        total = _mean_over_blocks(lambda part: block(state.params, state.step, data, part), positions)
+        drawn = positions.size * (1 if axis_name is None else jax.lax.axis_size(axis_name))
+        total = _sum_over_blocks(lambda part: block(state, data, part), positions)
         if axis_name is not None:
-            total = jax.lax.pmean(total, axis_name)
-        metrics, grads = total
+            total = jax.lax.psum(total, axis_name)
+        metrics, grads, rays = _per_value(*total)
         metrics["grad_norm"] = optax.tree.norm(grads)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
         keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)  # noqa: E731
+        params = keep(params, state.params)
         missed = (~finite).astype(jnp.int32)
         counters = {
             "nonfinite": state.counters["nonfinite"] + missed,
             "nonfinite_in_a_row": (state.counters["nonfinite_in_a_row"] + 1) * missed,
         }
+        grid = state.grid
+        if model.space is not None:
+            counters["left_out"] = state.counters["left_out"] + drawn - rays
+            grid = model.space.update(state.step, params, grid, data[2])
         state = TrainState(
             step=state.step + 1,
-            params=keep(params, state.params),
+            params=params,
             opt_state=keep(opt_state, state.opt_state),
-            grid=state.grid,
+            grid=grid,
             counters=counters,
         )
-        return state, {**metrics, **counters}
+        return state, {**metrics, "rays": rays, **counters}
 
     return train_step
 
 
-def _mean_over_blocks(function, positions):
+def _sum_where(whole, errors):
+    """Returns the sum of the errors [B, 3] of the rays [B] that are whole."""
+    return jnp.where(whole[:, None], errors, 0).sum()
+
+
+def _per_value(sums, grads):
+    """Returns means over all colour values that counted: metrics, gradient; and how many rays those were."""
+    rays = sums.pop("rays")
+    share = 1 / (3 * jnp.maximum(rays, 1))
+    return *jax.tree.map(lambda leaf: leaf * share, (sums, grads)), rays
+
+
+def _sum_over_blocks(function, positions):
     if positions.shape[0] == 1:
         return function(positions[0])
 
@@ -72,5 +95,4 @@ def _mean_over_blocks(function, positions):
         return jax.tree.map(jnp.add, total, function(part)), None
 
     zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(function, positions[0]))
-    total, _ = jax.lax.scan(add, zeros, positions)
-    return jax.tree.map(lambda leaf: leaf / positions.shape[0], total)
+    return jax.lax.scan(add, zeros, positions)[0]

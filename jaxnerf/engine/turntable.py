@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxnerf.core.cameras import pixel_grid, turntable
 from jaxnerf.core.rendering import render_image
+from jaxnerf.data.poses import gaze_center
 from jaxnerf.engine.load import newest_step, open_run
 from jaxnerf.engine.pictures import to_8_bits
 from jaxnerf.engine.records import Progress
@@ -44,7 +45,7 @@ def render_turntable(
     if target.exists() and not overwrite:
         raise ValueError(f"{target}: is there already; give --overwrite to render it again")
     views = run.experiment.load_views("train")
-    render = functools.partial(run.render, run.params(step))
+    render = functools.partial(run.render, run.weights(step))
     height, width = (int(value) for value in views.size[0])
     pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
     frames, progress = [], Progress(num_frames)
@@ -68,9 +69,8 @@ def orbit(cameras, num_frames):
     The point is the one nearest to all their axes; distance and height are their means.
     """
     poses = np.asarray(cameras.to_world, np.float64)
-    eyes, axes = poses[:, :, 3], poses[:, :, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projections onto the planes across the axes
-    center = np.linalg.lstsq(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0], rcond=None)[0]
+    eyes = poses[:, :, 3]
+    center = gaze_center(poses)
     distances = np.linalg.norm(eyes - center, axis=-1)
     elevation = np.arcsin(np.clip((eyes - center)[:, 2] / distances, -1, 1)).mean()
     return turntable(num_frames, center=center, radius=distances.mean(), elevation=elevation)

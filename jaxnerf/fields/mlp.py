@@ -77,7 +77,7 @@ class MLP(linen.Module):
         backward pass then run along memory, which on a CPU a small network gains most from.
         """
         shape = x.shape[:-1]
-        encoded = encode_planes(_planes(x), num_freqs=self.num_freqs).astype(self.compute_dtype)
+        encoded = encode_planes(planes(x), num_freqs=self.num_freqs).astype(self.compute_dtype)
         hidden = ()
         for layer in range(self.depth):
             joins = layer == 0 or layer == self.skip_layer + 1
@@ -87,7 +87,7 @@ class MLP(linen.Module):
         density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
         if self.use_viewdirs:
             # The direction is encoded and multiplied once a ray, and broadcast over its samples.
-            directions = encode_planes(_planes(viewdirs), num_freqs=self.num_view_freqs)
+            directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs)
             directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
             bottleneck = Dense(self.width, name="bottleneck")(*hidden).reshape(-1, *shape)
             view = Dense(self.view_width, name="view")(bottleneck, directions)
@@ -120,6 +120,6 @@ class Dense(linen.Module):
         return total
 
 
-def _planes(vectors):
+def planes(vectors):
     """Returns vectors [..., 3] as [3, N]."""
     return jnp.moveaxis(vectors, -1, 0).reshape(3, -1)

@@ -1,0 +1,194 @@
+"""The renderer that asks only where there is something: the samples of many rays, packed into one pool."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxnerf.core import compositing, occupancy, rendering
+from jaxnerf.core.structs import Rendering, check_shapes
+
+_AT_LEAST = 4  # samples of a ray asked in a row: fewer make more rounds, more are asked in vain
+
+
+def render_packed(scene, grid, rays, samples, *, capacity, stop=0.0, background=None):
+    """Returns what render_samples does, asking the scene only where the grid is occupied.
+
+    The samples of all rays that count are packed into a pool of fixed size, and composited there (Eq. 3,
+    with the skipping and the early stop of arXiv:2201.05989).
+
+    Args:
+        scene: see render_samples; it is asked for [1, K, 3] positions with as many directions.
+        grid: Grid, outside whose box there is nothing. None where the samples are masked already.
+        rays: Rays [...].
+        samples: Samples [..., S]; rules "segments" and "points".
+        capacity: K >= 1, the size of the pool.
+        stop: 0 asks all samples at once; those that do not fit are left out and counted. Greater than 0,
+            the pool is filled again and again with the next samples of the rays that still let more than
+            this through: none is left out, and where colours are in [0, 1] the colour is within stop of the
+            whole one. That is for rendering: it has no reverse mode.
+        background: see render_samples.
+
+    Returns:
+        Rendering [...] without weights; dropped [...] says how many samples of a ray did not fit.
+
+    Raises:
+        ValueError: as render_samples; on rule "gauss"; if capacity < 1.
+    """
+    if samples.rule == "gauss":
+        raise ValueError(
+            "render_packed: rule 'gauss' asks in pairs, which a cell's border may part; use 'segments'"
+        )
+    check_shapes(
+        "render_packed", near=(rays.near, "..."), t=(samples.t, "... S"), delta=(samples.delta, "... S")
+    )
+    shape = rays.near.shape
+    flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[len(shape) :]), (rays, samples))
+    if capacity < 1:
+        raise ValueError(f"render_packed: capacity is {capacity}, wanted at least 1")
+    rays, samples = flat
+    queue = _queue(grid, rays, samples)
+    ask = functools.partial(_ask, scene, rays, samples)
+    if stop > 0:
+        sums, dropped = _until_stopped(queue, ask, capacity, stop), jnp.zeros_like(queue.count)
+    else:
+        slot = jnp.arange(capacity)
+        sums = ask(_fill(queue, slot, slot < queue.ends[-1]))
+        dropped = queue.count - jnp.clip(capacity - _first(queue), 0, queue.count)
+    return _rendering(sums, dropped, rays.far, shape, background)
+
+
+class _Queue(NamedTuple):
+    """The samples that count, ray after ray: a bit each, W words of 32 a ray."""
+
+    words: jax.Array  # [B W] uint32, the samples' flags, the nearest lowest
+    ends: jax.Array  # [B W] int32, how many count up to the end of each word
+    count: jax.Array  # [B] int32, how many of each ray count
+
+
+class _Pool(NamedTuple):
+    """What is asked at once."""
+
+    source: jax.Array  # [K] int32, places among the samples of the ray
+    ray: jax.Array  # [K] int32, ascending
+    used: jax.Array  # [K] bool, False for the room that is left
+
+
+class _Sums(NamedTuple):
+    """What the samples asked so far add up to, for each ray."""
+
+    optical_depth: jax.Array  # [B]
+    rgb: jax.Array  # [B, 3]
+    depth: jax.Array  # [B] sum of w t
+    disparity: jax.Array  # [B] sum of w / t
+
+
+def _queue(grid, rays, samples):
+    kept = ~(samples.delta <= 0)
+    if grid is not None:
+        kept &= occupancy.occupied_at(grid, rays, samples.t)
+    kept = jnp.pad(kept, ((0, 0), (0, -kept.shape[-1] % 32))).reshape(kept.shape[0], -1, 32)
+    # Compacting words in place of samples is what makes this cheap: a scatter of all would take longest.
+    words = (kept * (jnp.uint32(1) << jnp.arange(32, dtype=jnp.uint32))[None, None]).sum(-1, dtype=jnp.uint32)
+    sizes = jax.lax.population_count(words).astype(jnp.int32)
+    return _Queue(words.reshape(-1), jnp.cumsum(sizes.reshape(-1)), sizes.sum(-1))
+
+
+def _first(queue):
+    """Returns [B], where each ray's samples begin in the queue."""
+    return jnp.cumsum(queue.count) - queue.count
+
+
+def _fill(queue, place, used):
+    """Returns the Pool of the samples at places [K] in the queue."""
+    word = jnp.searchsorted(queue.ends, place, side="right", method="scan_unrolled")
+    word = jnp.minimum(word, queue.words.size - 1)
+    bits = queue.words[word]
+    before = queue.ends[word] - jax.lax.population_count(bits).astype(jnp.int32)
+    width = queue.words.size // queue.count.size
+    return _Pool(word % width * 32 + _nth_bit(bits, place - before), word // width, used)
+
+
+def _nth_bit(words, n):
+    """Returns the place of the n-th bit that is set, the lowest being n = 0."""
+    place = jnp.zeros_like(n)
+    for half in (16, 8, 4, 2, 1):
+        low = (words >> place.astype(jnp.uint32)) & jnp.uint32(2**half - 1)
+        count = jax.lax.population_count(low).astype(jnp.int32)
+        above = n >= count
+        n, place = n - jnp.where(above, count, 0), place + jnp.where(above, half, 0)
+    return place
+
+
+def _ask(scene, rays, samples, pool):
+    """Returns the Sums of a pool, as if nothing lay before it."""
+    t = jnp.where(pool.used, samples.t[pool.ray, pool.source], 0)
+    delta = jnp.where(pool.used, samples.delta[pool.ray, pool.source], 0)
+    one = jax.tree.map(lambda leaf: leaf[pool.ray][None], rays)  # Rays [1, K], one a sample
+    x = one.origins + t[None, :, None] * one.directions
+    density, rgb = scene(x, one.viewdirs)
+    rendering.check_answer("render_packed", density, rgb, x)
+    density = jnp.where(pool.used, density[0], 0)
+    length = rendering.world_length(delta[:, None], one.directions[0])[:, 0]
+    starts = pool.ray != jnp.roll(pool.ray, 1).at[0].set(-1)
+    weights, optical_depth = compositing.packed_weights(density, length, starts, longest=samples.t.shape[-1])
+    colours = [jnp.where(pool.used, rgb[0, :, axis], 0) * weights for axis in range(3)]
+    parts = [optical_depth, *colours, weights * t, compositing.share_over(weights, t)]
+    sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), pool.ray, rays.near.size, indices_are_sorted=True)
+    return _Sums(sums[:, 0], sums[:, 1:4], sums[:, 4], sums[:, 5])
+
+
+def _until_stopped(queue, ask, capacity, stop):
+    """Returns the Sums of all rays, each asked until no more than stop passes, or to its end."""
+
+    first = _first(queue)
+
+    def fill(done, taken):
+        ends = jnp.cumsum(taken)
+        ray = jnp.repeat(jnp.arange(taken.size), taken, total_repeat_length=capacity)
+        slot = jnp.arange(capacity)
+        return _fill(queue, (first + done - (ends - taken))[ray] + slot, slot < ends[-1])
+
+    def waits(done, sums):
+        return (done < queue.count) & (jnp.exp(-sums.optical_depth) > stop)
+
+    def step(state):
+        done, sums = state
+        waiting = waits(done, sums)
+        # A few samples of each ray, as the next may not be needed; the last rays wait where all is taken.
+        quota = jnp.maximum(capacity // jnp.maximum(waiting.sum(), 1), _AT_LEAST)
+        taken = jnp.where(waiting, jnp.minimum(queue.count - done, quota), 0)
+        taken = jnp.clip(capacity - (jnp.cumsum(taken) - taken), 0, taken)
+        more = ask(fill(done, taken))
+        light = jnp.exp(-sums.optical_depth)
+        return done + taken, _Sums(
+            optical_depth=sums.optical_depth + more.optical_depth,
+            rgb=sums.rgb + light[:, None] * more.rgb,
+            depth=sums.depth + light * more.depth,
+            disparity=sums.disparity + light * more.disparity,
+        )
+
+    done = jnp.zeros_like(queue.count)
+    zeros = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(lambda: ask(fill(done, done))),
+    )
+    return jax.lax.while_loop(lambda state: waits(*state).any(), step, (done, zeros))[1]
+
+
+def _rendering(sums, dropped, far, shape, background):
+    passing = jnp.exp(-sums.optical_depth)
+    rgb = sums.rgb
+    if background is not None:
+        behind = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), (*shape, 3)).reshape(-1, 3)
+        rgb = rgb + passing[:, None] * behind
+    flat = Rendering(
+        rgb=rgb,
+        opacity=-jnp.expm1(-sums.optical_depth),
+        depth=sums.depth + compositing.share_of(passing, far),
+        disparity=sums.disparity,
+        weights=None,
+        dropped=dropped,
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)

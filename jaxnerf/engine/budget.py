@@ -1,0 +1,117 @@
+"""The cheapest way to render a trained model that stays within an error."""
+
+import sys
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.engine.load import newest_step, open_run
+
+_EXACT = {"samples": 4.0, "stop": 0.0, "skip_empty": False}  # what the error is measured against
+_SAMPLES = (1.0, 0.7, 0.5, 0.35, 0.25)
+_STOPS = (1e-3, 1e-2, 3e-2, 1e-1)
+
+
+class Choice(NamedTuple):
+    """One way to render, and what it costs."""
+
+    settings: dict  # of the configuration's eval section
+    error: float  # root of the mean square, over colours, of the difference from the exact rendering
+    seconds: float  # for the rays that were tried
+
+
+def choose(folder, error_budget, **options):
+    """Returns the settings of cheapest_settings, and prints what was tried and picked."""
+    choice, tried = cheapest_settings(folder, error_budget, **options)
+    for other in tried:
+        print(f"{_text(other)}{'  <- picked' if other is choice else ''}", file=sys.stderr)
+    return choice.settings
+
+
+def _text(choice):
+    settings = ", ".join(f"{name} {value}" for name, value in choice.settings.items())
+    return f"RMS error {choice.error:.5f} in {choice.seconds:.3f} s: {settings}"
+
+
+def cheapest_settings(folder, error_budget, *, config=None, split=None, step=None, num_rays=4096):
+    """Returns the cheapest Choice within a budget, and all that were tried.
+
+    Tried on rays through random pixels of a split's views, of which only the cameras count: the error is that
+    against the same model's own rendering with four times the samples, no stop, and nothing skipped but what
+    it was trained to skip.
+
+    Args:
+        folder: the workdir.
+        error_budget: in units of colour, of [0, 1].
+        config: see open_run.
+        split: views held out of training; the configuration's eval.split when None.
+        step: of the checkpoint; the newest when None.
+        num_rays: to try on.
+
+    Returns:
+        Choice, and a list of Choices in the order in which they were tried.
+
+    Raises:
+        ValueError: if none is within the budget; says how near the best comes.
+    """
+    exact = open_run(folder, config, settings=_EXACT)
+    split = split or exact.experiment.eval.split
+    rays = _random_rays(exact.experiment, exact.experiment.load_views(split), num_rays)
+    step = newest_step(exact, folder, step)
+    truth = _render(exact, exact.weights(step), rays)[0]
+    tried = []
+
+    def attempt(settings):
+        run = open_run(folder, config, settings=settings)
+        rgb, seconds = _render(run, run.weights(step), rays)
+        tried.append(Choice(settings, float(np.sqrt(np.mean((rgb - truth) ** 2))), seconds))
+        return tried[-1].error <= error_budget
+
+    skips = exact.experiment.model.space is not None
+    for skip_empty in (False,) if skips else (False, True):
+        _descend(attempt, tried, skip_empty, stops=_STOPS if skips or skip_empty else _STOPS[:1])
+    within = [choice for choice in tried if choice.error <= error_budget]
+    if not within:
+        best = min(tried, key=lambda choice: choice.error)
+        raise ValueError(
+            f"{folder}: no settings stay within {error_budget:g}; the nearest, {best.settings}, differ by "
+            f"{best.error:.2g}: allow that, or train with more samples"
+        )
+    return min(within, key=lambda choice: choice.seconds), tried
+
+
+def _descend(attempt, tried, skip_empty, stops):
+    """Tries fewer and fewer samples, and with the fewest that do, earlier and earlier stops."""
+    fewest = _SAMPLES[0]
+    for samples in _SAMPLES:
+        if not attempt({"samples": samples, "stop": stops[0], "skip_empty": skip_empty}):
+            break
+        fewest = samples
+    for stop in stops[1:]:
+        if not attempt({"samples": fewest, "stop": stop, "skip_empty": skip_empty}):
+            break
+
+
+def _random_rays(experiment, views, num_rays):
+    """Returns Rays [N] through random pixels of Views, as many of each."""
+    rng, parts = np.random.default_rng(0), []
+    for index, size in enumerate(np.asarray(views.size)):
+        height, width = (int(value) for value in size)
+        pixels = np.asarray(pixel_grid(height, width, offset=experiment.pixel_offset)).reshape(-1, 2)
+        chosen = rng.integers(len(pixels), size=-(-num_rays // len(views.size)))
+        parts.append(experiment.view_rays(views, index, jnp.asarray(pixels[chosen])))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:num_rays], *parts)
+
+
+def _render(run, weights, rays):
+    """Returns colours [N, 3] and the seconds that they took, compilation not counted."""
+    rgb, seconds = jax.block_until_ready(run.render(weights, rays)).rgb, []
+    for _ in range(3):
+        started = time.perf_counter()
+        jax.block_until_ready(run.render(weights, rays))
+        seconds.append(time.perf_counter() - started)
+    return np.asarray(rgb), min(seconds)

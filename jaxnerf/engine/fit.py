@@ -1,0 +1,124 @@
+"""Sizes from the data: what a configuration leaves open (0 or empty) is chosen here, once, and recorded."""
+
+import copy
+import math
+
+import numpy as np
+
+from jaxnerf.data import hull, poses
+from jaxnerf.data.batches import view_rays
+
+_SPACING = 0.7  # of a pixel's footprint: the finest thing that images can tell apart, and a little finer
+_FINEST = (32, 256)  # vertices along the longest side, at least and at most
+_SIZES = ("lower", "upper", "resolution", "step")
+_MOST_STEPS = 170  # along the longest side: finer images need finer features sooner than finer steps
+_LARGEST_GRID = 128  # cells: beyond, looking at all of them costs more than the samples it saves
+
+
+def fit_config(config, views):
+    """Returns a copy of a configuration without open sizes, and lines that say what was chosen and why.
+
+    What is set is kept. Nothing changes where the space section is off.
+
+    Args:
+        config: ConfigDict, see configs/default.py.
+        views: the training Views.
+
+    Raises:
+        ValueError: if the cameras look at no common place.
+    """
+    config, lines = copy.deepcopy(config), []
+    space = config.get("space")
+    if not space or not space.skip_empty:
+        return config, lines
+    footprint = _footprint(views, config.data.ndc)
+    masks = space.masks and views.pixels.shape[-1] == 4 and not config.data.ndc
+    if not (len(space.lower) and len(space.upper)):
+        lower, upper, why = _box(views, masks, ndc=config.data.ndc)
+        space.lower, space.upper = (tuple(round(float(x), 4) for x in bound) for bound in (lower, upper))
+        lines.append(f"box         {_text(space.lower)} to {_text(space.upper)}, {why}")
+    longest = max(high - low for low, high in zip(space.lower, space.upper, strict=True))
+    finest = int(np.clip(round(longest / (_SPACING * footprint)), *_FINEST))
+    if not space.step:
+        space.step = longest / min(finest, _MOST_STEPS)
+        lines.append(f"step        {space.step:.4g}, where a pixel covers {footprint:.4g}")
+    if not space.resolution:
+        space.resolution = min(finest, _LARGEST_GRID)
+        lines.append(f"cells       {space.resolution} along the longest side")
+    if config.field == "mlp" and not config.fine.num_freqs:
+        config.fine.num_freqs = int(np.clip(round(1 + math.log2(2 * math.pi / (4 * footprint))), 1, 16))
+        lines.append(f"octaves     {config.fine.num_freqs}, down to waves of four pixels")
+    if config.field == "grid" and not len(config.features.resolutions):
+        config.features.resolutions = tuple(max(finest // 2**level, 2) for level in (3, 2, 1, 0))
+        lines.append(f"features    {config.features.resolutions} vertices along the longest side")
+    lines.append("left out    coarse network and importance points: the cells say where to ask")
+    return config, lines
+
+
+def is_open(config):
+    """Returns whether sizes are still to be chosen."""
+    space = config.get("space")
+    if not space or not space.skip_empty:
+        return False
+    field = config.features.resolutions if config.field == "grid" else config.fine.num_freqs
+    return not all([*(space[name] for name in _SIZES), field])
+
+
+def fill_from(config, fitted):
+    """Returns a copy whose open sizes are those of a fitted configuration."""
+    config = copy.deepcopy(config)
+    if is_open(config):
+        for name in _SIZES:
+            config.space[name] = config.space[name] or fitted.space[name]
+        config.features.resolutions = config.features.resolutions or fitted.features.resolutions
+        config.fine.num_freqs = config.fine.num_freqs or fitted.fine.num_freqs
+    return config
+
+
+def skipping(config):
+    """Returns a copy of a configuration without a space, for fit_config to choose one by the cameras."""
+    config = copy.deepcopy(config)
+    if not config.get("space"):
+        raise ValueError("eval.skip_empty: the configuration has no space section; give one with --config")
+    config.space.update({"skip_empty": True, "masks": False})
+    return config
+
+
+def _footprint(views, ndc):
+    """Returns what a pixel covers where the cameras look, in world units."""
+    if ndc:
+        return 2 / float(np.max(views.size[:, 1]))
+    eyes = np.asarray(views.cameras.to_world, np.float64)[:, :, 3]
+    distances = np.linalg.norm(eyes - poses.gaze_center(views.cameras.to_world), axis=-1)
+    return float(np.median(distances / np.asarray(views.cameras.focal)[:, 0]))
+
+
+def _box(views, masks, *, ndc):
+    """Returns lower, upper, and in words where they come from."""
+    if ndc:
+        lower, upper = _ends_of_rays(views)
+        return lower, upper, "which holds all rays"
+    center = poses.gaze_center(views.cameras.to_world)
+    distance = np.linalg.norm(np.asarray(views.cameras.to_world)[:, :, 3] - center, axis=-1)
+    # As wide as the widest image is in the middle of the scene.
+    width = distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / np.asarray(views.cameras.focal)
+    lower, upper = center - width.max(), center + width.max()
+    if not masks:
+        return lower, upper, "as wide as the images where all cameras look; nothing is known to be empty"
+    return *hull.hull_bounds(views, lower, upper), "which holds all that the masks leave possible"
+
+
+def _ends_of_rays(views):
+    """Returns the box of all rays' ends: of those through the images' corners, as they are straight."""
+    ends = []
+    for index, (height, width) in enumerate(np.asarray(views.size)):
+        corners = np.float32([[0, 0], [width, 0], [0, height], [width, height]])
+        rays = view_rays(views, index, corners, ndc=True)
+        for t in (rays.near, rays.far):
+            ends.append(np.asarray(rays.origins + t[:, None] * rays.directions))
+    ends = np.concatenate(ends)
+    return ends.min(axis=0), ends.max(axis=0)
+
+
+def _text(point):
+    return "(" + ", ".join(f"{value:.2f}" for value in point) + ")"

@@ -1,0 +1,177 @@
+"""The box of a scene: what of it is known to be empty before training, and what training finds to be."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnerf.core import occupancy
+from jaxnerf.core.sampling import samples_from_edges, stepped_edges
+from jaxnerf.data.batches import live_pixels, view_rays
+from jaxnerf.data.hull import visual_hull
+
+_CHUNK = 8192  # cells asked at once: their activations stay in a processor's cache
+
+
+class Space(NamedTuple):
+    """The box of a model that asks only where there is something, and how that is kept up to date."""
+
+    lower: tuple[float, float, float]  # world units
+    upper: tuple[float, float, float]
+    shape: tuple[int, int, int]  # cells
+    step: float  # world units between samples
+    threshold: float  # 1 / world unit, the density below which a cell is empty
+    create: Callable[..., occupancy.Grid]  # possible [X, Y, Z] bool -> Grid
+    update: Callable[..., occupancy.Grid]  # (step, params, Grid, cells [L] int32) -> Grid
+
+    @property
+    def longest(self):
+        """The box's diagonal, world units."""
+        return math.dist(self.lower, self.upper)
+
+
+def make_space(
+    lower, upper, *, resolution, step, seed, field, threshold, update_every, look_at_once, passes_from_start=8
+):
+    """Returns the Space of a box.
+
+    Args:
+        lower, upper: [3] world units.
+        resolution: cells along the longest side; along the others so many that they are cubes.
+        step: world units between samples.
+        seed: of the places that are looked at.
+        field: Field; its density under params["fine"] is what counts. None where there are no updates.
+        threshold: the share of light absorbed in a step below which a cell is empty.
+        update_every: steps between two looks.
+        look_at_once: cells a look. Where there are more, looks at the start come more often, until all cells
+            have been seen passes_from_start times.
+    """
+    if threshold <= 0 or step <= 0:
+        raise ValueError(f"space.threshold is {threshold} and space.step {step}, wanted both above 0")
+    sides = [high - low for low, high in zip(lower, upper, strict=True)]
+    shape = tuple(max(round(side / max(sides) * resolution), 1) for side in sides)
+    density = threshold / step
+
+    def create(possible):
+        # What is not looked at yet counts as ten times the threshold: half a dozen looks empty a cell.
+        return occupancy.create_grid(
+            jnp.asarray(lower, jnp.float32), jnp.asarray(upper, jnp.float32), possible, assumed=10 * density
+        )
+
+    def update(step, params, grid, cells):
+        if cells.size == 0:
+            return grid
+        count = min(cells.size, look_at_once)
+        count -= count % _CHUNK if count > _CHUNK else 0  # or a rest of another size is compiled too
+        often = max(update_every * count // cells.size, 1)
+        young = step < passes_from_start * update_every
+        interval = jnp.where(young, often, update_every)
+        look = jnp.where(young, step // often, step // update_every)
+
+        def looked():
+            # No ray has this position, so the key is the step's own.
+            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), step), 2**32 - 2)
+            first = (look % -(-cells.size // count)) * count
+            chosen = cells[(first + jnp.arange(count)) % cells.size]
+            return occupancy.update_grid(
+                key,
+                grid,
+                functools.partial(field.apply, params["fine"]),
+                chosen,
+                threshold=density,
+                chunk=_CHUNK,
+            )
+
+        return jax.lax.cond(step % interval == interval - 1, looked, lambda: grid)
+
+    return Space(tuple(lower), tuple(upper), shape, step, density, create, update)
+
+
+def survey(views, space, *, masks, ndc=False, pixel_offset=0.5):
+    """Returns what is known before training: possible [X, Y, Z] bool, live [L] and cells [M] int32.
+
+    Args:
+        views: Views.
+        space: Space.
+        masks: whether pixels without alpha show that nothing is there.
+        ndc, pixel_offset: see draw_batch.
+
+    Returns:
+        possible: which cells may hold something; live: the pixels whose rays meet one, all that training
+        has to look at; cells: the flat indices of those that are possible.
+    """
+    possible = possible_cells(views, space, masks=masks)
+    live = pixels_that_meet(views, space, possible, ndc=ndc, pixel_offset=pixel_offset)
+    return possible, live, np.flatnonzero(possible).astype(np.int32)
+
+
+def possible_cells(views, space, *, masks):
+    """Returns [X, Y, Z] bool, what the views' alpha leaves possible; all without masks."""
+    if not masks or views.pixels.shape[-1] != 4:
+        return np.ones(space.shape, bool)
+    # The hull halves its cells, so it is fastest with few of them times a power of two along each axis.
+    count, halvings = max(space.shape), 0
+    while count > 31:
+        count, halvings = -(-count // 2), halvings + 1
+    count <<= halvings
+    lower = np.asarray(space.lower)
+    upper = lower + count * (np.asarray(space.upper) - lower) / space.shape
+    x, y, z = space.shape
+    return visual_hull(views, lower, upper, resolution=count)[:x, :y, :z]
+
+
+def pixels_that_meet(views, space, possible, *, ndc=False, pixel_offset=0.5, chunk=2**12):
+    """Returns [L] int32, ascending: the ids of live pixels whose rays meet a possible cell.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    live = live_pixels(views)
+    live = np.arange(views.pixels.shape[0], dtype=np.int32) if live is None else live
+
+    @jax.jit
+    def meets(views, grid, ids):
+        view = jnp.searchsorted(views.offset, ids, side="right", method="compare_all") - 1
+        place, width = ids - views.offset[view], views.size[view, 1]
+        pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
+        rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
+        samples = samples_in_box(None, grid, rays, step=space.step, longest=space.longest)
+        return ((samples.delta > 0) & occupancy.occupied_at(grid, rays, samples.t)).any(axis=-1)
+
+    colourless = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None)
+    grid, found = space.create(possible), []
+    for start in range(0, live.size, chunk):
+        ids = live[np.minimum(np.arange(start, start + chunk), live.size - 1)]  # one compiled shape
+        found.append(meets(colourless, grid, ids))
+    met = live[np.concatenate([np.asarray(part) for part in found])[: live.size]]
+    if not met.size:
+        raise ValueError(
+            f"no ray of {len(views.offset)} views meets anything in the box {space.lower} to {space.upper}; "
+            "correct space.lower and space.upper"
+        )
+    return met
+
+
+def samples_in_box(key, grid, rays, *, step, longest):
+    """Returns Samples [..., S] of equal steps along what a grid's box cuts from rays [...].
+
+    Args:
+        key: see stepped_edges.
+        grid: Grid.
+        rays: Rays [...].
+        step: world units, a number.
+        longest: world units, a number: the box's diagonal, which says how many samples a ray may need.
+    """
+    inside = occupancy.cut_to_box(grid, rays)
+    count = math.ceil(longest / step) + 1
+    count += -count % 32  # whole words for the packer's flags: padding them takes longer than asking
+    x, y, z = (rays.directions[..., axis] for axis in range(3))
+    t_step = step / jnp.sqrt(x * x + y * y + z * z)
+    return samples_from_edges(
+        None, stepped_edges(key, inside.near, inside.far, step=t_step, num_segments=count)
+    )

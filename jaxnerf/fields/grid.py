@@ -1,0 +1,152 @@
+"""The fast field: features at the vertices of several grids, and a small network with the view direction."""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen
+
+from jaxnerf.core.structs import check_shapes
+from jaxnerf.fields.mlp import Dense, Field
+
+_glorot = linen.initializers.glorot_uniform()
+
+_PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, Eq. 4
+_LARGEST = 15.0  # its exponential stops all light within 1e-5 world units
+
+
+def grid_field(**options):
+    """Returns features in grids of several resolutions as a Field (after arXiv:2201.05989).
+
+    Args:
+        **options: attributes of FeatureGrid.
+
+    Returns:
+        Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3]) returns density [..., S] in
+        1 / world unit, an exponential of at most e^15, and rgb [..., S, 3] in [0, 1], both float32.
+        Outside the box the answer is that of the nearest point inside.
+
+    Raises:
+        ValueError: if the box has no inside, or a level fewer than 2 vertices a side.
+    """
+    network = FeatureGrid(**options)
+    lower, upper = np.asarray(network.lower, float), np.asarray(network.upper, float)
+    if lower.shape != (3,) or upper.shape != (3,) or not (lower < upper).all():
+        raise ValueError(f"grid_field: the box is {network.lower} to {network.upper}, wanted lower < upper")
+    if not network.resolutions or min(network.resolutions) < 2:
+        raise ValueError(f"grid_field: resolutions are {network.resolutions}, wanted one, of at least 2")
+
+    def init(key):
+        return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
+
+    def apply(params, x, viewdirs):
+        density, rgb = network.apply({"params": params}, x, viewdirs)
+        return jnp.exp(jnp.minimum(density, _LARGEST)), jax.nn.sigmoid(rgb)
+
+    return Field(init, apply)
+
+
+class FeatureGrid(linen.Module):
+    """Interpolated features: a weighted sum for the density's logarithm, one hidden layer for colour."""
+
+    lower: Sequence[float]  # [3] world units, the box
+    upper: Sequence[float]  # [3]
+    resolutions: Sequence[int] = (16, 32, 64, 128)  # vertices along the longest side, a level each
+    features: int = 4  # of a vertex
+    table_size: int = 2**17  # rows of a level; where it has more vertices, they share rows by a hash
+    view_width: int = 64  # of the hidden layer
+    use_viewdirs: bool = True  # False: colour does not depend on the direction
+    scale: float = 4.0  # of the features over their table: each step moves few of them, so further
+
+    @linen.compact
+    def __call__(self, x, viewdirs):
+        """Returns density [..., S] and rgb [..., S, 3] before their activations; features first inside."""
+        shape = x.shape[:-1]
+        side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
+        place = [(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)]
+        sizes = [vertices(side, resolution) for resolution in self.resolutions]
+        first = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes])
+        # One table for all levels: one gradient to clear and one array to update.
+        table = self.param("table", _near_zero, (int(first[-1]), self.features))
+        levels = [
+            interpolate(table, place, size, rows=range(*ends))
+            for size, ends in zip(sizes, np.stack([first[:-1], first[1:]], -1).tolist(), strict=True)
+        ]
+        features = self.scale * jnp.concatenate(levels, axis=-1)
+        density = features @ self.param("density", _glorot, (features.shape[-1], 1))
+        if self.use_viewdirs:
+            directions = harmonics(viewdirs)
+            directions = jnp.broadcast_to(directions, (*shape, 9)).reshape(-1, 9)
+            features = jnp.concatenate([features, directions], axis=-1)
+        # Rows come from the table, but a small hidden layer is faster with features first.
+        kernel = self.param("view", _glorot, (features.shape[-1], self.view_width))
+        bias = self.param("view_bias", linen.initializers.zeros_init(), (self.view_width,))
+        hidden = jax.nn.relu(jnp.einsum("df,nd->fn", kernel, features) + bias[:, None])
+        rgb = Dense(3, name="rgb")(hidden)
+        return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
+
+
+def vertices(side, resolution):
+    """Returns how many vertices a grid has along each side [3] of a box, for cells that are nearly cubes."""
+    side = np.asarray(side, np.float64)
+    return tuple(int(max(round(share * (resolution - 1)), 1)) + 1 for share in side / side.max())
+
+
+def interpolate(table, place, size, *, rows):
+    """Returns features, linear between the 8 vertices around each place.
+
+    Args:
+        table: [T, F] features of vertices.
+        place: three times [N], x, y and z as shares of the box; held inside it.
+        size: vertices along x, y and z.
+        rows: range of the table's rows that belong to this grid: one a vertex, z fastest, or fewer, which
+            vertices then share by the hash of arXiv:2201.05989 (Eq. 4).
+
+    Returns:
+        [N, F]. The derivative with respect to place is that of the linear pieces.
+
+    Raises:
+        ValueError: on another shape of the table.
+    """
+    check_shapes("interpolate", table=(table, "T F"), x=(place[0], "N"), y=(place[1], "N"), z=(place[2], "N"))
+    spread = [jnp.clip(value, 0, 1) * (count - 1) for value, count in zip(place, size, strict=True)]
+    low = [jnp.minimum(value.astype(jnp.int32), count - 2) for value, count in zip(spread, size, strict=True)]
+    share = [value - start for value, start in zip(spread, low, strict=True)]
+    total = 0.0
+    for corner in np.ndindex(2, 2, 2):
+        row = rows.start + _row(
+            [start + step for start, step in zip(low, corner, strict=True)], size, len(rows)
+        )
+        weight = 1.0
+        for part, step in zip(share, corner, strict=True):
+            weight = weight * (part if step else 1 - part)
+        total = total + weight[:, None] * table.at[row].get(mode="promise_in_bounds")
+    return total
+
+
+def harmonics(directions):
+    """Returns the 9 real spherical harmonics [..., 9] of degree up to 2 of unit vectors [..., 3]."""
+    x, y, z = (directions[..., i] for i in range(3))
+    return jnp.stack(
+        [
+            jnp.full_like(x, 0.28209479),
+            *(0.48860251 * value for value in (y, z, x)),
+            *(1.0925484 * value for value in (x * y, y * z, x * z)),
+            0.31539157 * (3 * z**2 - 1),
+            0.54627421 * (x**2 - y**2),
+        ],
+        axis=-1,
+    )
+
+
+def _row(vertex, size, count):
+    if count == np.prod(size):
+        return (vertex[0] * size[1] + vertex[1]) * size[2] + vertex[2]
+    scattered = (v.astype(jnp.uint32) * jnp.uint32(prime) for v, prime in zip(vertex, _PRIMES, strict=True))
+    return (functools.reduce(jnp.bitwise_xor, scattered) % jnp.uint32(count)).astype(jnp.int32)
+
+
+def _near_zero(key, shape):
+    return jax.random.uniform(key, shape, minval=-0.025, maxval=0.025)
