@@ -16,7 +16,7 @@ from jaxnerf.engine.workdir import write_text
 
 _README = flags.DEFINE_string("readme", None, "File whose table is replaced.")
 MARKS = ("<!-- results -->", "<!-- end of results -->")
-HEADS = ("run", "step", "training", "compiling", "PSNR", "SSIM", "views", "s a frame", "parameters")
+HEADS = ("run", "step", "training", "compiling", "PSNR", "SSIM", "views", "parameters")
 
 
 def main(argv):
@@ -45,7 +45,6 @@ def row(path):
         f"{results['psnr']:.2f} dB",
         f"{results['ssim']:.3f}",
         str(results["views"]),
-        f"{results['seconds_per_frame']:.2f}",
         f"{results['parameters']:,}",
     )
 

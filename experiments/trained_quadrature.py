@@ -21,7 +21,8 @@ from quadrature import error, measure
 
 from jaxnerf import app, render_hierarchical, render_rays
 from jaxnerf.data.batches import pixel_colors
-from jaxnerf.engine import build, load, workdir
+from jaxnerf.engine import load, workdir
+from jaxnerf.engine.scenes import background_of
 from jaxnerf.fields.mlp import mlp_field
 
 flags.DEFINE_list("workdir", None, "Folders of trained runs.", required=True)
@@ -48,9 +49,9 @@ def study(folder):
     config = workdir.read_config(folder)
     run = load.open_run(folder, config)
     step = load.newest_step(run, folder)
-    params = run.params(step)
+    params, _ = run.weights(step)
     rays, photographed = test_rays(run.experiment, FLAGS.test_rays)
-    background = build.BACKGROUNDS[config.data.background]
+    background = background_of(config.data)
     options = {"background": background, "in_disparity": config.sampling.in_disparity}
     segments, truth, difference = reference(config, params, rays, options)
     rows, timed = [], {}

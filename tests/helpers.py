@@ -1,10 +1,12 @@
 """What several test files share."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf import Rays
+from jaxnerf import Rays, create_grid
 
 
 def compiled(function, *static):
@@ -40,6 +42,23 @@ def random_rays(seed, shape, near=2.0, far=6.0):
         near=np.full(shape, near, np.float32),
         far=np.full(shape, far, np.float32),
     )
+
+
+def rays_past_origin(seed, count):
+    """Returns Rays [count] from about 4 away that pass near the origin, with t in [1, 7]."""
+    rays = random_rays(seed, (count,), near=1.0, far=7.0)
+    return dataclasses.replace(rays, origins=np.float32(0.4 * rays.origins - 4 * rays.directions))
+
+
+def full_grid(half=30.0, shape=(6, 5, 8)):
+    """Returns a Grid of a cube around the origin, all of which is occupied."""
+    return create_grid(np.full(3, -half), np.full(3, half), np.ones(shape, bool), assumed=1.0)
+
+
+def checked_grid(half=1.5, shape=(6, 5, 8)):
+    """Returns a Grid of a cube around the origin of which every other cell is empty."""
+    possible = np.indices(shape).sum(axis=0) % 2 == 0
+    return create_grid(np.full(3, -half), np.full(3, half), possible, assumed=1.0)
 
 
 def all_finite(tree):

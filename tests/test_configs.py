@@ -19,6 +19,16 @@ def load(name):
     return importlib.import_module(f"configs.{name}").get_config()
 
 
+def with_sizes(config):
+    """Returns the configuration with what its views would fill in."""
+    if config.space.skip_empty:
+        sizes = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3, "resolution": 8, "step": 0.1}
+        config.space.update({name: size for name, size in sizes.items() if not config.space[name]})
+        config.features.resolutions = config.features.resolutions or (4, 8)
+        config.fine.num_freqs = config.fine.num_freqs or 4
+    return config
+
+
 def fields(config):
     """Returns {"section.key": value} of all that a configuration holds."""
     plain = config.to_dict()
@@ -32,13 +42,13 @@ def fields(config):
 @pytest.mark.parametrize("name", NAMES)
 def test_it_builds_and_invents_no_field(name):
     config, default = load(name), load("default")
-    experiment = build(config)
     known = fields(default)
     for field, value in fields(config).items():
         assert field in known, f"{field} is not in configs/default.py"
         assert type(value) is type(known[field]), field
+    experiment = build(with_sizes(config))
     params = jax.eval_shape(experiment.model.init, jax.random.key(0))
-    assert ("coarse" in params) == bool(config.sampling.num_fine)
+    assert ("coarse" in params) == (bool(config.sampling.num_fine) and not config.space.skip_empty)
     assert float(experiment.schedule(config.train.lr_steps)) == pytest.approx(config.train.lr_final)
     assert experiment.conventions["background"] == config.data.background
 
@@ -131,6 +141,8 @@ def test_the_learning_rate_falls_exponentially():
         ("sampling.rule", "boxes", "sampling.rule is 'boxes'"),
         ("train.batching", "rays", "train.batching is 'rays'"),
         ("fine.density_activation", "tanh", "density_activation is 'tanh'"),
+        ("field", "grid", "field is 'grid' with space.skip_empty off"),
+        ("space.skip_empty", True, "space.lower is open"),
     ],
 )
 def test_what_cannot_be_built_is_named(field, value, wanted):
@@ -163,11 +175,11 @@ def _render_jaxpr(experiment):
         pixels=None, offset=None, size=None, cameras=camera, near=jax.numpy.ones(1), far=jax.numpy.ones(1)
     )
     rays = jax.eval_shape(lambda: experiment.view_rays(views, 0, jax.numpy.ones((4, 2))))
-    return jax.make_jaxpr(model.render)(keys, params, rays)
+    return jax.make_jaxpr(model.render)(keys, params, None, rays, 0)
 
 
 def test_one_module_alone_reads_the_configuration():
-    """ConfigDict stays in workdir.py and the mains; sections of a configuration are read in build.py."""
+    """ConfigDict stays in workdir.py and the mains; sections are read in build.py, and filled in fit.py."""
     for path in sorted((ROOT / "jaxnerf").rglob("*.py")):
         name = str(path.relative_to(ROOT / "jaxnerf"))
         tree = ast.parse(path.read_text())
@@ -189,8 +201,10 @@ def test_one_module_alone_reads_the_configuration():
             and isinstance(node.value, ast.Name)
             and node.value.id == "config"
         } - {"to_json_best_effort", "update"}
-        allowed = {"data"} if main or name == "engine/load.py" else set()  # to put --data_dir in
-        assert name == "engine/build.py" or read <= allowed, (name, read)
+        # To put --data_dir and other settings in, or to read what fit.py looks at.
+        allowed = {"engine/load.py": {"data", "eval"}, "engine/loop.py": {"data"}}
+        allowed = allowed.get(name, {"data"} if main else set())
+        assert name in ("engine/build.py", "engine/fit.py") or read <= allowed, (name, read)
 
 
 def test_the_optimizer_is_adam_with_the_configured_numbers():

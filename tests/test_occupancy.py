@@ -1,3 +1,5 @@
+"""The grid of what may be occupied: where its cells are, what looks find, and what it leaves out."""
+
 import dataclasses
 
 import jax
@@ -6,215 +8,49 @@ import numpy as np
 import pytest
 
 import jaxnerf
-from helpers import all_finite, assert_same, compiled, random_rays
-from jaxnerf.core import compositing, occupancy
-from jaxnerf.fields import analytic
+from helpers import checked_grid, compiled, full_grid, rays_past_origin
+from jaxnerf.core import occupancy
 
-RAYS, SEGMENTS, RESOLUTION = 24, 40, 8
-BACKGROUND = np.float32([0.9, 0.2, 0.5])
-OUTPUTS = ("rgb", "opacity", "depth", "disparity")
-
-
-def scene(x, viewdirs):
-    """Fog around the origin, coloured by place and direction."""
-    return 4 * jnp.exp(-2 * (x**2).sum(axis=-1)), jax.nn.sigmoid(3 * x + viewdirs)
+SIZES = (16, 12, 14)  # cells of the box that is looked at
+LOWER, UPPER = np.float32([-3.0, -2.0, -2.5]), np.float32([3.0, 2.5, 2.0])
+occupied_at = compiled(occupancy.occupied_at)
+mask_samples = compiled(occupancy.mask_samples)
 
 
-def full_grid(half=30.0):
-    everywhere = np.ones((RESOLUTION,) * 3, bool)
-    return occupancy.create_grid(np.full(3, -half), np.full(3, half), everywhere, assumed=1.0)
+def fog(x, viewdirs):
+    return 4 * jnp.exp(-2 * (x**2).sum(axis=-1)), jnp.zeros_like(x)
 
 
-def checked_grid():
-    """Returns a grid of which every other cell is empty."""
-    possible = np.indices((RESOLUTION,) * 3).sum(axis=0) % 2 == 0
-    return occupancy.create_grid(np.full(3, -1.5), np.full(3, 1.5), possible, assumed=1.0)
-
-
-@pytest.fixture(scope="module")
-def rays():
-    """Rays that pass near the origin."""
-    rays = random_rays(0, (RAYS,), near=1.0, far=7.0)
-    return dataclasses.replace(rays, origins=np.float32(0.4 * rays.origins - 4 * rays.directions))
-
-
-@pytest.fixture(scope="module")
-def samples(rays):
-    edges = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=SEGMENTS)
-    return jaxnerf.samples_from_edges(jax.random.key(1), edges)
+def one_ray(origin, direction):
+    names = ("origins", "directions", "viewdirs", "near", "far")
+    values = (origin, direction, direction, 0.0, 9.0)
+    return jaxnerf.Rays(**{name: np.float32([value]) for name, value in zip(names, values, strict=True)})
 
 
 @compiled
-def dense(rays, samples):
-    return jaxnerf.render_samples(scene, rays, samples, background=BACKGROUND)
+def look(key, grid, cells):
+    return occupancy.update_grid(key, grid, fog, cells, threshold=0.5, decay=0.5)
 
 
-packed = compiled(
-    lambda grid, rays, samples, capacity, stop=0.0: jaxnerf.render_packed(
-        scene, grid, rays, samples, capacity=capacity, stop=stop, background=BACKGROUND
-    ),
-    "capacity",
-    "stop",
-)
+def middles(grid):
+    """Returns the middles [X, Y, Z, 3] of cells, and half of a cell's diagonal."""
+    size = (np.asarray(grid.upper) - np.asarray(grid.lower)) / grid.occupied.shape
+    places = np.moveaxis(np.indices(grid.occupied.shape), 0, -1) + 0.5
+    return np.asarray(grid.lower) + places * size, np.linalg.norm(size) / 2
 
 
-def assert_close(got, want, atol=1e-6):
-    for name in OUTPUTS:
-        np.testing.assert_allclose(getattr(got, name), getattr(want, name), rtol=1e-6, atol=atol)
-
-
-def test_a_full_grid_changes_nothing(rays, samples):
-    got = packed(full_grid(), rays, samples, capacity=RAYS * SEGMENTS)
-    assert_close(got, dense(rays, samples))
-    assert got.weights is None and got.dropped.shape == (RAYS,) and not got.dropped.any()
-
-
-def test_a_full_grid_changes_no_gradient(rays, samples):
-    slopes = np.float32(np.random.default_rng(2).normal(size=(RAYS, 6)))
-
-    def total(render):
-        def value(rays, samples, strength):
-            def own(x, viewdirs):
-                density, rgb = scene(x, viewdirs)
-                return strength * density, rgb
-
-            seen = render(own, rays, samples)
-            parts = jnp.stack([seen.opacity, seen.depth, seen.disparity], axis=-1)
-            return (jnp.concatenate([seen.rgb, parts], axis=-1) * slopes).sum()
-
-        return jax.jit(jax.grad(value, argnums=(0, 1, 2)))
-
-    def in_pool(scene, rays, samples):
-        return jaxnerf.render_packed(scene, full_grid(), rays, samples, capacity=RAYS * SEGMENTS)
-
-    given = jax.tree.map(jnp.asarray, (rays, samples)), jnp.float32(1.3)
-    got = total(in_pool)(*given[0], given[1])
-    want = total(jaxnerf.render_samples)(*given[0], given[1])
-    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
-        np.testing.assert_allclose(a, b, atol=2e-6 * max(1.0, np.abs(b).max()))
-
-
-def test_an_empty_cell_is_as_if_the_scene_were_empty_there(rays, samples):
-    grid = checked_grid()
-    kept = np.asarray(occupancy.occupied_at(grid, rays, samples.t))
-    assert 0.05 < kept.mean() < 0.6
-    seen = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
-    assert_close(packed(grid, rays, samples, capacity=int(kept.sum())), dense(rays, seen))
-
-
-def test_a_cell_is_found_by_hand():
-    grid = checked_grid()
-    rays = jaxnerf.Rays(
-        origins=np.float32([[-1.4, -1.4, -1.4]]),
-        directions=np.float32([[0.0, 0.0, 1.0]]),
-        viewdirs=np.float32([[0.0, 0.0, 1.0]]),
-        near=np.float32([0.0]),
-        far=np.float32([9.0]),
-    )
-    t = np.float32([[0.0, 0.2, 0.3, 0.7, 2.8, 3.0, np.nan]])  # cells 0 0 1 2 7, outside, unknown
+@pytest.mark.parametrize("axis, size", [(0, 6), (1, 5), (2, 8)])
+def test_a_cell_is_found_by_hand(axis, size):
+    """Along one axis, from the middle of the box's first cell: every other cell is empty."""
+    cell = 3 / np.float32([6, 5, 8])
+    direction = 2 * np.eye(3)[axis]
+    rays = one_ray(-1.5 + cell / 2, direction)
+    t = cell[axis] / 2 * np.float32([[0, 0.4, 0.6, 1, 2, size - 1, size - 0.4, -0.4, -0.6, np.nan]])
+    empty_last = size % 2 == 0
     np.testing.assert_array_equal(
-        occupancy.occupied_at(grid, rays, t)[0], [True, True, False, True, False, False, True]
+        occupied_at(checked_grid(), rays, t)[0],
+        [True, True, False, False, True, not empty_last, False, True, False, True],
     )
-
-
-def test_rays_that_miss_everything_see_the_background(rays, samples):
-    nothing = dataclasses.replace(full_grid(), occupied=jnp.zeros((RESOLUTION,) * 3, bool))
-    for stop in (0.0, 0.01):
-        got = packed(nothing, rays, samples, capacity=64, stop=stop)
-        np.testing.assert_allclose(got.rgb, np.broadcast_to(BACKGROUND, (RAYS, 3)), rtol=1e-6)
-        np.testing.assert_array_equal(got.depth, rays.far)
-        np.testing.assert_array_equal(got.disparity, 0)
-        np.testing.assert_array_equal(got.opacity, 0)
-
-
-def test_an_overflow_is_counted_and_spares_the_rays_that_fit(rays, samples):
-    got = packed(full_grid(), rays, samples, capacity=10 * SEGMENTS + 5)
-    np.testing.assert_array_equal(got.dropped, [0] * 10 + [SEGMENTS - 5] + [SEGMENTS] * (RAYS - 11))
-    first = jax.tree.map(lambda leaf: leaf[:10], got)
-    assert_close(first, jax.tree.map(lambda leaf: leaf[:10], dense(rays, samples)))
-
-
-@pytest.mark.parametrize("stop, capacity", [(0.5, RAYS), (0.1, 100), (1e-3, 60), (1e-3, RAYS * SEGMENTS)])
-def test_what_stops_early_is_within_its_bound_and_drops_nothing(rays, samples, stop, capacity):
-    got, want = packed(full_grid(), rays, samples, capacity=capacity, stop=stop), dense(rays, samples)
-    assert np.abs(got.rgb - want.rgb).max() <= stop + 1e-6
-    assert (got.opacity <= want.opacity + 1e-6).all() and not got.dropped.any()
-    still = 1 - got.opacity > stop
-    np.testing.assert_allclose(got.rgb[still], want.rgb[still], atol=1e-6)
-
-
-def test_a_small_pool_asks_for_less_than_all():
-    """Behind a wall nothing is asked once the pool has come to it."""
-    asked = []
-    wall = analytic.slab(1e4, lower=0.0, upper=1.0).scene
-
-    def counting(x, viewdirs):
-        jax.debug.callback(lambda x: asked.append(float(x[0, :, 2].min())), x)
-        return wall(x, viewdirs)
-
-    one = np.float32([[0.0, 0.0, -1.0]])
-    rays = jaxnerf.Rays(
-        origins=-2 * one, directions=one, viewdirs=one, near=np.zeros(1, "f"), far=np.full(1, 20, "f")
-    )
-    samples = jaxnerf.samples_from_edges(None, jaxnerf.uniform_edges(rays.near, rays.far, num_segments=200))
-    seen = jaxnerf.render_packed(counting, full_grid(), rays, samples, capacity=4, stop=1e-4)
-    jax.effects_barrier()
-    np.testing.assert_allclose(seen.opacity, 1, atol=1e-4)
-    assert len(asked) == 3 and min(asked) > 0.4  # 12 of 200 samples: 10 before the wall, 2 in it
-
-
-def test_packed_weights_are_those_of_each_ray():
-    rng = np.random.default_rng(3)
-    density = np.float32(rng.exponential(size=(5, 7)) * (rng.uniform(size=(5, 7)) < 0.7))
-    density[1, 2], density[3, 0] = np.inf, 1e30
-    length = np.float32(rng.uniform(size=(5, 7)))
-    starts = np.arange(35) % 7 == 0
-    slopes = np.float32(rng.normal(size=35))
-
-    def total(density):
-        return (compositing.packed_weights(density, length.reshape(-1), starts, longest=7)[0] * slopes).sum()
-
-    def separate(density):
-        weights = jaxnerf.weights_from_density(density.reshape(5, 7), length)
-        return (weights.reshape(-1) * slopes).sum()
-
-    for function in (total, separate):
-        assert all_finite(jax.jit(jax.grad(function))(density.reshape(-1)))
-    got, _ = compositing.packed_weights(density.reshape(-1), length.reshape(-1), starts, longest=7)
-    np.testing.assert_allclose(got.reshape(5, 7), jaxnerf.weights_from_density(density, length), atol=1e-7)
-    np.testing.assert_allclose(
-        jax.grad(total)(density.reshape(-1)), jax.grad(separate)(density.reshape(-1)), atol=1e-6
-    )
-
-
-@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
-def test_leading_axes_do_not_matter(rays, samples, shape):
-    count = int(np.prod(shape))
-
-    def part(leaf):
-        return None if leaf is None else np.asarray(leaf)[:count].reshape((*shape, *np.shape(leaf)[1:]))
-
-    some = jax.tree.map(part, (rays, samples))
-    got = packed(full_grid(), *some, capacity=count * SEGMENTS)
-    assert_close(got, jax.tree.map(part, dense(rays, samples)))
-
-
-def test_nan_of_a_scene_is_seen_only_where_it_is_asked(rays, samples):
-    grid = checked_grid()
-
-    def half_wrong(x, viewdirs):
-        density, rgb = scene(x, viewdirs)
-        return jnp.where(x[..., 0] > 0.0, jnp.nan, density), rgb
-
-    @jax.jit
-    def value(rays, kept):
-        masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
-        return jaxnerf.render_packed(half_wrong, grid, rays, masked, capacity=RAYS * SEGMENTS).rgb.sum()
-
-    kept = np.asarray(jaxnerf.positions(rays, samples.t))[..., 0] <= 0.0
-    given = jax.tree.map(jnp.asarray, rays)
-    assert all_finite(jax.value_and_grad(value)(given, kept))
-    assert np.isnan(value(given, np.ones_like(kept)))
 
 
 def test_rays_are_cut_to_the_box():
@@ -229,58 +65,141 @@ def test_rays_are_cut_to_the_box():
     np.testing.assert_array_equal(got.near[[1, 4]], got.far[[1, 4]])
 
 
-@compiled
-def look(key, grid, cells):
-    return occupancy.update_grid(key, grid, scene, cells, threshold=0.5, decay=0.5)
-
-
 def test_looks_leave_out_what_is_empty_and_keep_what_is_not():
-    resolution = 16
-    everywhere = np.ones((resolution,) * 3, bool)
-    grid = occupancy.create_grid(np.full(3, -3.0), np.full(3, 3.0), everywhere, assumed=1.9)
-    cells = np.arange(resolution**3, dtype=np.int32)
+    grid = occupancy.create_grid(LOWER, UPPER, np.ones(SIZES, bool), assumed=1.9)
+    cells = np.arange(np.prod(SIZES), dtype=np.int32)
     first = look(jax.random.key(0), grid, cells)
     assert first.occupied.all()  # one look is not enough: 0.95 is left of what was assumed
     grid = look(jax.random.key(1), first, cells)
-    middles = (np.indices(grid.occupied.shape) + 0.5) * 6 / resolution - 3
-    away = np.sqrt((middles**2).sum(axis=0))
+    places, half = middles(grid)
+    away = np.linalg.norm(places, axis=-1)
     radius = np.sqrt(np.log(4 / 0.5) / 2)  # where the density is at the threshold
     assert grid.occupied[away < radius].all()  # the neighbours keep what one look might miss
-    assert not grid.occupied[away > radius + 6 / resolution * 3].any()
+    assert not grid.occupied[away > radius + 3.1 * half].any()  # its own cell's half, and a neighbour
     truth = 4 * np.exp(-2 * away**2)
-    assert np.corrcoef(np.asarray(grid.mean).reshape(-1), truth.reshape(-1))[0, 1] > 0.95
+    assert np.corrcoef(np.maximum(grid.mean, 0).reshape(-1), truth.reshape(-1))[0, 1] > 0.95
+    np.testing.assert_array_equal(grid.mean < 0, ~grid.occupied)
 
 
 def test_a_look_at_some_cells_leaves_the_others_as_they_were():
-    grid = dataclasses.replace(full_grid(1.0), possible=jnp.asarray(checked_grid().possible))
-    cells = np.int32([3, 77, 300])
+    grid = checked_grid(1.0, SIZES)
+    cells = np.resize(np.int32([0, 3, 77, 300]), 4)
     got = look(jax.random.key(2), grid, cells)
-    changed = np.flatnonzero(np.asarray(got.peak != grid.peak))
-    assert set(changed) <= set(cells) and set(np.flatnonzero(got.mean)) == set(cells)
+    changed = np.flatnonzero(got.peak != np.asarray(grid.peak))
+    assert set(changed) <= set(cells)
+    possible = np.asarray(grid.possible).reshape(-1)
+    assert set(np.flatnonzero(got.mean > 0)) == {cell for cell in cells if possible[cell]} != set(cells)
     assert not got.occupied[~np.asarray(grid.possible)].any()
 
 
-def test_wrong_arguments(rays, samples):
+def test_each_look_is_inside_its_cell():
+    """The density found in a cell is its own: here it is the number of the cell at x."""
+    grid = occupancy.create_grid(LOWER, UPPER, np.ones(SIZES, bool), assumed=0.0)
+
+    def numbered(x, viewdirs):
+        sizes = zip(LOWER, UPPER, SIZES, strict=True)
+        cells = [(x[..., i] - low) / (high - low) * size for i, (low, high, size) in enumerate(sizes)]
+        first, second, third = (jnp.floor(cell) for cell in cells)
+        return (first * SIZES[1] + second) * SIZES[2] + third, x
+
+    cells = np.random.default_rng(0).permutation(np.prod(SIZES))[:500].astype(np.int32)
+    update = jax.jit(
+        lambda key: occupancy.update_grid(key, grid, numbered, cells, threshold=0.5, smoothing=1.0, chunk=96)
+    )
+    np.testing.assert_array_equal(update(jax.random.key(0)).peak.reshape(-1)[cells], cells)
+
+
+def test_a_density_that_is_nan_keeps_its_cell_occupied():
+    """Or it would be silenced: what is NaN must be asked, and show, in pictures and in training."""
+    grid = occupancy.create_grid(np.full(3, -1.5), np.full(3, 1.5), np.ones((6, 5, 8), bool), assumed=0.0)
+
+    def wrong(x, viewdirs):
+        return jnp.where(x[..., 0] > 0.5, jnp.nan, 0.0), jnp.zeros_like(x)
+
+    got = jax.jit(lambda key: occupancy.update_grid(key, grid, wrong, jnp.arange(240), threshold=0.5))(
+        jax.random.key(0)
+    )
+    occupied = np.asarray(got.occupied)
+    assert occupied[4:].all() and occupied[3].all()  # and the neighbours
+    assert not occupied[:3].any()
+    rays = one_ray((-2.9, 0.1, 0.1), (1.0, 0.0, 0.0))
+    samples = jaxnerf.samples_from_points(np.float32([[1.5, 2.0, 3.6, 4.0]]), last_delta=0.1)
+    np.testing.assert_array_equal(occupied_at(got, rays, samples.t), [[False, False, True, True]])
+    masked, _ = mask_samples(got, rays, samples)
+    np.testing.assert_array_equal(masked.delta > 0, [[False, False, True, True]])
+
+
+def test_a_grid_of_a_scene_that_was_trained_without_one():
+    @compiled
+    def extract(key):
+        return jaxnerf.grid_of_scene(key, fog, LOWER, UPPER, SIZES, threshold=0.5)
+
+    grid = extract(jax.random.key(3))
+    places, half = middles(grid)
+    away = np.linalg.norm(places, axis=-1)
+    radius = np.sqrt(np.log(4 / 0.5) / 2)
+    assert grid.possible.all() and grid.occupied.shape == SIZES
+    assert grid.occupied[away < radius].all()
+    assert not grid.occupied[away > radius + 3.1 * half].any()
+    inner = away < 0.7 * radius
+    np.testing.assert_allclose(grid.mean[inner], 4 * np.exp(-2 * away[inner] ** 2), atol=0.7)
+
+
+def plain_mask(grid, rays, samples, beyond):
+    """Returns which samples are kept [B, S] and which rays are cut [B], sample by sample, in float64."""
+    shape = np.array(grid.mean.shape)
+    kept, cut = np.zeros(samples.t.shape, bool), np.zeros(samples.t.shape[0], bool)
+    for ray in range(len(kept)):
+        depth = 0.0
+        for index in range(kept.shape[1]):
+            t, delta = float(samples.t[ray, index]), float(samples.delta[ray, index])
+            x = np.float64(rays.origins[ray]) + t * np.float64(rays.directions[ray])
+            cell = np.floor((x - grid.lower) / (np.float64(grid.upper) - grid.lower) * shape).astype(int)
+            there = (cell >= 0).all() and (cell < shape).all() and grid.occupied[tuple(cell)] and delta > 0
+            if there and depth > beyond:
+                cut[ray] = True
+            kept[ray, index] = there and depth <= beyond
+            if there:
+                depth += grid.mean[tuple(cell)] * delta * np.linalg.norm(rays.directions[ray])
+    return kept, cut
+
+
+@pytest.mark.parametrize("beyond", [np.inf, 2.0, 0.5])
+def test_what_a_guess_hides_is_what_a_plain_loop_hides(beyond):
+    grid = checked_grid()
+    density = np.random.default_rng(1).exponential(size=(6, 5, 8)) * (
+        np.random.default_rng(2).uniform(size=(6, 5, 8)) < 0.8
+    )
+    grid = dataclasses.replace(grid, mean=jnp.where(grid.occupied, np.float32(density), -1))
+    grid = jax.tree.map(np.asarray, grid)
+    rays = rays_past_origin(4, 30)
+    # Some samples are left out already, as those behind far.
+    samples = jaxnerf.samples_from_edges(
+        None, np.minimum(np.linspace(1, 8, 61, dtype=np.float32), rays.far[:, None] - rays.near[:, None])
+    )
+    got, cut = mask_samples(grid, rays, samples, beyond=np.float32(beyond))
+    kept, wanted_cut = plain_mask(grid, rays, samples, beyond)
+    np.testing.assert_array_equal(got.delta, np.where(kept, samples.delta, 0))
+    np.testing.assert_array_equal(got.t, samples.t)
+    np.testing.assert_array_equal(cut, wanted_cut)
+    if beyond == np.inf:
+        assert not cut.any()
+        np.testing.assert_array_equal(kept, occupied_at(grid, rays, samples.t) & (samples.delta > 0))
+    else:
+        assert 0.1 < cut.mean() < 0.95
+
+
+def test_a_t_that_is_nan_is_kept_and_shows():
+    """In training as in pictures: a broken ray must not be taken for an empty one."""
+    samples = jaxnerf.samples_from_points(np.float32([[np.nan, 1.0]]), last_delta=0.1)
+    masked, _ = mask_samples(full_grid(), one_ray((0, 0, 0), (1, 0, 0)), samples)
+    assert np.isnan(masked.delta[0, 0])
+
+
+def test_wrong_arguments():
     with pytest.raises(ValueError, match="create_grid: upper"):
         occupancy.create_grid(np.zeros(3), np.zeros(2), np.ones((2, 2, 2), bool), assumed=1.0)
     with pytest.raises(ValueError, match="create_grid: possible"):
-        occupancy.create_grid(np.zeros(3), np.ones(3), np.ones((2, 2, 3), bool), assumed=1.0)
-    with pytest.raises(ValueError, match="capacity is 3 for 24 rays"):
-        jaxnerf.render_packed(scene, full_grid(), rays, samples, capacity=3, stop=0.1)
-    with pytest.raises(ValueError, match="gauss"):
-        pairs = dataclasses.replace(samples, rule="gauss")
-        jaxnerf.render_packed(scene, full_grid(), rays, pairs, capacity=30)
-    with pytest.raises(ValueError, match="render_packed: the scene returned"):
-        jaxnerf.render_packed(lambda x, v: (x, x), full_grid(), rays, samples, capacity=30)
-
-
-def test_render_rays_takes_it_as_its_renderer(rays):
-    def render(scene, rays, samples, *, background=None):
-        return jaxnerf.render_packed(
-            scene, full_grid(), rays, samples, capacity=RAYS * SEGMENTS, background=background
-        )
-
-    options = {"num_samples": SEGMENTS, "background": BACKGROUND}
-    got = jaxnerf.render_rays(jax.random.key(4), scene, rays, render=render, **options)
-    want = jaxnerf.render_rays(jax.random.key(4), scene, rays, **options)
-    assert_same(dataclasses.replace(got, weights=None), dataclasses.replace(want, weights=None), atol=2e-6)
+        occupancy.create_grid(np.zeros(3), np.ones(3), np.ones((2, 2), bool), assumed=1.0)
+    with pytest.raises(ValueError, match="update_grid: cells"):
+        look(jax.random.key(0), full_grid(), np.zeros((2, 2), np.int32))

@@ -49,7 +49,7 @@ def runs(compiled_once, experiment, views):
         mode: run_steps(
             step,
             create_state(model, optimizer, 0),
-            (views, None),
+            (views, None, None),
             10,
             mode,
             batch_size=64,
@@ -95,8 +95,8 @@ def test_the_batch_is_the_same_ray_for_ray(experiment, views, mode):
         return state, jax.tree.map(gather, seen) if axis_name else seen
 
     state = {"step": jnp.int32(3)}
-    _, (seen,) = run_steps(probe, state, (views, None), 1, mode, batch_size=64, block_size=8)
-    keys, batch = jax.jit(experiment.draw)(3, jnp.arange(64), (views, None))
+    _, (seen,) = run_steps(probe, state, (views, None, None), 1, mode, batch_size=64, block_size=8)
+    keys, batch = jax.jit(experiment.draw)(3, jnp.arange(64), (views, None, None))
     np.testing.assert_array_equal(seen["key"], jax.random.key_data(keys))
     assert_same((seen["rgb"], seen["rays"]), (batch.rgb, batch.rays))
 

@@ -22,8 +22,8 @@ from runs import SMOKE_FLAGS, smoke_config, start
 pytest_plugins = ["engine_fixtures"]
 
 
-def params(folder, step):
-    return jax.device_get(open_run(folder).params(step))
+def weights(folder, step):
+    return jax.device_get(open_run(folder).weights(step))
 
 
 def logged_steps(folder):
@@ -71,7 +71,7 @@ def test_a_killed_run_goes_on_bit_for_bit(killed, tmp_path):
     options = {"log_every": 1, "max_steps": end}
     assert train_and_evaluate(smoke_config(**options), killed)
     assert train_and_evaluate(smoke_config(**options), tmp_path / "whole")
-    assert_equal(params(killed, end), params(tmp_path / "whole", end))
+    assert_equal(weights(killed, end), weights(tmp_path / "whole", end))
     assert logged_steps(killed) == list(range(1, end + 1))
     whole, parts = records.read_rows(tmp_path / "whole"), records.read_rows(killed)
     for name in ("loss", "psnr_fine", "lr", "grad_norm", "rays"):
@@ -101,12 +101,12 @@ def test_the_last_few_checkpoints_are_kept(trained):
 
 def test_a_finished_run_is_left_as_it_is(trained, tmp_path, capsys):
     folder = shutil.copytree(trained, tmp_path / "run")
-    before = params(folder, 20)
+    before = weights(folder, 20)
     assert train_and_evaluate(smoke_config(), folder)
     assert "20 of 20 taken" in capsys.readouterr().err
     assert Checkpoints(folder).steps() == [10, 15, 20]
     assert logged_steps(folder) == [5, 10, 15, 20]
-    assert_equal(params(folder, 20), before)
+    assert_equal(weights(folder, 20), before)
 
 
 def test_a_limit_of_seconds_is_not_passed_again_and_again(trained, tmp_path):
@@ -126,28 +126,28 @@ def test_a_broken_checkpoint_is_named_and_nothing_is_lost(trained, tmp_path):
     assert Checkpoints(folder).steps() == [10, 15, 20]
     shutil.rmtree(folder / "checkpoints" / "20")
     assert train_and_evaluate(smoke_config(), folder)
-    assert_equal(params(folder, 20), params(trained, 20))
+    assert_equal(weights(folder, 20), weights(trained, 20))
     assert logged_steps(folder) == [5, 10, 15, 20]
 
 
 def test_load_scene_gives_the_model_to_other_code(trained):
     scene, render = load_scene(trained)
     opened = open_run(trained)
-    views, weights = opened.experiment.load_views("test"), opened.params(20)
+    views, weights = opened.experiment.load_views("test"), opened.weights(20)
     rays = opened.experiment.view_rays(views, 1, pixel_grid(24, 24))
     wanted = render_image(functools.partial(opened.render, weights), rays, chunk=250)
     assert_equal(render_image(render, rays, chunk=250), wanted)
     points = np.random.default_rng(0).normal(size=(5, 4, 3)).astype(np.float32)
     answer = jax.jit(scene)(points, points[:, :1])
     assert [value.shape for value in answer] == [(5, 4), (5, 4, 3)]
-    assert_equal(answer, jax.jit(opened.experiment.model.scene(weights))(points, points[:, :1]))
+    assert_equal(answer, jax.jit(opened.experiment.model.scene(*weights))(points, points[:, :1]))
 
 
 def test_another_checkpoint_compiles_nothing(trained):
     opened = open_run(trained)
     rays = opened.experiment.view_rays(opened.experiment.load_views("test"), 0, pixel_grid(24, 24))
     images = [
-        render_image(lambda rays, step=step: opened.render(opened.params(step), rays), rays, chunk=250)
+        render_image(lambda rays, step=step: opened.render(opened.weights(step), rays), rays, chunk=250)
         for step in (10, 20)
     ]
     assert opened.render._cache_size() == 1

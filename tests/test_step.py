@@ -23,14 +23,15 @@ OPTIMIZER = optax.adam(0.1)
 def toy_model(trouble=lambda params: 0.0):
     """Colours linear in the direction; two renderings as a hierarchy has. trouble is added to them."""
 
-    def render(keys, params, rays):
+    def render(keys, params, grid, rays, step):
         colours = [rays.viewdirs @ params[name]["w"] + trouble(params) for name in ("coarse", "fine")]
-        return tuple(types.SimpleNamespace(rgb=rgb) for rgb in colours)
+        whole = jnp.zeros(rays.near.shape, jnp.int32)
+        return tuple(types.SimpleNamespace(rgb=rgb, dropped=whole) for rgb in colours)
 
     def init(key):
         return {name: {"w": jax.random.normal(key, (3, 3))} for name in ("coarse", "fine")}
 
-    return types.SimpleNamespace(init=init, render=render)
+    return types.SimpleNamespace(init=init, render=render, space=None)
 
 
 def toy_draw(step, positions, data):

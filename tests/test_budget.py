@@ -1,0 +1,49 @@
+"""Rendering settings picked by error, and empty space found in a network trained along whole rays."""
+
+import pytest
+
+from jaxnerf.engine import budget
+from jaxnerf.engine.load import newest_step, open_run
+from runs import run
+
+pytest_plugins = ["engine_fixtures"]
+
+
+@pytest.fixture(scope="module")
+def picked(trained):
+    """(choice, tried) of a budget that all meet; few settings, as each is compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(budget, "_SAMPLES", (1.0, 0.5))
+        patch.setattr(budget, "_STOPS", (1e-3,))
+        return budget.cheapest_settings(trained, 0.5, num_rays=256)
+
+
+def test_the_cheapest_within_the_budget_is_picked(picked):
+    choice, tried = picked
+    assert choice in tried and choice.seconds == min(other.seconds for other in tried)
+    assert {other.settings["skip_empty"] for other in tried} == {True, False}
+    dense = [other.error for other in tried if not other.settings["skip_empty"]]
+    assert 0 < dense[0] < dense[1] < 0.5, "fewer samples, more error"
+
+
+def test_a_budget_that_nothing_meets_is_said(trained, monkeypatch):
+    far_off = [budget.Choice({"samples": 1.0}, 0.25, 1.0)]
+    monkeypatch.setattr(budget, "_descend", lambda attempt, tried, *_, **__: tried.extend(far_off))
+    with pytest.raises(ValueError, match="no settings stay within 0.1; the nearest, .* differ by 0.25"):
+        budget.cheapest_settings(trained, 0.1, num_rays=64)
+
+
+def test_what_is_skipped_afterwards_was_empty(trained):
+    """The extracted grid leaves the picture as the field itself makes it, sampled as finely."""
+    run = open_run(trained, settings={"skip_empty": True, "samples": 4.0, "stop": 0.0})
+    params, grid = run.weights(newest_step(run, trained))
+    assert grid.occupied.any()
+    rays = budget._random_rays(run.experiment, run.experiment.load_views("test"), 128)
+    everything = grid.__class__(**{**vars(grid), "occupied": grid.possible})
+    skipped, whole = run.render((params, grid), rays), run.render((params, everything), rays)
+    assert float(abs(skipped.rgb - whole.rgb).max()) < 0.05
+
+
+def test_the_program_knows_the_flag():
+    code, _, err = run("eval", "--workdir=nowhere", "--error_budget=-1")
+    assert code == 2 and "error_budget" in err

@@ -1,0 +1,212 @@
+"""The box of a scene: which cells and pixels count, when cells are looked at, and samples through it."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import compiled, full_grid, rays_past_origin
+from jaxnerf import Rays
+from jaxnerf.core import occupancy
+from jaxnerf.data import synthetic
+from jaxnerf.engine import space as spaces
+from jaxnerf.fields import showcase
+from jaxnerf.fields.mlp import Field
+
+BOX = (-1.5, -1.5, -1.0), (1.5, 1.5, 1.3)  # holds the embedded scene
+FOUND = 1e4  # the density of everywhere
+
+
+def a_space(density=FOUND, box=BOX, **options):
+    field = Field(None, lambda params, x, viewdirs: (jnp.full(x.shape[:-1], density), x))
+    given = {"resolution": 8, "step": 0.1, "threshold": 0.01, "update_every": 16, "look_at_once": 2**18}
+    return spaces.make_space(*box, seed=0, field=field, **{**given, **options})
+
+
+@functools.cache
+def looks_at_cells(num_steps, num_cells, **options):
+    """Returns [num_steps, num_cells], how often some cells were looked at up to each step; and the others.
+
+    Each look takes the running mean a fifth of the way to what is everywhere.
+    """
+    space = a_space(**options)
+    cells = np.random.default_rng(0).permutation(np.prod(space.shape))[:num_cells].astype(np.int32)
+
+    def step(grid, index):
+        grid = space.update(index, {"fine": None}, grid, jnp.asarray(cells))
+        return grid, grid.mean.reshape(-1)
+
+    first = space.create(np.ones(space.shape, bool))
+    mean = jax.jit(lambda grid: jax.lax.scan(step, grid, jnp.arange(num_steps)))(first)[1]
+    counts = np.log1p(-np.minimum(np.float64(mean) / FOUND, 1 - 1e-6)) / np.log(0.8)
+    return counts.round().astype(int)[:, cells], np.delete(counts, cells, axis=1)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return synthetic.load_views(size=24)
+
+
+def test_cells_are_cubes_along_all_sides():
+    space = a_space(resolution=20)
+    assert space.shape == (20, 20, 15) and space.longest == pytest.approx(np.sqrt(9 + 9 + 2.3**2))
+    assert a_space(box=((0, 0, 0), (1e-3, 1, 1))).shape == (1, 8, 8)
+
+
+def test_an_empty_cell_is_left_out_after_half_a_dozen_looks():
+    space = a_space(density=0.0)
+    grid, cells = space.create(np.ones(space.shape, bool)), np.arange(np.prod(space.shape))
+    assert grid.occupied.all()
+    update, shares = jax.jit(space.update), []
+    for look in range(6):
+        grid = update(16 * look + 15, {"fine": None}, grid, cells)
+        shares.append(float(grid.occupied.mean()))
+    assert shares[3] == 1 and shares[5] == 0
+
+
+def test_what_is_not_possible_stays_empty():
+    space = a_space()
+    possible = np.random.default_rng(1).uniform(size=space.shape) < 0.1
+    grid = space.create(possible)
+    np.testing.assert_array_equal(grid.occupied, possible)
+    got = jax.jit(space.update)(15, {"fine": None}, grid, np.flatnonzero(possible).astype(np.int32))
+    np.testing.assert_array_equal(got.occupied, possible)
+    assert space.update(15, {"fine": None}, grid, np.zeros(0, np.int32)) is grid
+
+
+def test_where_one_look_sees_all_each_cell_is_looked_at_once_an_interval():
+    counts, others = looks_at_cells(50, 300)
+    assert not others.any()
+    wanted = (np.arange(50) + 1) // 16  # at steps 15, 31, 47
+    np.testing.assert_array_equal(counts, np.broadcast_to(wanted[:, None], counts.shape))
+
+
+def test_with_more_cells_looks_come_more_often_at_first():
+    """A quarter of the cells at once: every 4 steps for 8 times 16 steps, then every 16."""
+    counts, _ = looks_at_cells(200, 384, look_at_once=96)
+    looked = np.flatnonzero(np.diff(counts.sum(1), prepend=0))
+    np.testing.assert_array_equal(looked, [*range(3, 128, 4), 143, 159, 175, 191])
+    assert (np.diff(counts.sum(1), prepend=0)[looked] == 96).all()
+    for step in range(15, 128, 16):
+        assert (counts[step] == (step + 1) // 16).all()  # 8 times from the start, each cell as often
+    assert (counts[191] == 9).all()  # and once more in four intervals
+
+
+@pytest.mark.parametrize(
+    "num_cells, look_at_once, update_every", [(300, 70, 16), (301, 300, 16), (300, 9, 4)]
+)
+def test_every_cell_is_looked_at(num_cells, look_at_once, update_every):
+    """Where numbers divide badly too, also where looks at every step are too few for an interval."""
+    options = {"look_at_once": look_at_once, "update_every": update_every}
+    counts, others = looks_at_cells(200, num_cells, **options)
+    assert not others.any()
+    rounds = -(-num_cells // look_at_once)
+    often = max(update_every * look_at_once // num_cells, 1)
+    young = 8 * update_every
+    if rounds * often <= young:
+        assert (counts[rounds * often - 1] >= 1).all()
+        assert (counts[young - 1] >= 8 - 1).all()
+    later = np.arange(young, 200 - rounds * update_every, update_every)
+    for step in later:
+        assert (counts[step + rounds * update_every - 1] > counts[step - 1]).all()
+    assert (counts[-1] >= 1).all()
+
+
+def test_cells_beyond_a_chunk_are_looked_at_in_whole_chunks():
+    counts, _ = looks_at_cells(26, 10_000, resolution=24, look_at_once=9000)  # every 13 steps
+    assert set(np.diff(counts.sum(1), prepend=0)) == {0, 8192}
+    assert (counts[-1] >= 1).all()
+
+
+def test_a_look_depends_on_seed_and_step_alone():
+    space = spaces.make_space(
+        *BOX,
+        resolution=8,
+        step=0.1,
+        seed=3,
+        field=Field(None, lambda params, x, viewdirs: (jnp.abs(x[..., 0]), x)),
+        threshold=0.01,
+        update_every=4,
+        look_at_once=1000,
+    )
+    cells, grid = np.arange(np.prod(space.shape)), space.create(np.ones(space.shape, bool))
+    update = compiled(space.update)
+    first, again, later = (update(step, {"fine": None}, grid, cells).mean for step in (3, 3, 7))
+    np.testing.assert_array_equal(first, again)
+    assert (first != later).mean() > 0.9
+
+
+def test_all_is_possible_without_masks(views):
+    space = a_space()
+    assert spaces.possible_cells(views, space, masks=False).all()
+    opaque = dataclasses.replace(views, pixels=views.pixels[:, :3])
+    possible = spaces.possible_cells(opaque, space, masks=True)
+    assert possible.all() and possible.shape == space.shape == (8, 8, 6)
+
+
+@pytest.mark.parametrize("resolution", [16, 37])
+def test_possible_cells_hold_all_matter_of_the_embedded_scene(views, resolution):
+    """Also where the hull is made of more cells than the box has."""
+    space = a_space(resolution=resolution)
+    possible = spaces.possible_cells(views, space, masks=True)
+    assert possible.shape == space.shape and possible.mean() < 0.8
+    lower, upper = (np.float32(bound) for bound in BOX)
+    x = lower + np.random.default_rng(2).uniform(size=(1, 200_000, 3)).astype(np.float32) * (upper - lower)
+    density, _ = compiled(showcase.scene)(x, x)
+    cells = np.floor((x[0] - lower) / (upper - lower) * space.shape).astype(int)
+    seen = density[0] > 1.0  # thinner matter may leave no alpha
+    assert seen.mean() > 0.02 and possible[tuple(cells[seen].T)].all()
+
+
+@pytest.mark.parametrize("step", [0.05, 0.3])
+def test_every_pixel_that_shows_something_is_live(views, step):
+    space = a_space(resolution=32, step=step)
+    possible, live, cells = spaces.survey(views, space, masks=True)
+    np.testing.assert_array_equal(cells, np.flatnonzero(possible))
+    assert live.dtype == cells.dtype == np.int32 and (np.diff(live) > 0).all()
+    shown = np.flatnonzero(views.pixels[:, 3] > 0)
+    assert np.isin(shown, live).all()
+    assert live.size < 0.98 * len(views.pixels)
+
+
+def test_pixels_outside_their_mask_are_not_live(views):
+    mask = np.arange(len(views.pixels)) % 3 == 0
+    masked = dataclasses.replace(views, mask=mask)
+    space = a_space()
+    possible = np.ones(space.shape, bool)
+    wanted = spaces.pixels_that_meet(views, space, possible)
+    got = spaces.pixels_that_meet(masked, space, possible, chunk=1000)  # a chunk is no matter
+    np.testing.assert_array_equal(got, wanted[mask[wanted]])
+
+
+def test_a_box_that_no_ray_meets_is_named(views):
+    with pytest.raises(ValueError, match=r"no ray of 60 views .*\(50, 50, 50\).* correct space.lower"):
+        spaces.survey(views, a_space(box=((50, 50, 50), (51, 51, 51))), masks=False)
+
+
+def lengths(rays):
+    return np.linalg.norm(np.float64(rays.directions), axis=-1)
+
+
+@pytest.mark.parametrize("step, random", [(0.3, True), (0.0777, False), (5.0, True), (np.sqrt(3) / 7, False)])
+def test_samples_stand_for_all_of_the_way_through_the_box(step, random):
+    """Whatever the step; also along the diagonal, which no ray is longer in the box than."""
+    grid, rays = full_grid(0.5), rays_past_origin(5, 60)
+    diagonal = np.float32([[1, 1, 1], [-2, 2, 2], [0.5, 0.5, 0.5], [1, 0, 0]])
+    rays = jax.tree.map(lambda a, b: np.concatenate([a, np.float32(b)]), rays, Rays(
+        origins=-2 * diagonal, directions=diagonal, viewdirs=diagonal, near=np.zeros(4), far=np.full(4, 9)
+    ))  # fmt: skip
+    keys = jax.random.split(jax.random.key(0), 64) if random else None
+    samples_in_box = compiled(spaces.samples_in_box, "step", "longest")
+    samples = samples_in_box(keys, grid, rays, step=float(step), longest=float(np.sqrt(3)))
+    inside = compiled(occupancy.cut_to_box)(grid, rays)
+    way = np.float64(inside.far) - inside.near
+    assert (way > 0).mean() > 0.4 and (way == 0).any()
+    np.testing.assert_allclose(np.float64(samples.delta).sum(-1), way, atol=1e-5)
+    assert (samples.delta >= 0).all()
+    assert (samples.delta * lengths(rays)[:, None]).max() <= step * (1 + 1e-4)
+    counted = (samples.delta > 0).sum(-1)
+    assert (counted <= way * lengths(rays) / step + 2.001).all()  # no ray asks more than it is long

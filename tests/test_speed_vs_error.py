@@ -1,0 +1,55 @@
+"""What the study of speed against error computes from its measurements."""
+
+import math
+import pathlib
+import sys
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "experiments"))
+
+import speed_figures
+import speed_machine
+
+
+def test_the_front_holds_what_no_other_point_beats():
+    points = [(3.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 5.0), (1.0, 1.0), (5.0, 4.0)]
+    assert speed_figures.pareto_front(points) == [(1.0, 2.0), (4.0, 5.0)]
+    assert speed_figures.pareto_front([]) == []
+
+
+def test_a_point_is_on_the_front_or_is_beaten_by_one_that_is():
+    points = [tuple(pair) for pair in np.random.default_rng(0).uniform(size=(200, 2)).tolist()]
+    front = speed_figures.pareto_front(points)
+    assert front == sorted(front) and front == sorted(front, key=lambda point: point[1])
+    for cost, value in points:
+        assert any(a <= cost and b >= value for a, b in front)
+
+
+def test_comparable_seconds_are_those_of_the_reference_machine():
+    assert speed_machine.comparable(10.0, speed_machine.REFERENCE) == 10.0
+    assert (
+        speed_machine.comparable(10.0, 2 * speed_machine.REFERENCE) == 20.0
+    )  # twice as fast, so twice the work
+
+
+def test_a_bar_is_reached_at_the_first_score_above_it():
+    points = [{"seconds": 2.0, "psnr": 30.0}, {"seconds": 1.0, "psnr": 28.0}, {"seconds": 3.0, "psnr": 29.9}]
+    assert speed_figures.first_reached(points, 29.0) == 2.0
+    assert math.isinf(speed_figures.first_reached(points, 31.0))
+
+
+def test_a_curve_of_seeds_has_medians_where_all_were_scored():
+    run = lambda *scores: [{"stop": stop, "psnr": psnr} for stop, psnr in scores]  # noqa: E731
+    runs = {"0": run((1, 20.0), (2, 25.0)), "1": run((1, 22.0)), "2": run((1, 27.0), (2, 21.0))}
+    (point,) = speed_figures.medians(runs)
+    assert point["psnr"] == 22.0 and point["seeds"] == [20.0, 22.0, 27.0]
+
+
+@pytest.mark.parametrize("power", [0.0, 1.0, 2.0])
+def test_the_slope_is_the_power(power):
+    values = [1.0, 2.0, 4.0]
+    assert speed_figures.slope(values, [3 * value**power for value in values]) == pytest.approx(
+        power, abs=1e-9
+    )
