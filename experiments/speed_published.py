@@ -1,6 +1,6 @@
-"""What others have published, from facts.md parts C and E; no script of this project measured it.
+"""What others have published, gathered before the project began; no script of this project measured it.
 
-Each entry names the file that it comes from; "hardware" is what facts.md says of it, and no more.
+Each entry names the file that it comes from; "hardware" is what that file says of it, and no more.
 """
 
 
@@ -10,8 +10,12 @@ def _entry(name, psnr, seconds, hardware, what, source, kind="published"):
 
 
 _LEGO, _MEAN = "lego, 800x800", "mean of 8 scenes, 800x800"
-_RERUN = "nerfbaselines README, reruns by one protocol (facts.md C)"
-_CORE, _PART_E, _BEFORE = "one core, 2.5 GHz AVX-512 Xeon", "facts.md E", "measured before the start"
+_RERUN = "nerfbaselines README, reruns by one protocol"
+_CORE, _PART_E, _BEFORE = (
+    "one core, 2.5 GHz AVX-512 Xeon",
+    "one run of each, by hand",
+    "measured before the start",
+)
 _LEGO_100 = "lego, 100x100, 13 held-out training views"
 
 TRAINING = [
@@ -46,7 +50,7 @@ RENDERING = [  # seconds of an 800x800 frame, but where another size is said
     _entry("JaxNeRF", None, 0.35, "128 TPUv2", "800x800", "JaxNeRF README"),
     _entry("ngp_pl", None, 1 / 32.4, "2080 Ti", "mean of the scenes' frames a second", "ngp_pl README"),
     _entry("torch-ngp", None, 1 / 7.8, "2080 Ti", "lego", "ngp_pl README"),
-    _entry("jaxngp", None, 3.75, "GTX 1080 Ti", "1080p, of 288 frames", "facts.md C"),
+    _entry("jaxngp", None, 3.75, "GTX 1080 Ti", "1080p, of 288 frames", "jaxngp README"),
     _entry("nerf-pytorch", None, 4870, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
     _entry("JaxNeRF", None, 3840, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
 ]

@@ -20,7 +20,7 @@ def report(measured):
 
 
 def training(kept):
-    """Returns the lines of curves, of the times to fixed scores, and of what others have published."""
+    """Returns the lines of curves, and of the times to fixed scores."""
     rows, reached = [], []
     for name, curve in kept["curves"].items():
         if not any(curve["runs"].values()):
@@ -46,11 +46,6 @@ def training(kept):
             )
         reached.append((name, *(_reached(curve["runs"], bar) for bar in BARS)))
     heads = ("curve", "s", "comparable s", "PSNR", "SSIM", "rays", "compiling s", "set-up s", "s a frame")
-    others = [
-        (entry["name"], entry["what"], f"{entry['psnr']:.2f}", f"{entry['seconds']:,.0f}", entry["hardware"])
-        + (entry["kind"], entry["source"])
-        for entry in speed_published.TRAINING
-    ]
     return [
         f"Training, scored on the test views; medians of the seeds. {kept['machine']}. Comparable seconds: "
         "times the GFLOP/s of a matrix product just before and after, over 93.",
@@ -60,7 +55,17 @@ def training(kept):
         "Seconds (comparable seconds) of training at the first score that reached:",
         "",
         *table.markdown(("curve", *(f"{bar:g} dB" for bar in BARS)), reached),
-        "",
+    ]
+
+
+def published():
+    """Returns the lines of what others have published, and of what was known before the start."""
+    others = [
+        (entry["name"], entry["what"], f"{entry['psnr']:.2f}", f"{entry['seconds']:,.0f}", entry["hardware"])
+        + (entry["kind"], entry["source"])
+        for entry in speed_published.TRAINING
+    ]
+    return [
         "Published by others, on their hardware; not measured here:",
         "",
         *table.markdown(("system", "on", "PSNR", "s", "hardware", "kind", "source"), others),

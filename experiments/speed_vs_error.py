@@ -54,7 +54,7 @@ def main(argv):
             )
     measured = {part: _read(out / f"{part}.json") for part in PARTS}
     lines = speed_report.report(measured)
-    print("\n".join(lines))
+    print("\n".join([*lines, "", *speed_report.published()]))
     if flags.FLAGS.readme:
         table.replace(pathlib.Path(flags.FLAGS.readme), lines, MARKS)
     speed_plot.draw(measured, out / "speed_vs_error.png")

@@ -84,7 +84,7 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
 
 
 def grid_of_scene(key, scene, lower, upper, shape, *, threshold, looks=4, chunk=8192):
-    """Returns the Grid of a scene that was trained without one, from its density alone.
+    """Returns the Grid of a scene that was trained without one (a grid of arXiv:2201.05989).
 
     Args:
         key: where in the cells.
@@ -154,7 +154,15 @@ def mask_samples(grid, rays, samples, *, beyond=jnp.inf):
 
 
 def restrict_scene(scene, grid):
-    """Returns the scene with nothing where the grid is empty: what render_packed sees (arXiv:2201.05989)."""
+    """Returns a scene with nothing where the grid is empty: what render_packed sees (arXiv:2201.05989).
+
+    Args:
+        scene: see render_samples.
+        grid: Grid. Outside its box, too, there is nothing.
+
+    Returns:
+        A scene, whose density is 0, with gradient 0, in empty cells.
+    """
 
     def restricted(x, viewdirs):
         density, rgb = scene(x, viewdirs)
