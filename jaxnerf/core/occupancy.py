@@ -57,7 +57,7 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
         key: where in each cell.
         grid: Grid.
         scene: see render_samples.
-        cells: [M] int32, flat indices x first, each at most once.
+        cells: [M] int32, flat indices x first, each at most once; what lies past the last cell is ignored.
         threshold: 1 / world unit; 0.01 over the spacing of samples leaves out what absorbs 1 % of the light.
         decay: what of the peak outlasts a look that finds less.
         smoothing: the weight of a look in the running mean.
@@ -142,12 +142,12 @@ def mask_samples(grid, rays, samples, *, beyond=jnp.inf):
         Samples [..., S]; and hidden [...], whether a ray has samples left out that only the guess hides.
     """
     index, inside = _cell(grid, _along(grid, rays, samples.t))
-    mean = jnp.where(inside & (samples.delta > 0), grid.mean.reshape(-1)[index], -1)
+    mean = jnp.where(inside & ~(samples.delta <= 0), grid.mean.reshape(-1)[index], -1)
     # A plain norm, as it is redone for every sample: a guess needs no care for directions of 1e-20.
     x, y, z = (rays.directions[..., axis] for axis in range(3))
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
     hidden = compositing.sum_before(jnp.maximum(mean, 0) * samples.delta * size) > beyond
-    worth = ~(mean < 0)  # NaN counts, and shows
+    worth = ~(mean < 0) | jnp.isnan(samples.t)  # NaN counts, and shows
     kept = worth & ~hidden
     masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
     return masked, (worth & hidden).any(axis=-1)

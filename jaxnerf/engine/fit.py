@@ -35,7 +35,11 @@ def fit_config(config, views):
     masks = space.masks and views.pixels.shape[-1] == 4 and not config.data.ndc
     if not (len(space.lower) and len(space.upper)):
         lower, upper, why = _box(views, masks, ndc=config.data.ndc)
-        space.lower, space.upper = (tuple(round(float(x), 4) for x in bound) for bound in (lower, upper))
+        digits = 4 - math.floor(math.log10(max(upper - lower)))
+        space.lower, space.upper = (
+            tuple(given) or tuple(round(float(x), digits) for x in bound)
+            for given, bound in ((space.lower, lower), (space.upper, upper))
+        )
         lines.append(f"box         {_text(space.lower)} to {_text(space.upper)}, {why}")
     longest = max(high - low for low, high in zip(space.lower, space.upper, strict=True))
     finest = int(np.clip(round(longest / (_SPACING * footprint)), *_FINEST))

@@ -20,9 +20,9 @@ def load_views(data, split):
         return _read_views(data, split)
     views = _read_views(data, "train")
     count = len(views.offset)
-    indices = subset.held_out(count, every)
-    if every < 0 or not 0 < indices.size < count:
+    if not 2 <= every <= count:
         raise ValueError(f"data.hold_out is {every} of {count} views, wanted 2 to {count}, or 0 for none")
+    indices = subset.held_out(count, every)
     return subset.select_views(views, indices if split == "held_out" else np.setdiff1d(range(count), indices))
 
 

@@ -66,9 +66,9 @@ def make_space(
     def update(step, params, grid, cells):
         if cells.size == 0:
             return grid
-        count = min(cells.size, look_at_once)
-        count -= count % _CHUNK if count > _CHUNK else 0  # or a rest of another size is compiled too
-        often = max(update_every * count // cells.size, 1)
+        looks = -(-cells.size // look_at_once)  # that see all cells
+        count = -(-cells.size // looks)
+        often = max(update_every // looks, 1)
         young = step < passes_from_start * update_every
         interval = jnp.where(young, often, update_every)
         look = jnp.where(young, step // often, step // update_every)
@@ -76,8 +76,11 @@ def make_space(
         def looked():
             # No ray has this position, so the key is the step's own.
             key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), step), 2**32 - 2)
-            first = (look % -(-cells.size // count)) * count
-            chosen = cells[(first + jnp.arange(count)) % cells.size]
+            # Whole chunks, as a rest of another size would be compiled too.
+            place = jnp.arange(count + (-count % _CHUNK if count > _CHUNK else 0))
+            index = look % looks * count + place
+            beyond = (place >= count) | (index >= cells.size)
+            chosen = jnp.where(beyond, grid.possible.size, cells[jnp.minimum(index, cells.size - 1)])
             return occupancy.update_grid(
                 key,
                 grid,
