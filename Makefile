@@ -21,7 +21,7 @@ demo: $(BIN)/.installed
 	$(BIN)/python experiments/table.py $(DEMO)
 
 test: $(BIN)/.dev
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .
