@@ -53,7 +53,10 @@ def get_config():
                 "resolutions": (),  # vertices along the longest side, a level each; () fits the images
                 "features": 4,  # of a vertex
                 "table_size": 2**17,  # vertices of a level that have their own features
-                "view_width": 64,  # of the hidden layer for colour
+                "width": 64,  # of the density's hidden layer
+                "geometry": 15,  # what colour learns of a place, beside the direction
+                "view_depth": 2,  # hidden layers of colour
+                "view_width": 128,
                 "use_viewdirs": True,
                 "scale": 4.0,  # of the features over their table, whose learning rate it multiplies
             },
@@ -67,8 +70,9 @@ def get_config():
                 "threshold": 0.01,  # share of light that a step absorbs, below which a cell is empty
                 "update_every": 64,  # steps between looks at the cells
                 "look_at_once": 2**18,  # cells
-                "samples_per_ray": 13,  # room in training's pool; rays without room are left out and counted
-                "hide_beyond": 4.0,  # optical depth by the grid's guess behind which training asks no more
+                "samples_per_ray": 10,  # room in training's pool; rays without room are left out and counted
+                "fog_until": 300,  # step before which samples are three steps long
+                "hide_beyond": 6.0,  # optical depth by the grid's guess behind which training asks no more
                 "hide_from": 400,  # step
             },
             "train": {
@@ -94,7 +98,7 @@ def get_config():
                 "split": "test",
                 "chunk": 4096,  # rays rendered at once
                 "samples": 1.0,  # along a ray, times those of training
-                "skip_empty": False,  # leaves out what a network trained along whole rays shows to be empty
+                "skip_empty": False,  # of a network trained along whole rays: leave out what is not seen
                 "stop": 1e-3,  # where empty space is skipped: a ray ends where no more than this passes
                 "samples_at_once": 16_384,  # where empty space is skipped
                 "at_end": False,  # score the split when training ends

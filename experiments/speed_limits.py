@@ -71,7 +71,7 @@ def _frame_row(folder):
     flops = run.render.lower(weights, rays).compile().cost_analysis()["flops"]
     asked = {name: rays.near.size * count for name, count in _samples_per_ray(config).items()}
     if model.space is not None:
-        capacity = max(options.samples_at_once, rays.near.size)
+        capacity = options.samples_at_once
         rounds = _rounds(model, weights, rays, options, capacity)
         one, far = jnp.zeros((1, capacity, 3)), jnp.ones((1, capacity, 3))
         scene = jax.jit(lambda params, *places: model.scene(params, weights[1])(*places))
@@ -97,7 +97,7 @@ def _rounds(model, weights, rays, options, capacity):
         jax.debug.callback(lambda: rounds.append(1))
         return scene(x, viewdirs)
 
-    sizes = {"step": space.step / options.samples, "longest": space.longest, "stop": options.stop}
+    sizes = {"step": space.step / options.samples, "cell": space.cell, "stop": options.stop}
     jax.block_until_ready(
         jax.jit(lambda rays: view_packed(counted, grid, rays, capacity=capacity, **sizes))(rays)
     )
@@ -112,7 +112,7 @@ def field_flops(params):
         for path, leaf in jax.tree.leaves_with_path(params)
         if leaf.ndim == 2 and not _is_table(path)
     ]
-    corners = 8 * params["density"].shape[0] if "table" in params else 0
+    corners = 8 * params["kernel"].shape[0] if "table" in params else 0
     return 2 * (sum(sizes) + corners)
 
 

@@ -15,10 +15,14 @@ def _curve(config, seconds, **overrides):
     return {"config": config, "overrides": overrides, "seconds": seconds}
 
 
-# The small network along whole rays: samples as far apart as its steps in the box, evenly from near to far,
-# and the octaves that engine.fit chooses for these images where it knows a box.
+# The small network along whole rays: samples as far apart as its steps in lego's box, from near to far, and
+# the octaves that engine.fit chooses for these images where it knows a box.
 _DENSE = {"space.skip_empty": False, "sampling.num_fine": 0, "sampling.num_coarse": 133}
 _DENSE["fine.num_freqs"] = 7
+# Where nothing is known to be empty: no alpha, and as many octaves with skipping as without.
+_EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "space.masks": False, "fine.num_freqs": 7}
+_FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.background": "none"}
+_FERN |= {"space.masks": False, "space.step": 2 / 133, "fine.num_freqs": 7}
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
 CURVES = {
     "grid": _curve("lego_fast", (15, 30, 45, 60, 90, 120, 180, 300)),
@@ -27,6 +31,10 @@ CURVES = {
     "grid 400": _curve("lego_fast", (60, 150, 300, 600), **{"data.factor": 2}),
     "small network": _curve("lego_mlp_fast", (30, 60, 120, 240, 480)),
     "small network everywhere": _curve("lego_mlp_fast", (120, 480), **_DENSE),
+    "embedded": _curve("lego_mlp_fast", (60, 180), **_EMBEDDED),
+    "embedded everywhere": _curve("lego_mlp_fast", (60, 180), **_EMBEDDED | _DENSE),
+    "fern": _curve("lego_mlp_fast", (120, 300), **_FERN),
+    "fern everywhere": _curve("lego_mlp_fast", (120, 300), **_FERN | _DENSE),
     "dense": _curve("lego_small", (60, 120, 300, 600)),
     "paper": _curve("default", (600, 1800), **_PAPER),
 }

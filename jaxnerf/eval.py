@@ -14,7 +14,7 @@ _CHUNK = flags.DEFINE_integer("chunk", None, "Rays at once; config.eval.chunk wh
 _WATCH = flags.DEFINE_bool("watch", False, "Score new checkpoints as they come, until training's last step.")
 _POLL = flags.DEFINE_float("poll_seconds", 10.0, "How often --watch looks.", lower_bound=0.01)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier result.")
-_SKIP_EMPTY = flags.DEFINE_bool("skip_empty", None, "Find what a dense model shows to be empty, and skip it.")
+_SKIP_EMPTY = flags.DEFINE_bool("skip_empty", None, "Leave out what is not seen of a dense model.")
 _ERROR_BUDGET = flags.DEFINE_float(
     "error_budget",
     None,

@@ -80,6 +80,7 @@ class Tiny:
             self.field,
             experiment.model.space,
             samples_per_ray=16,
+            fog_until=20,
             hide_beyond=3.0,  # optical depth: 5 % of the light is left
             hide_from=hide_from,
             stop=0.0,
@@ -155,8 +156,6 @@ def test_hiding_too_eagerly_costs_little_because_cut_rays_do_not_see_the_backgro
     assert (wanted - ours).mean() < 1.2
     assert (wanted - untreated).mean() > 2.0
     assert (ours - untreated > 0.8).all()
-    rays = [np.asarray(tiny.run(0, *how)[1]["rays"])[-100:].mean() for how in ((NEVER,), (EAGERLY,))]
-    assert rays[0] < rays[1]  # what is hidden leaves room in the pool
 
 
 def test_no_seed_collapses(tiny):
@@ -220,11 +219,13 @@ def toy():
         threshold=0.01,
         update_every=2,
         look_at_once=300,
+        passes_from_start=4,
     )
     model = packed_model(
         field,
         space,
         samples_per_ray=1,
+        fog_until=4,
         hide_beyond=1.0,
         hide_from=8,
         stop=0.0,
@@ -330,7 +331,7 @@ def test_a_run_ends_in_files_that_give_it_back(unoptimized, tmp_path, capsys):
     @compiled
     def plainly(rays):
         box = space.create(jnp.ones(space.shape, bool))
-        samples = samples_in_box(None, box, rays, step=space.step, longest=space.longest)
+        samples = samples_in_box(None, box, rays, step=space.step, cell=space.cell)
         return render_samples(scene, rays, samples, background=(1.0, 1.0, 1.0))
 
     seen, want = render(rays), plainly(rays)

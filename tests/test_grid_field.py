@@ -219,7 +219,7 @@ def test_what_is_drawn_at_first_depends_on_the_key_alone(field):
     assert_same(first, again, rtol=0, atol=0)
     assert (first["table"] != other["table"]).mean() > 0.99
     assert first["table"].shape == (3 * 4 * 2 + 100, 2)  # the box is 2 x 3 x 1
-    assert not first["view_bias"].any() and np.abs(first["table"]).max() <= 0.025
+    assert not first["bias"].any() and np.abs(first["table"]).max() <= 0.025
     density, _ = apply(first, inside((6, 4)), directions((6, 1)))
     np.testing.assert_allclose(density, 1, atol=0.5)  # thin fog to begin with
 
@@ -230,12 +230,12 @@ def test_without_view_directions_there_is_nothing_for_them():
     for use_viewdirs in (True, False):
         plain = grid_field(**BOX, resolutions=(4,), table_size=100, use_viewdirs=use_viewdirs)
         params = jax.eval_shape(plain.init, jax.random.key(0))
-        rows[use_viewdirs] = params["view"].shape[0]
+        rows[use_viewdirs] = params["view_0"]["kernel"].shape[0]
         apply = jax.jit(plain.apply).lower(params, x, viewdirs).compile()
         flops[use_viewdirs] = apply.cost_analysis()["flops"]
-    assert rows == {True: 4 + 9, False: 4}
+    assert rows == {True: 15 + 9, False: 15}
     # At least the hidden layer's product with 9 harmonics a sample.
-    assert flops[True] - flops[False] >= 2 * 9 * 64 * 32 * 16
+    assert flops[True] - flops[False] >= 2 * 9 * 128 * 32 * 16
     params = jax.tree.map(lambda leaf: np.ones(leaf.shape, leaf.dtype), params)
     assert_same(apply(params, x, viewdirs), apply(params, x, -viewdirs), rtol=0, atol=0)
 

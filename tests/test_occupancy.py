@@ -203,3 +203,33 @@ def test_wrong_arguments():
         occupancy.create_grid(np.zeros(3), np.ones(3), np.ones((2, 2), bool), assumed=1.0)
     with pytest.raises(ValueError, match="update_grid: cells"):
         look(jax.random.key(0), full_grid(), np.zeros((2, 2), np.int32))
+
+
+def test_a_grid_keeps_marked_cells_and_their_neighbours():
+    grid, rays = full_grid(4.0, (8, 8, 8)), rays_past_origin(0, 64)
+    t = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=64)
+    chosen = np.abs(t - 4) < 0.1
+    marked = occupancy.mark_cells(jnp.zeros((8, 8, 8), bool), grid, rays, t, chosen)
+    assert 0 < marked.sum() < 64
+    x = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+    cells = np.floor((x + 4) / 1).astype(int)[np.asarray(chosen) & (np.abs(x) < 4).all(axis=-1)]
+    want = np.zeros((8, 8, 8), bool)
+    want[tuple(cells.T)] = True
+    np.testing.assert_array_equal(marked, want)
+    kept = occupancy.keep_cells(grid, marked)
+    assert kept.occupied[marked].all() and marked.sum() < kept.occupied.sum() < grid.occupied.sum()
+    assert (kept.mean[~kept.occupied] == -1).all()
+
+
+def test_without_spread_only_dense_cells_count():
+    grid = full_grid(4.0, (8, 8, 8))
+    ball = lambda x, viewdirs: (jnp.where((x**2).sum(-1) < 4, 9.0, 0.0), x)  # noqa: E731
+    options = {"threshold": 0.5, "decay": 0.0}
+    look = jax.jit(
+        lambda spread: occupancy.update_grid(
+            jax.random.key(0), grid, ball, jnp.arange(512), spread=spread, **options
+        )
+    )
+    wide, narrow = look(True), look(False)
+    np.testing.assert_array_equal(narrow.occupied, narrow.peak > 0.5)
+    assert 0 < narrow.occupied.sum() < wide.occupied.sum() and wide.occupied[narrow.occupied].all()

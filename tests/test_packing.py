@@ -9,7 +9,7 @@ import pytest
 
 import jaxnerf
 from helpers import all_finite, assert_same, checked_grid, compiled, full_grid, rays_past_origin
-from jaxnerf.core import compositing, occupancy
+from jaxnerf.core import compositing, occupancy, packing
 from jaxnerf.fields import analytic
 
 RAYS, SEGMENTS = 24, 40
@@ -235,3 +235,66 @@ def test_render_rays_takes_it_as_its_renderer(rays):
 
     got, want = seen(jax.random.key(4), rays)
     assert_same(got, want, atol=2e-6)
+
+
+needed = compiled(
+    lambda scene, grid, rays, samples, error=0.02, background=BACKGROUND: packing.needed_samples(
+        scene, grid, rays, samples, error=error, capacity=100, background=background
+    ),
+    "scene",
+    "error",
+)
+
+
+def without(samples, kept):
+    return dataclasses.replace(samples, delta=np.where(kept, samples.delta, 0))
+
+
+@pytest.mark.parametrize("error", [0.002, 0.02, 0.2])
+def test_without_what_is_not_needed_colours_are_within_the_error(rays, samples, error):
+    grid = checked_grid()
+    kept = needed(scene, grid, rays, samples, error=error)
+    asked = np.asarray(occupancy.occupied_at(grid, rays, samples.t) & (samples.delta > 0))
+    assert not kept[~asked].any() and 0 < kept.sum() < 0.9 * asked.sum()
+    whole = packed(grid, rays, samples, capacity=RAYS * SEGMENTS)
+    fewer = packed(grid, rays, without(samples, kept), capacity=RAYS * SEGMENTS)
+    off = abs(whole.rgb - fewer.rgb).max()
+    assert error / 10 < off <= error + 1e-6
+
+
+def test_white_fog_before_white_is_not_needed_and_a_body_of_one_colour_is(rays, samples):
+    """However thinly its samples share it: one by one, none of them would be missed."""
+
+    def body(density, colour):
+        def scene(x, viewdirs):
+            inside = (x**2).sum(axis=-1) < 1
+            return jnp.where(inside, density, 0.0), jnp.broadcast_to(jnp.float32(colour), x.shape)
+
+        return scene
+
+    white, red = (1.0, 1.0, 1.0), (1.0, 0.0, 0.0)
+    for density in (0.05, 0.5):
+        assert not needed(body(density, white), full_grid(), rays, samples, background=np.ones(3)).any()
+    for density in (0.3, 3.0, 30.0, 1e6):
+        scene = body(density, red)
+        kept = needed(scene, full_grid(), rays, samples, error=0.002, background=np.ones(3))
+        chosen = (samples, without(samples, kept))
+        whole, fewer = (jaxnerf.render_samples(scene, rays, each, background=np.ones(3)) for each in chosen)
+        assert kept.any()
+        np.testing.assert_allclose(fewer.rgb, whole.rgb, atol=0.0021)
+
+
+def test_what_stops_the_light_is_needed_whatever_its_colour(rays, samples):
+    wall = lambda x, viewdirs: (jnp.full(x.shape[:-1], 1e6), jnp.ones_like(x))  # noqa: E731
+    kept = needed(wall, full_grid(), rays, samples, background=np.ones(3))
+    np.testing.assert_array_equal(kept.sum(axis=-1), 1)
+    assert kept[:, 0].all()
+
+
+@pytest.mark.parametrize("wrong", [{"capacity": 0}, {"samples": "gauss"}])
+def test_needed_samples_names_what_it_cannot_pack(rays, samples, wrong):
+    given = {"capacity": 8, "samples": samples} | wrong
+    if given["samples"] == "gauss":
+        given["samples"] = dataclasses.replace(samples, rule="gauss")
+    with pytest.raises(ValueError, match="needed_samples"):
+        packing.needed_samples(scene, full_grid(), rays, error=0.1, **given)

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxnerf
 from helpers import compiled, full_grid, rays_past_origin
 from jaxnerf import Rays
 from jaxnerf.core import occupancy
 from jaxnerf.data import synthetic
 from jaxnerf.engine import space as spaces
+from jaxnerf.engine.extraction import crop_grid
 from jaxnerf.fields import showcase
 from jaxnerf.fields.mlp import Field
 
@@ -52,7 +54,7 @@ def views():
 
 def test_cells_are_cubes_along_all_sides():
     space = a_space(resolution=20)
-    assert space.shape == (20, 20, 15) and space.longest == pytest.approx(np.sqrt(9 + 9 + 2.3**2))
+    assert space.shape == (20, 20, 15) and space.cell == pytest.approx((0.15, 0.15, 2.3 / 15))
     assert a_space(box=((0, 0, 0), (1e-3, 1, 1))).shape == (1, 8, 8)
 
 
@@ -191,8 +193,17 @@ def lengths(rays):
     return np.linalg.norm(np.float64(rays.directions), axis=-1)
 
 
-@pytest.mark.parametrize("step, random", [(0.3, True), (0.0777, False), (5.0, True), (np.sqrt(3) / 7, False)])
-def test_samples_stand_for_all_of_the_way_through_the_box(step, random):
+@pytest.mark.parametrize(
+    "step, random, stretch",
+    [
+        (0.3, True, 1.0),
+        (0.0777, False, 1.0),
+        (5.0, True, 1.0),
+        (np.sqrt(3) / 7, False, 1.0),
+        (0.1, True, 3.0),
+    ],
+)
+def test_samples_stand_for_all_of_the_way_through_the_box(step, random, stretch):
     """Whatever the step; also along the diagonal, which no ray is longer in the box than."""
     grid, rays = full_grid(0.5), rays_past_origin(5, 60)
     diagonal = np.float32([[1, 1, 1], [-2, 2, 2], [0.5, 0.5, 0.5], [1, 0, 0]])
@@ -200,8 +211,10 @@ def test_samples_stand_for_all_of_the_way_through_the_box(step, random):
         origins=-2 * diagonal, directions=diagonal, viewdirs=diagonal, near=np.zeros(4), far=np.full(4, 9)
     ))  # fmt: skip
     keys = jax.random.split(jax.random.key(0), 64) if random else None
-    samples_in_box = compiled(spaces.samples_in_box, "step", "longest")
-    samples = samples_in_box(keys, grid, rays, step=float(step), longest=float(np.sqrt(3)))
+    samples_in_box = compiled(spaces.samples_in_box, "step", "cell")
+    cell = tuple(1 / size for size in grid.possible.shape)
+    samples = samples_in_box(keys, grid, rays, step=float(step), cell=cell, stretch=stretch)
+    step = step * stretch
     inside = compiled(occupancy.cut_to_box)(grid, rays)
     way = np.float64(inside.far) - inside.near
     assert (way > 0).mean() > 0.4 and (way == 0).any()
@@ -210,3 +223,34 @@ def test_samples_stand_for_all_of_the_way_through_the_box(step, random):
     assert (samples.delta * lengths(rays)[:, None]).max() <= step * (1 + 1e-4)
     counted = (samples.delta > 0).sum(-1)
     assert (counted <= way * lengths(rays) / step + 2.001).all()  # no ray asks more than it is long
+
+
+def test_a_cell_that_was_empty_comes_back_when_its_density_grows():
+    """Long after the start, too, when neighbours no longer count."""
+    field = Field(None, lambda params, x, viewdirs: (jnp.where(x[..., 0] > 0, params, 0.0), x))
+    options = {"resolution": 8, "step": 0.1, "threshold": 0.01, "update_every": 16, "look_at_once": 2**18}
+    space = spaces.make_space(*BOX, seed=0, field=field, **options)
+    grid, cells = space.create(jnp.ones(space.shape, bool)), jnp.arange(np.prod(space.shape))
+    update = jax.jit(space.update)
+    for step in range(15, 400, 16):
+        grid = update(step, {"fine": 0.0}, grid, cells)
+    assert not grid.occupied.any()
+    grid = update(415, {"fine": 9.0}, grid, cells)
+    half = space.shape[0] // 2
+    assert grid.occupied[half:].all() and not grid.occupied[:half].any()
+
+
+def test_a_cropped_grid_is_occupied_where_the_whole_was():
+    grid = full_grid(4.0, (8, 8, 8))
+    occupied = np.zeros((8, 8, 8), bool)
+    occupied[2, 3, 1] = occupied[4, 3, 6] = True
+    grid = dataclasses.replace(grid, occupied=jnp.asarray(occupied))
+    cropped = crop_grid(grid)
+    assert cropped.occupied.shape == (3, 1, 6) and cropped.occupied.sum() == 2
+    rays = rays_past_origin(0, 256)
+    t = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=64)
+    inside = occupancy.occupied_at(cropped, rays, t)
+    assert inside.any()
+    np.testing.assert_array_equal(inside, occupancy.occupied_at(grid, rays, t))
+    empty = dataclasses.replace(grid, occupied=jnp.zeros((8, 8, 8), bool))
+    assert crop_grid(empty) is empty

@@ -47,11 +47,11 @@ def create_grid(lower, upper, possible, *, assumed):
     return Grid(lower=lower, upper=upper, possible=possible, peak=peak, mean=mean, occupied=possible)
 
 
-def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2, chunk=8192):
+def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2, spread=True, chunk=8192):
     """Returns the Grid after a look at a random point in each of some cells (as in arXiv:2201.05989).
 
-    A cell is occupied where the largest density of late, or that of a neighbour, exceeds the threshold:
-    a field that is still forming must not lose what it is about to grow.
+    A cell is occupied where the largest density of late exceeds the threshold, or, with spread, that of a
+    neighbour does: a field that is still forming must not lose what it is about to grow.
 
     Args:
         key: where in each cell.
@@ -61,6 +61,7 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
         threshold: 1 / world unit; 0.01 over the spacing of samples leaves out what absorbs 1 % of the light.
         decay: what of the peak outlasts a look that finds less.
         smoothing: the weight of a look in the running mean.
+        spread: bool, traced or not. When the field has formed, its neighbours cost samples and are empty.
         chunk: cells asked at once.
 
     Returns:
@@ -79,7 +80,8 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
     peak, mean = grid.peak.reshape(-1), jnp.maximum(grid.mean.reshape(-1), 0)
     peak = peak.at[cells].set(jnp.maximum(decay * peak[cells], found)).reshape(grid.peak.shape)
     mean = mean.at[cells].add(smoothing * (found - mean[cells])).reshape(grid.mean.shape)
-    occupied = _widen(~(peak <= threshold)) & grid.possible  # NaN counts, and shows
+    dense = ~(peak <= threshold)  # NaN counts, and shows
+    occupied = jnp.where(spread, _widen(dense), dense) & grid.possible
     return dataclasses.replace(grid, peak=peak, mean=jnp.where(occupied, mean, -1), occupied=occupied)
 
 
@@ -106,6 +108,18 @@ def grid_of_scene(key, scene, lower, upper, shape, *, threshold, looks=4, chunk=
         return update_grid(jax.random.fold_in(key, index), grid, scene, cells, **options)
 
     return jax.lax.fori_loop(0, looks, look, grid)
+
+
+def mark_cells(marked, grid, rays, t, chosen):
+    """Returns marked [X, Y, Z] bool, with the cells of those of the samples at t that are chosen [..., S]."""
+    index, inside = _cell(grid, _along(grid, rays, t))
+    return marked.reshape(-1).at[index].max(chosen & inside).reshape(marked.shape)
+
+
+def keep_cells(grid, marked):
+    """Returns the Grid with only the cells that are marked [X, Y, Z], and their neighbours, occupied."""
+    occupied = grid.occupied & _widen(marked)
+    return dataclasses.replace(grid, mean=jnp.where(occupied, grid.mean, -1), occupied=occupied)
 
 
 def cut_to_box(grid, rays):
@@ -174,11 +188,12 @@ def restrict_scene(scene, grid):
 
 
 def _widen(occupied):
-    """Returns the cells that are occupied or touch one that is."""
+    """Returns the cells that are occupied or share a side with one that is."""
+    wide = occupied
     for axis in range(3):
         window = tuple(3 if i == axis else 1 for i in range(3))
-        occupied = jax.lax.reduce_window(occupied, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
-    return occupied
+        wide |= jax.lax.reduce_window(occupied, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
+    return wide
 
 
 def _along(grid, rays, t):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxnerf.core import compositing, occupancy, rendering
 from jaxnerf.core.structs import Rendering, check_shapes
 
+_HARDLY = 1e-3  # of the light
 _AT_LEAST = 4  # samples of a ray asked in a row: fewer make more rounds, more are asked in vain
 
 
@@ -36,18 +37,8 @@ def render_packed(scene, grid, rays, samples, *, capacity, stop=0.0, background=
     Raises:
         ValueError: as render_samples; on rule "gauss"; if capacity < 1.
     """
-    if samples.rule == "gauss":
-        raise ValueError(
-            "render_packed: rule 'gauss' asks in pairs, which a cell's border may part; use 'segments'"
-        )
-    check_shapes(
-        "render_packed", near=(rays.near, "..."), t=(samples.t, "... S"), delta=(samples.delta, "... S")
-    )
     shape = rays.near.shape
-    flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[len(shape) :]), (rays, samples))
-    if capacity < 1:
-        raise ValueError(f"render_packed: capacity is {capacity}, wanted at least 1")
-    rays, samples = flat
+    rays, samples = _checked("render_packed", rays, samples, capacity)
     queue = _queue(grid, rays, samples)
     ask = functools.partial(_ask, scene, rays, samples)
     if stop > 0:
@@ -57,6 +48,61 @@ def render_packed(scene, grid, rays, samples, *, capacity, stop=0.0, background=
         sums = ask(_fill(queue, slot, slot < queue.ends[-1]))
         dropped = queue.count - jnp.clip(capacity - _first(queue), 0, queue.count)
     return _rendering(sums, dropped, rays.far, shape, background)
+
+
+def needed_samples(scene, grid, rays, samples, *, error, capacity, background=None):
+    """Returns which samples a ray needs: without all of the others its colour differs by at most an error.
+
+    From back to front, each sample is left out unless what that adds to the error made behind it, by Eq. 3,
+    is too much. White fog before a white background is not needed, nor is the inside of a wall.
+
+    Args:
+        scene, rays, samples, background: see render_packed.
+        grid: Grid, where the scene is asked.
+        error: in each of the three channels, which are taken to be in [0, 1].
+        capacity: samples asked at once; all of them are asked, in as many rounds as that takes.
+
+    Returns:
+        [..., S] bool; False where the scene is not asked. A ray that lets less than a thousandth pass keeps
+        what stops it, whatever the colours: opacity and depth would show it. A NaN is needed, and shows.
+
+    Raises:
+        ValueError: as render_packed.
+    """
+    name, shape = "needed_samples", samples.t.shape
+    rays, samples = _checked(name, rays, samples, capacity)
+    queue = _queue(grid, rays, samples)
+
+    def ask_round(index, answers):
+        slot = index * capacity + jnp.arange(capacity)
+        pool = _fill(queue, slot, slot < queue.ends[-1])
+        _, density, rgb = _answers(name, scene, rays, samples, pool)
+        place = jnp.where(pool.used, pool.ray * shape[-1] + pool.source, answers.shape[0])
+        return answers.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
+
+    rounds = -(-queue.ends[-1] // capacity)
+    answers = jax.lax.fori_loop(0, rounds, ask_round, jnp.zeros((samples.t.size, 4)))
+    density, *rgb = jnp.moveaxis(answers.reshape(*samples.t.shape, 4), -1, 0)
+    length = rendering.world_length(jnp.maximum(samples.delta, 0), rays.directions)
+    depth = jnp.where(density == 0, 0, density * length)
+    before = jnp.exp(-compositing.sum_before(depth))
+    passing = jnp.exp(-depth)
+
+    def leave_out(state, sample):
+        behind, wrong = state  # [B, 3]: the colour behind the sample, and by how much it is off already
+        before, passing, rgb = sample
+        passing = passing[:, None]
+        change = wrong + (1 - passing) * (rgb - behind)
+        needed = ~(before * jnp.abs(change).max(axis=-1) <= error)
+        wrong = jnp.where(needed[:, None], passing * wrong, change)
+        return ((1 - passing) * rgb + passing * behind, wrong), needed
+
+    behind = jnp.zeros(3) if background is None else jnp.asarray(background)
+    behind = jnp.broadcast_to(behind, (*rays.near.shape, 3))
+    opaque = before[:, -1:] * passing[:, -1:] < _HARDLY
+    start = (behind, jnp.broadcast_to(jnp.where(opaque, 1.0, 0.0), behind.shape))
+    nearest_first = (before.T, passing.T, jnp.stack(rgb, axis=-1).swapaxes(0, 1))
+    return jax.lax.scan(leave_out, start, nearest_first, reverse=True)[1].T.reshape(shape)
 
 
 class _Queue(NamedTuple):
@@ -82,6 +128,19 @@ class _Sums(NamedTuple):
     rgb: jax.Array  # [B, 3]
     depth: jax.Array  # [B] sum of w t
     disparity: jax.Array  # [B] sum of w / t
+
+
+def _checked(function, rays, samples, capacity):
+    """Returns Rays [B] and Samples [B, S] of any leading axes; ValueError on what cannot be packed."""
+    if samples.rule == "gauss":
+        raise ValueError(
+            f"{function}: rule 'gauss' asks in pairs, which a cell's border may part; use 'segments'"
+        )
+    check_shapes(function, near=(rays.near, "..."), t=(samples.t, "... S"), delta=(samples.delta, "... S"))
+    if capacity < 1:
+        raise ValueError(f"{function}: capacity is {capacity}, wanted at least 1")
+    leading = rays.near.ndim
+    return jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[leading:]), (rays, samples))
 
 
 def _queue(grid, rays, samples):
@@ -121,19 +180,24 @@ def _nth_bit(words, n):
     return place
 
 
-def _ask(scene, rays, samples, pool):
-    """Returns the Sums of a pool, as if nothing lay before it."""
+def _answers(function, scene, rays, samples, pool):
+    """Returns what a scene says at a pool's samples, 0 in the room left: t [K], density [K], rgb [K, 3]."""
     t = jnp.where(pool.used, samples.t[pool.ray, pool.source], 0)
-    delta = jnp.where(pool.used, samples.delta[pool.ray, pool.source], 0)
     one = jax.tree.map(lambda leaf: leaf[pool.ray][None], rays)  # Rays [1, K], one a sample
     x = one.origins + t[None, :, None] * one.directions
     density, rgb = scene(x, one.viewdirs)
-    rendering.check_answer("render_packed", density, rgb, x)
-    density = jnp.where(pool.used, density[0], 0)
-    length = rendering.world_length(delta[:, None], one.directions[0])[:, 0]
+    rendering.check_answer(function, density, rgb, x)
+    return t, jnp.where(pool.used, density[0], 0), jnp.where(pool.used[:, None], rgb[0], 0)
+
+
+def _ask(scene, rays, samples, pool):
+    """Returns the Sums of a pool, as if nothing lay before it."""
+    t, density, rgb = _answers("render_packed", scene, rays, samples, pool)
+    delta = jnp.where(pool.used, samples.delta[pool.ray, pool.source], 0)
+    length = rendering.world_length(delta[:, None], rays.directions[pool.ray])[:, 0]
     starts = pool.ray != jnp.roll(pool.ray, 1).at[0].set(-1)
     weights, optical_depth = compositing.packed_weights(density, length, starts, longest=samples.t.shape[-1])
-    colours = [jnp.where(pool.used, rgb[0, :, axis], 0) * weights for axis in range(3)]
+    colours = [rgb[:, axis] * weights for axis in range(3)]
     parts = [optical_depth, *colours, weights * t, compositing.share_over(weights, t)]
     sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), pool.ray, rays.near.size, indices_are_sorted=True)
     return _Sums(sums[:, 0], sums[:, 1:4], sums[:, 4], sums[:, 5])

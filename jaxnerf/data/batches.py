@@ -108,3 +108,22 @@ def draw_batch(
     pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
     rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
     return keys, Batch(rays=rays, rgb=pixel_colors(views.pixels[index], views.background))
+
+
+def random_rays(views, count, view_rays, *, pixel_offset=0.5, seed=0):
+    """Returns Rays [N] through random pixels of Views, nearly as many of each view; only cameras count.
+
+    Args:
+        views: Views.
+        count: N.
+        view_rays: (views, index, pixels [M, 2]) -> Rays [M].
+        pixel_offset: see pixel_grid.
+        seed: int.
+    """
+    rng, parts = np.random.default_rng(seed), []
+    ends = np.linspace(0, count, len(views.size) + 1).astype(int)
+    for index, (height, width) in enumerate(np.asarray(views.size)):
+        each = ends[index + 1] - ends[index]
+        pixels = np.stack([rng.integers(width, size=each), rng.integers(height, size=each)], axis=-1)
+        parts.append(view_rays(views, index, jnp.asarray(pixels + pixel_offset, jnp.float32)))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)

@@ -5,10 +5,9 @@ import time
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.data.batches import random_rays
 from jaxnerf.engine.load import newest_step, open_run
 
 _EXACT = {"samples": 4.0, "stop": 0.0, "skip_empty": False}  # what the error is measured against
@@ -60,14 +59,19 @@ def cheapest_settings(folder, error_budget, *, config=None, split=None, step=Non
     """
     exact = open_run(folder, config, settings=_EXACT)
     split = split or exact.experiment.eval.split
-    rays = _random_rays(exact.experiment, exact.experiment.load_views(split), num_rays)
+    experiment = exact.experiment
+    rays = random_rays(
+        experiment.load_views(split), num_rays, experiment.view_rays, pixel_offset=experiment.pixel_offset
+    )
     step = newest_step(exact, folder, step)
     truth = _render(exact, exact.weights(step), rays)[0]
-    tried = []
+    tried, weights = [], {}
 
     def attempt(settings):
         run = open_run(folder, config, settings=settings)
-        rgb, seconds = _render(run, run.weights(step), rays)
+        if settings["skip_empty"] not in weights:  # neither samples nor stop change them
+            weights[settings["skip_empty"]] = run.weights(step)
+        rgb, seconds = _render(run, weights[settings["skip_empty"]], rays)
         tried.append(Choice(settings, float(np.sqrt(np.mean((rgb - truth) ** 2))), seconds))
         return tried[-1].error <= error_budget
 
@@ -94,17 +98,6 @@ def _descend(attempt, tried, skip_empty, stops):
     for stop in stops[1:]:
         if not attempt({"samples": fewest, "stop": stop, "skip_empty": skip_empty}):
             break
-
-
-def _random_rays(experiment, views, num_rays):
-    """Returns Rays [N] through random pixels of Views, as many of each."""
-    rng, parts = np.random.default_rng(0), []
-    for index, size in enumerate(np.asarray(views.size)):
-        height, width = (int(value) for value in size)
-        pixels = np.asarray(pixel_grid(height, width, offset=experiment.pixel_offset)).reshape(-1, 2)
-        chosen = rng.integers(len(pixels), size=-(-num_rays // len(views.size)))
-        parts.append(experiment.view_rays(views, index, jnp.asarray(pixels[chosen])))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:num_rays], *parts)
 
 
 def _render(run, weights, rays):

@@ -101,12 +101,9 @@ def build_model(config):
     return hierarchical_model(fields, background=background, view_samples=view_samples, **sampling)
 
 
-def skipping_model(config, model):
-    """Returns a dense model that skips empty space in pictures, and the extraction of its grid from params.
-
-    The space section must have no open sizes.
-    """
-    return skip_empty_afterwards(model, _space(config, None), **_view_options(config))
+def skipping_model(config, model, look):
+    """Returns what skip_empty_afterwards does, for a configuration whose space section has no open sizes."""
+    return skip_empty_afterwards(model, _space(config, None), look, **_view_options(config))
 
 
 def _packed_model(config):
@@ -123,6 +120,7 @@ def _packed_model(config):
         field,
         _space(config, field),
         samples_per_ray=space.samples_per_ray,
+        fog_until=space.get("fog_until", 0),
         hide_beyond=space.hide_beyond,
         hide_from=space.hide_from,
         **_view_options(config),

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from jaxnerf.data.batches import random_rays
 from jaxnerf.engine import build, fit, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.state import create_state
@@ -16,7 +17,7 @@ class Trained(NamedTuple):
     experiment: build.Experiment
     steps: Any  # () -> steps of the finished checkpoints, ascending
     weights: Any  # step -> (params, grid or None)
-    render: Any  # (weights, Rays [...]) -> Rendering [...] without weights, jitted once for all steps
+    render: Any  # (weights, Rays [...]) -> Rendering [...] without weights, jitted once for a grid's shape
 
 
 def open_run(folder, config=None, *, data_dir=None, settings=None):
@@ -41,8 +42,11 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
     model, trained = experiment.model, experiment.model
     extract = None
     if config.eval.get("skip_empty") and model.space is None:
-        config, _ = fit.fit_config(fit.skipping(config), experiment.load_views(config.eval.split))
-        model, extract = build.skipping_model(config, model)
+        views = experiment.load_views("train")
+        config, _ = fit.fit_config(fit.skipping(config), views)
+        options = {"view_rays": experiment.view_rays, "pixel_offset": experiment.pixel_offset}
+        look = functools.partial(random_rays, views, **options)
+        model, extract = build.skipping_model(config, model, look)
 
     @functools.cache
     def template():

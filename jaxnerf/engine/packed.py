@@ -9,8 +9,11 @@ import jax.numpy as jnp
 
 from jaxnerf.core import occupancy
 from jaxnerf.core.packing import render_packed
+from jaxnerf.engine.extraction import crop_grid, rays_to_look, visible_grid
 from jaxnerf.engine.models import Model
 from jaxnerf.engine.space import samples_in_box
+
+_STEP_IN_FOG = 3.0  # times the step
 
 
 def packed_model(
@@ -18,6 +21,7 @@ def packed_model(
     space,
     *,
     samples_per_ray,
+    fog_until,
     hide_beyond,
     hide_from,
     stop,
@@ -31,6 +35,7 @@ def packed_model(
         field: Field.
         space: Space.
         samples_per_ray: the room in training's pool; rays that find none are left out and counted.
+        fog_until: the step before which samples are longer, as fog looks the same and more rays find room.
         hide_beyond: optical depth by the grid's guess behind which training asks no more; 0: none.
         hide_from: the step from which on the guess counts.
         stop: of pictures: a ray ends where no more than this passes.
@@ -44,7 +49,8 @@ def packed_model(
 
     def render(keys, params, grid, rays, step):
         capacity = math.ceil(samples_per_ray * rays.near.size)
-        samples = samples_in_box(keys, grid, rays, step=space.step, longest=space.longest)
+        stretch = jnp.where(step < fog_until, _STEP_IN_FOG, 1.0) if fog_until else 1.0
+        samples = samples_in_box(keys, grid, rays, step=space.step, cell=space.cell, stretch=stretch)
         beyond = jnp.where(step < hide_from, jnp.inf, hide_beyond) if hide_beyond else jnp.inf
         samples, hidden = occupancy.mask_samples(grid, rays, samples, beyond=beyond)
         seen = render_packed(scene(params), None, rays, samples, capacity=capacity)
@@ -58,31 +64,30 @@ def packed_model(
     return Model(lambda key: {"fine": field.init(key)}, render, view, restricted, space)
 
 
-def skip_empty_afterwards(model, space, *, stop, view_samples, samples_at_once, background):
-    """Returns the Model of pictures of a model that was trained along whole rays, and its grid's extraction.
+def skip_empty_afterwards(model, space, look, *, stop, view_samples, samples_at_once, background):
+    """Returns the Model, for pictures only, of one trained along whole rays, with a grid of what can be seen.
 
     Args:
         model: Model without a space.
         space: Space around what is to be seen.
+        look: count -> Rays [count] of what the training views see.
         stop, view_samples, samples_at_once, background: see packed_model.
 
     Returns:
-        Model, only for pictures: its grid is extract(params), outside of which nothing is asked any more.
-        extract: jitted.
+        Model, outside whose grid nothing is asked; and params -> that grid, see extraction.visible_grid.
     """
 
     def scene(params):
         return model.scene(params, None)
 
     @jax.jit
-    def extract(params):
-        bounds = (jnp.asarray(bound, jnp.float32) for bound in (space.lower, space.upper))
-        return occupancy.grid_of_scene(
-            jax.random.key(0), scene(params), *bounds, space.shape, threshold=space.threshold
-        )
+    def find(params, rays):
+        options = {"samples_at_once": samples_at_once, "background": background}
+        return visible_grid(scene(params), space, rays, **options)
 
+    rays = look(rays_to_look(space))
     view = _view_of(scene, space, view_samples, stop, samples_at_once, background)
-    return model._replace(view=view), extract
+    return model._replace(view=view), lambda params: crop_grid(find(params, rays))
 
 
 def _view_of(scene, space, view_samples, stop, samples_at_once, background):
@@ -92,7 +97,7 @@ def _view_of(scene, space, view_samples, stop, samples_at_once, background):
             grid,
             rays,
             step=space.step / view_samples,
-            longest=space.longest,
+            cell=space.cell,
             stop=stop,
             capacity=samples_at_once,
             background=background,
@@ -101,16 +106,16 @@ def _view_of(scene, space, view_samples, stop, samples_at_once, background):
     return view
 
 
-def view_packed(scene, grid, rays, *, step, longest, stop, capacity, background=None):
+def view_packed(scene, grid, rays, *, step, cell, stop, capacity, background=None):
     """Returns what rays [...] see of a scene where its grid is occupied: Rendering [...] without weights.
 
     Args:
         scene, grid, rays, background: see render_packed.
-        step, longest: see samples_in_box.
+        step, cell: see samples_in_box.
         stop: a ray ends where no more than this passes; 0: where nothing does.
         capacity: samples asked at once; what does not fit is asked in a further round.
     """
-    samples = samples_in_box(None, grid, rays, step=step, longest=longest)
+    samples = samples_in_box(None, grid, rays, step=step, cell=cell)
     return render_packed(
         scene, grid, rays, samples, capacity=capacity, stop=stop or 1e-30, background=background
     )

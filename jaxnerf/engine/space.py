@@ -30,9 +30,10 @@ class Space(NamedTuple):
     update: Callable[..., occupancy.Grid]  # (step, params, Grid, cells [L] int32) -> Grid
 
     @property
-    def longest(self):
-        """The box's diagonal, world units."""
-        return math.dist(self.lower, self.upper)
+    def cell(self):
+        """The size of a cell [3], world units."""
+        sides = zip(self.lower, self.upper, self.shape, strict=True)
+        return tuple((high - low) / count for low, high, count in sides)
 
 
 def make_space(
@@ -49,7 +50,7 @@ def make_space(
         threshold: the share of light absorbed in a step below which a cell is empty.
         update_every: steps between two looks.
         look_at_once: cells a look. Where there are more, looks at the start come more often, until all cells
-            have been seen passes_from_start times.
+            have been seen passes_from_start times; and that long neighbours of dense cells count, too.
     """
     if threshold <= 0 or step <= 0:
         raise ValueError(f"space.threshold is {threshold} and space.step {step}, wanted both above 0")
@@ -87,6 +88,7 @@ def make_space(
                 functools.partial(field.apply, params["fine"]),
                 chosen,
                 threshold=density,
+                spread=young,
                 chunk=_CHUNK,
             )
 
@@ -143,7 +145,7 @@ def pixels_that_meet(views, space, possible, *, ndc=False, pixel_offset=0.5, chu
         place, width = ids - views.offset[view], views.size[view, 1]
         pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
         rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
-        samples = samples_in_box(None, grid, rays, step=space.step, longest=space.longest)
+        samples = samples_in_box(None, grid, rays, step=space.step, cell=space.cell)
         return ((samples.delta > 0) & occupancy.occupied_at(grid, rays, samples.t)).any(axis=-1)
 
     colourless = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None)
@@ -160,7 +162,7 @@ def pixels_that_meet(views, space, possible, *, ndc=False, pixel_offset=0.5, chu
     return met
 
 
-def samples_in_box(key, grid, rays, *, step, longest):
+def samples_in_box(key, grid, rays, *, step, cell, stretch=1.0):
     """Returns Samples [..., S] of equal steps along what a grid's box cuts from rays [...].
 
     Args:
@@ -168,13 +170,16 @@ def samples_in_box(key, grid, rays, *, step, longest):
         grid: Grid.
         rays: Rays [...].
         step: world units, a number.
-        longest: world units, a number: the box's diagonal, which says how many samples a ray may need.
+        cell: [3] world units, numbers, the size of one of this grid's cells: they say how many
+            samples a ray may need.
+        stretch: how many steps one sample takes, at least 1, traced or not.
     """
     inside = occupancy.cut_to_box(grid, rays)
+    longest = math.hypot(*(size * count for size, count in zip(cell, grid.possible.shape, strict=True)))
     count = math.ceil(longest / step) + 1
     count += -count % 32  # whole words for the packer's flags: padding them takes longer than asking
     x, y, z = (rays.directions[..., axis] for axis in range(3))
-    t_step = step / jnp.sqrt(x * x + y * y + z * z)
+    t_step = stretch * step / jnp.sqrt(x * x + y * y + z * z)
     return samples_from_edges(
         None, stepped_edges(key, inside.near, inside.far, step=t_step, num_segments=count)
     )

@@ -1,4 +1,4 @@
-"""The fast field: features at the vertices of several grids, and a small network with the view direction."""
+"""The fast field: features at the vertices of several grids, and two small networks that read them."""
 
 import functools
 from collections.abc import Sequence
@@ -49,14 +49,17 @@ def grid_field(**options):
 
 
 class FeatureGrid(linen.Module):
-    """Interpolated features: a weighted sum for the density's logarithm, one hidden layer for colour."""
+    """Interpolated features, a network for the density's logarithm, and one for colour (arXiv:2201.05989)."""
 
     lower: Sequence[float]  # [3] world units, the box
     upper: Sequence[float]  # [3]
     resolutions: Sequence[int] = (16, 32, 64, 128)  # vertices along the longest side, a level each
     features: int = 4  # of a vertex
     table_size: int = 2**17  # rows of a level; where it has more vertices, they share rows by a hash
-    view_width: int = 64  # of the hidden layer
+    width: int = 64  # of the density's hidden layer
+    geometry: int = 15  # what colour learns of a place
+    view_depth: int = 2  # hidden layers of colour
+    view_width: int = 128
     use_viewdirs: bool = True  # False: colour does not depend on the direction
     scale: float = 4.0  # of the features over their table: each step moves few of them, so further
 
@@ -75,16 +78,18 @@ class FeatureGrid(linen.Module):
             for size, ends in zip(sizes, np.stack([first[:-1], first[1:]], -1).tolist(), strict=True)
         ]
         features = self.scale * jnp.concatenate(levels, axis=-1)
-        density = features @ self.param("density", _glorot, (features.shape[-1], 1))
-        if self.use_viewdirs:
-            directions = harmonics(viewdirs)
-            directions = jnp.broadcast_to(directions, (*shape, 9)).reshape(-1, 9)
-            features = jnp.concatenate([features, directions], axis=-1)
-        # Rows come from the table, but a small hidden layer is faster with features first.
-        kernel = self.param("view", _glorot, (features.shape[-1], self.view_width))
-        bias = self.param("view_bias", linen.initializers.zeros_init(), (self.view_width,))
+        # Rows come from the table, but small layers are faster with features first.
+        kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
+        bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
         hidden = jax.nn.relu(jnp.einsum("df,nd->fn", kernel, features) + bias[:, None])
-        rgb = Dense(3, name="rgb")(hidden)
+        geometry = Dense(1 + self.geometry, name="density")(hidden)
+        density, inputs = geometry[0], [geometry[1:]]
+        if self.use_viewdirs:
+            directions = jnp.broadcast_to(harmonics(viewdirs), (*shape, 9))
+            inputs.append(directions.reshape(-1, 9).T)
+        for layer in range(self.view_depth):
+            inputs = [jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(*inputs))]
+        rgb = Dense(3, name="rgb")(*inputs)
         return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 
