@@ -38,7 +38,7 @@ SURFACE = {
     "importance_floor=0.0 background=None",
     "render_image": "render rays | chunk",
     "create_grid": "lower upper possible | assumed",
-    "update_grid": "key grid scene cells | threshold decay=0.6 smoothing=0.2 chunk=8192",
+    "update_grid": "key grid scene cells | threshold decay=0.6 smoothing=0.2 spread=True chunk=8192",
     "grid_of_scene": "key scene lower upper shape | threshold looks=4 chunk=8192",
     "restrict_scene": "scene grid |",
     "render_packed": "scene grid rays samples | capacity stop=0.0 background=None",
