@@ -89,18 +89,21 @@ def needed_samples(scene, grid, rays, samples, *, error, capacity, background=No
     passing = jnp.exp(-depth)
 
     def leave_out(state, sample):
-        behind, wrong = state  # [B, 3]: the colour behind the sample, and by how much it is off already
+        # [B, 3]: the colour behind the sample, and by how much it is off already; [B]: what an opaque ray
+        # would let through of light from behind it.
+        behind, wrong, bared = state
         before, passing, rgb = sample
-        passing = passing[:, None]
-        change = wrong + (1 - passing) * (rgb - behind)
-        needed = ~(before * jnp.abs(change).max(axis=-1) <= error)
-        wrong = jnp.where(needed[:, None], passing * wrong, change)
-        return ((1 - passing) * rgb + passing * behind, wrong), needed
+        through = passing[:, None]
+        change = wrong + (1 - through) * (rgb - behind)
+        needed = ~(before * jnp.maximum(jnp.abs(change).max(axis=-1), bared) <= error)
+        wrong = jnp.where(needed[:, None], through * wrong, change)
+        bared = jnp.where(needed, passing * bared, bared)
+        return ((1 - through) * rgb + through * behind, wrong, bared), needed
 
     behind = jnp.zeros(3) if background is None else jnp.asarray(background)
     behind = jnp.broadcast_to(behind, (*rays.near.shape, 3))
     opaque = before[:, -1:] * passing[:, -1:] < _HARDLY
-    start = (behind, jnp.broadcast_to(jnp.where(opaque, 1.0, 0.0), behind.shape))
+    start = (behind, jnp.zeros_like(behind), opaque[:, 0].astype(behind.dtype))
     nearest_first = (before.T, passing.T, jnp.stack(rgb, axis=-1).swapaxes(0, 1))
     return jax.lax.scan(leave_out, start, nearest_first, reverse=True)[1].T.reshape(shape)
 
