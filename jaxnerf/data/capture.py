@@ -1,0 +1,32 @@
+"""What a reader of a format finds in a folder: posed photographs, not yet opened, in the file's own world."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxnerf.core.structs import Camera
+
+
+class Frame(NamedTuple):
+    """One photograph and its camera."""
+
+    name: str  # of the file below its folder of images, without extension, with / between folders
+    image: Path  # exists
+    camera: Camera  # float64; height and width are what the format states for the photograph, or None
+    mask: Path | None = None  # exists; grey, where 0 the photograph is to be ignored
+    bounds: tuple[float, float] | None = None  # nearest and farthest matter, world units along the axis
+    seen: Any = None  # [M] indices of the Capture's points that this photograph shows; None: not known
+    seen_at: Any = None  # [M, 2] px where
+
+
+class Capture(NamedTuple):
+    """The photographs of a folder, in the order of their names."""
+
+    format: str  # "colmap", "llff", "transforms" or "blender"
+    source: Path  # the file or folder that the cameras were read from
+    frames: tuple[Frame, ...]
+    splits: dict[str, tuple[int, ...]] | None = None  # by name, indices of frames; None: the file has none
+    points: np.ndarray | None = None  # [N, 3] float64, matter on surfaces; None: not known
+    box: tuple | None = None  # (lower [3], upper [3]) outside which the format says there is nothing
+    notes: tuple[str, ...] = ()  # a line each: what was left out of the folder, and why
