@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxnerf.core.structs import Camera, Views
+from jaxnerf.data.capture import Capture, Frame
 from jaxnerf.data.checks import check_background, check_factor, check_range, is_number, read_json, required
-from jaxnerf.data.images import average_blocks, read_image
+from jaxnerf.data.images import average_blocks, image_size, read_image
 from jaxnerf.data.poses import check_pose
 
 
@@ -55,6 +56,34 @@ def load_views(folder, *, split="train", factor=1, near=2.0, far=6.0, background
         names=tuple(path.stem for path in paths),
         background=background,
     )
+
+
+def read_capture(folder):
+    """Returns the Capture of all splits in a folder; frames are named by split and file, as train/r_0.
+
+    Raises:
+        ValueError: as load_views.
+    """
+    frames, splits = [], {}
+    for split in ("train", "val", "test"):
+        if split != "train" and not (Path(folder) / f"transforms_{split}.json").is_file():
+            continue
+        source, scene = _read_transforms(folder, split)
+        angle, first = _angle(scene, source), len(frames)
+        for where, frame in _frames(scene, source):
+            path = _image_path(source, frame, where)
+            pose = check_pose(required(frame, "transform_matrix", where), source=where)
+            width, height = image_size(path)
+            camera = Camera(
+                to_world=pose,
+                focal=np.full(2, 0.5 * width / math.tan(0.5 * angle)),
+                center=np.array([width, height]) / 2,
+                height=height,
+                width=width,
+            )
+            frames.append(Frame(f"{split}/{path.stem}", path, camera))
+        splits[split] = tuple(range(first, len(frames)))
+    return Capture("blender", Path(folder), tuple(frames), splits)
 
 
 def _read_transforms(folder, split):

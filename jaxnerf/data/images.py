@@ -8,12 +8,25 @@ straight, arithmetic is premultiplied. Everything here is numpy on the host.
 import numpy as np
 from PIL import Image
 
+_ORIENTATION = 0x0112  # the EXIF tag
+_UPRIGHT = {  # its values, and what undoes each
+    2: np.fliplr,
+    3: lambda pixels: np.rot90(pixels, 2),
+    4: np.flipud,
+    5: lambda pixels: np.swapaxes(pixels, 0, 1),
+    6: lambda pixels: np.rot90(pixels, -1),
+    7: lambda pixels: np.rot90(np.swapaxes(pixels, 0, 1), 2),
+    8: np.rot90,
+}
 
-def read_image(path):
-    """Returns the pixels of an image file at the precision that the file has.
+
+def read_image(path, *, stored=None):
+    """Returns the pixels of an image file, upright, at the precision that the file has.
 
     Args:
         path: an 8 or 16 bit PNG, or an 8 bit file of another kind that Pillow reads.
+        stored: (height, width) that the pixels are known to have as the cameras count them. Where they are
+            stored like that, an EXIF orientation that would turn them is not followed.
 
     Returns:
         [H, W, 3] opaque or [H, W, 4] with straight alpha, uint8 or uint16. Grey becomes three equal
@@ -22,26 +35,52 @@ def read_image(path):
     Raises:
         ValueError: if the file is missing, no image, or cut short.
     """
+    pixels, turn = _open(path, lambda image: (_decode(path, image), _orientation(image)))
+    upright = np.ascontiguousarray(_UPRIGHT[turn](pixels)) if turn in _UPRIGHT else pixels
+    return pixels if pixels.shape[:2] == stored != upright.shape[:2] else upright
+
+
+def read_mask(path, *, stored=None):
+    """Returns [H, W] bool of a grey image file: whether a pixel is at least half bright; see read_image."""
+    pixels = read_image(path, stored=stored)
+    return pixels[..., 0] > np.iinfo(pixels.dtype).max // 2
+
+
+def image_size(path):
+    """Returns the (width, height) in px of an image file, upright, from its first bytes; see read_image."""
+    size, turn = _open(path, lambda image: (image.size, _orientation(image)))
+    return size[::-1] if turn >= 5 else size
+
+
+def _open(path, use):
     try:
         with Image.open(path) as image:
-            raw = image.tile[0][3] if image.format == "PNG" else None
-            if raw in ("RGB;16B", "RGBA;16B"):
-                # Pillow keeps only the first byte of each 16 bit value. Naming the byte order the other way
-                # round makes it keep the second, so two passes give all sixteen bits.
-                high, low = np.asarray(image), _second_bytes(path, raw)
-                return high.astype(np.uint16) * 256 + low
-            if image.mode == "I;16":
-                return np.repeat(np.asarray(image)[..., None], 3, axis=-1)
-            mode = "RGBA" if image.has_transparency_data else "RGB"
-            image = image if image.mode == mode else image.convert(mode)
-            return np.asarray(image)
+            return use(image)
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file, wanted an image; copy it or correct the name") from None
     except Exception as error:  # a damaged file makes Pillow's decoders raise almost anything
-        reason = f"{type(error).__name__}: {error}"
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(
             f"{path}: unreadable ({reason}), wanted a whole image file; copy or render it again"
         ) from error
+
+
+def _orientation(image):
+    turn = image.getexif().get(_ORIENTATION, 1)
+    return turn if turn in _UPRIGHT else 1
+
+
+def _decode(path, image):
+    raw = image.tile[0][3] if image.format == "PNG" and image.tile else None
+    if raw in ("RGB;16B", "RGBA;16B"):
+        # Pillow keeps only the first byte of each 16 bit value. Naming the byte order the other way
+        # round makes it keep the second, so two passes give all sixteen bits.
+        high, low = np.asarray(image), _second_bytes(path, raw)
+        return high.astype(np.uint16) * 256 + low
+    if image.mode == "I;16":
+        return np.repeat(np.asarray(image)[..., None], 3, axis=-1)
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    return np.asarray(image if image.mode == mode else image.convert(mode))
 
 
 def _second_bytes(path, raw):
