@@ -27,16 +27,22 @@ def get_config():
         {
             "seed": 0,
             "data": {
-                "format": "synthetic",  # "synthetic" (embedded, rendered once and cached) or "blender"
+                # "synthetic" (embedded, rendered once and cached), "blender", "transforms", "colmap", "llff", or
+                # "auto": what is in the folder
+                "format": "synthetic",
                 "dir": "",  # the scene's folder, here or under $JAXNERF_SCENES
-                "factor": 1,  # images are area-averaged down this many times
+                "factor": 1,  # images are area-averaged down this many times; 0: to data.width
+                "width": 800,  # px, about
                 "size": 100,  # px, side of the embedded scene's images
                 "near": 2.0,  # in t; the embedded scene brings its own
                 "far": 6.0,  # in t
                 "background": "white",  # behind alpha and behind the scene: "white", "black" or "none"
                 "hold_out": 0,  # every n-th training view is in the split "held_out" instead
                 "pixel_offset": 0.5,  # px; 0.5 looks through pixel centres, 0 is what the 2020 code did
-                "ndc": False,  # normalised device coordinates, for forward-facing captures
+                # "file": as cameras stand there; "forward": recentred for NDC; "around": what they look at in
+                # the middle; "auto": by the cameras
+                "world": "auto",
+                "ndc": False,  # normalised device coordinates, for a world that is "forward"; None: then
             },
             "field": "mlp",  # what "fine" is: "mlp", or "grid": the features below, with space.skip_empty
             "coarse": mlp(),  # guides the fine samples
@@ -63,7 +69,8 @@ def get_config():
             "space": {  # where the scene is asked; what is 0 or () fits cameras, masks and images
                 "skip_empty": False,  # one field on equal steps where something is; no coarse network
                 "masks": True,  # alpha 0 shows that nothing is there
-                "lower": (),  # world units, the box; outside of it there is nothing
+                "outside": "nothing",  # of the box; "contracted": the box holds all of space; "": by the capture
+                "lower": (),  # world units, the box
                 "upper": (),
                 "step": 0.0,  # world units between samples
                 "resolution": 0,  # cells along the longest side

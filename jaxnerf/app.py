@@ -4,6 +4,8 @@ import sys
 
 from absl import app, flags, logging
 
+FORMATS = ("blender", "transforms", "colmap", "llff")
+
 
 def run(main, *, positional=False):
     """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line.
@@ -13,10 +15,14 @@ def run(main, *, positional=False):
     app.run(_without_traceback(main, positional), flags_parser=_parse)
 
 
-def use_data_dir(config, data_dir):
-    """Lets --data_dir override the scene's folder."""
+def use_data(config, data_dir, format=None):
+    """Lets --data_dir override the scene's folder, and --format what is read there."""
     if data_dir:
         config.data.dir = data_dir
+        if config.data.format == "synthetic":  # which has no folder: what is there counts
+            config.data.format = "auto"
+    if format:
+        config.data.format = format
     return config
 
 

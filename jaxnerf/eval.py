@@ -36,7 +36,7 @@ def main(argv):
     if config is None and _WORKDIR.value and not _WATCH.value:
         config = workdir.read_config(_WORKDIR.value)
     if config is not None:
-        app.use_data_dir(config, _DATA_DIR.value)
+        app.use_data(config, _DATA_DIR.value)
     if _PREDICTIONS.value:
         results = predictions.score_folder(
             _PREDICTIONS.value, config=config, split=_SPLIT.value, overwrite=_OVERWRITE.value

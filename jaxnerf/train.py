@@ -8,6 +8,9 @@ from jaxnerf import app
 _CONFIG = config_flags.DEFINE_config_file("config", None, "The run's configuration file.", lock_config=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run; the same one again resumes it.")
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
+_FORMAT = flags.DEFINE_enum(
+    "format", None, ["auto", *app.FORMATS], "Of the scene, in place of config.data.format."
+)
 flags.mark_flags_as_required(["config", "workdir"])
 
 
@@ -15,7 +18,7 @@ def main(argv):
     del argv
     from jaxnerf.engine.loop import train_and_evaluate  # after the flags: a wrong one is said at once
 
-    train_and_evaluate(app.use_data_dir(_CONFIG.value, _DATA_DIR.value), _WORKDIR.value)
+    train_and_evaluate(app.use_data(_CONFIG.value, _DATA_DIR.value, _FORMAT.value), _WORKDIR.value)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,15 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from jaxnerf.core import compositing
+from jaxnerf.core import compositing, contraction
 from jaxnerf.core.structs import check_shapes, pytree
 
+_JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 
-@pytree()
+
+@pytree(static=("contracted",))
 class Grid:
-    """What is known of the X x Y x Z cells of a box."""
+    """What is known of the X x Y x Z cells of a box, into which all of space may be contracted."""
 
     lower: jax.Array  # [3] world units, the box
     upper: jax.Array  # [3]
@@ -23,9 +25,10 @@ class Grid:
     peak: jax.Array  # [X, Y, Z] 1 / world unit, the largest density found of late
     mean: jax.Array  # [X, Y, Z] 1 / world unit, the running mean of those found; -1 where not occupied
     occupied: jax.Array  # [X, Y, Z] bool, where a scene is asked
+    contracted: bool = False  # the box's inner half is plain, and its outer half holds all the rest
 
 
-def create_grid(lower, upper, possible, *, assumed):
+def create_grid(lower, upper, possible, *, assumed, contracted=False):
     """Returns the Grid of a box of which only is known what is possible (as the grids of arXiv:2201.05989).
 
     Args:
@@ -33,6 +36,8 @@ def create_grid(lower, upper, possible, *, assumed):
         possible: [X, Y, Z] bool, x first.
         assumed: 1 / world unit, the density taken for found everywhere. An empty cell is left out after as
             many looks as bring that down to the threshold: log(assumed / threshold) / log(1 / decay).
+        contracted: whether there is space outside of the box, too: then the cells of its inner half are
+            plain, and those of the outer half hold all the rest, see contraction.contract.
 
     Returns:
         Grid with fields [X, Y, Z], occupied wherever that is possible.
@@ -43,8 +48,15 @@ def create_grid(lower, upper, possible, *, assumed):
     lower, upper, possible = (jnp.asarray(value) for value in (lower, upper, possible))
     check_shapes("create_grid", lower=(lower, "3"), upper=(upper, "3"), possible=(possible, "X Y Z"))
     mean = jnp.where(possible, 0.0, -1.0)
-    peak = jnp.full_like(mean, assumed)
-    return Grid(lower=lower, upper=upper, possible=possible, peak=peak, mean=mean, occupied=possible)
+    return Grid(
+        lower=lower,
+        upper=upper,
+        possible=possible,
+        peak=jnp.full_like(mean, assumed),
+        mean=mean,
+        occupied=possible,
+        contracted=contracted,
+    )
 
 
 def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2, spread=True, chunk=8192):
@@ -58,7 +70,8 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
         grid: Grid.
         scene: see render_samples.
         cells: [M] int32, flat indices x first, each at most once; what lies past the last cell is ignored.
-        threshold: 1 / world unit; 0.01 over the spacing of samples leaves out what absorbs 1 % of the light.
+        threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there leaves out
+            what absorbs 1 % of the light.
         decay: what of the peak outlasts a look that finds less.
         smoothing: the weight of a look in the running mean.
         spread: bool, traced or not. When the field has formed, its neighbours cost samples and are empty.
@@ -73,6 +86,8 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
     check_shapes("update_grid", cells=(cells, "M"))
     corner = jnp.stack(jnp.unravel_index(cells, grid.occupied.shape), axis=-1)
     place = (corner + jax.random.uniform(key, corner.shape)) / jnp.array([grid.occupied.shape])
+    if grid.contracted:
+        place = (contraction.expand(4 * place - 2) + 2) / 4
     x = grid.lower[None] + place * (grid.upper - grid.lower)[None]
     # Density has no direction; any will do.
     ask = lambda x: scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]))[0][0, 0]  # noqa: E731
@@ -213,7 +228,19 @@ def _cells_per_unit(grid, axis):
 def _cell(grid, places):
     """Returns the flat index of the cell at each of the places, and whether they are inside the box."""
     index, inside = 0, True
+    if grid.contracted:
+        places = _contracted(places, grid.occupied.shape)
     for place, size in zip(places, grid.occupied.shape, strict=True):
         inside &= (place >= 0) & (place < size)
         index = index * size + jnp.clip(place.astype(jnp.int32), 0, size - 1)
     return index, inside
+
+
+def _contracted(places, shape):
+    """Returns where contract puts places, three times [...] in cells; axis by axis, as that is faster."""
+    along = [place * (4 / size) - 2 for place, size in zip(places, shape, strict=True)]
+    largest = jnp.maximum(jnp.maximum(*map(jnp.abs, along[:2])), jnp.abs(along[2]))
+    safe = jnp.maximum(largest, 1)
+    # Infinitely far away the box has an end, and what lies there is in its last cell.
+    scale = jnp.minimum((2 - 1 / safe) / safe, _JUST_INSIDE / safe)
+    return [(value * scale + 2) * (size / 4) for value, size in zip(along, shape, strict=True)]

@@ -90,6 +90,7 @@ class Views:
     mask: jax.Array | None = None  # [P] bool, False = belongs to no batch and no score
     names: tuple[str, ...] = ()  # V file names without folder and extension
     background: tuple[float, float, float] | None = None  # what alpha is composited over
+    box: jax.Array | None = None  # [2, 3] world units, lower and upper, outside which the file has nothing
     to_file: jax.Array | None = None  # [4, 4] this world -> the capture file's; None: the same
 
 

@@ -60,9 +60,7 @@ def _shared_depths(capture, poses):
     for index, frame in enumerate(capture.frames):
         pose, slopes = poses[index], _slopes(frame.camera)
         places = pose[:, 3] + steps[:, None, None] * (slopes @ pose[:, :3].T)
-        count = sum(
-            _sees(other.camera, places) for j, other in enumerate(capture.frames) if j != index
-        )
+        count = sum(_sees(other.camera, places) for j, other in enumerate(capture.frames) if j != index)
         wanted = min(_OTHERS, len(poses) - 1)
         found = np.flatnonzero((count >= wanted).any(axis=1)) if wanted else []
         near = float(steps[found[0]]) if len(found) else 0.1 * distance

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxnerf.core.structs import Camera, Views
 from jaxnerf.data.checks import check_background, check_factor
-from jaxnerf.data.images import average_blocks, read_image, read_mask
+from jaxnerf.data.images import average_blocks, image_size, read_image, read_mask
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # coefficients
@@ -113,6 +113,11 @@ def stack_cameras(cameras, names):
         for name in ("to_world", "focal", "center")
     }
     return Camera(**numbers, distortion=distortion, lens=lens, height=height, width=width)
+
+
+def full_width(capture):
+    """Returns how wide the widest photograph is, in px, where all are as large as their cameras say."""
+    return max(frame.camera.width or image_size(frame.image)[0] for frame in capture.frames)
 
 
 def image_files(folder):

@@ -6,7 +6,9 @@ import numpy as np
 
 from jaxnerf.data.poses import gaze_center
 
-_FORWARD = 0.85  # cosine of the widest angle between an axis and their mean: LLFF's grids stay within 20 degrees
+_FORWARD = (
+    0.85  # cosine of the widest angle between an axis and their mean: LLFF's grids stay within 20 degrees
+)
 
 
 def poses_of(capture):

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.data import batches
+from jaxnerf.engine.fit import OUTSIDE, SIZES
 from jaxnerf.engine.models import Model, hierarchical_model
 from jaxnerf.engine.packed import packed_model, skip_empty_afterwards
 from jaxnerf.engine.scenes import background_of, load_views
-from jaxnerf.engine.space import make_space, survey
+from jaxnerf.engine.space import contracted_field, make_space, survey
 from jaxnerf.fields.grid import grid_field
 from jaxnerf.fields.mlp import mlp_field
 
@@ -116,6 +117,8 @@ def _packed_model(config):
         field = mlp_field(**_network(config.fine))
     else:
         raise ValueError(f"field is {config.field!r}, wanted 'mlp' or 'grid'")
+    if space.get("outside") == "contracted":
+        field = contracted_field(field, space.lower, space.upper)
     return packed_model(
         field,
         _space(config, field),
@@ -129,11 +132,15 @@ def _packed_model(config):
 
 def _space(config, field):
     space = config.space
-    open_sizes = [name for name in ("lower", "upper", "resolution", "step") if not space[name]]
+    open_sizes = [name for name in SIZES if not space.get(name, "nothing")]
     if open_sizes:
         raise ValueError(f"space.{open_sizes[0]} is open, wanted a number; engine.fit chooses it from views")
+    outside = space.get("outside", "nothing")
+    if outside not in OUTSIDE:
+        raise ValueError(f"space.outside is {outside!r}, wanted one of {OUTSIDE}")
     names = ("resolution", "step", "threshold", "update_every", "look_at_once")
     options = {name: space[name] for name in names}
+    options["contracted"] = outside == "contracted"
     return make_space(space.lower, space.upper, seed=config.seed, field=field, **options)
 
 

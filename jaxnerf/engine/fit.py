@@ -7,10 +7,12 @@ import numpy as np
 
 from jaxnerf.data import hull, poses
 from jaxnerf.data.batches import view_rays
+from jaxnerf.engine import scenes
 
 _SPACING = 0.7  # of a pixel's footprint: the finest thing that images can tell apart, and a little finer
 _FINEST = (32, 256)  # vertices along the longest side, at least and at most
-_SIZES = ("lower", "upper", "resolution", "step")
+SIZES = ("lower", "upper", "resolution", "step", "outside")
+OUTSIDE = ("nothing", "contracted")  # what is taken to be outside of the box
 _MOST_STEPS = 170  # along the longest side: finer images need finer features sooner than finer steps
 _LARGEST_GRID = 128  # cells: beyond, looking at all of them costs more than the samples it saves
 
@@ -31,10 +33,15 @@ def fit_config(config, views):
     space = config.get("space")
     if not space or not space.skip_empty:
         return config, lines
+    if not space.get("outside", "nothing"):
+        space.outside, why = _outside(config, views)
+        lines.append(f"outside     {space.outside}: {why}")
     footprint = _footprint(views, config.data.ndc)
     masks = space.masks and views.pixels.shape[-1] == 4 and not config.data.ndc
     if not (len(space.lower) and len(space.upper)):
-        lower, upper, why = _box(views, masks, ndc=config.data.ndc)
+        lower, upper, why = _box(
+            views, masks, ndc=config.data.ndc, contracted=space.get("outside") == "contracted"
+        )
         digits = 4 - math.floor(math.log10(max(upper - lower)))
         space.lower, space.upper = (
             tuple(given) or tuple(round(float(x), digits) for x in bound)
@@ -59,21 +66,38 @@ def fit_config(config, views):
     return config, lines
 
 
+def fit_data(config):
+    """Returns a copy of a configuration whose data section is settled, and lines that say what was found."""
+    config = copy.deepcopy(config)
+    data, lines = scenes.settle(config.data)
+    config.data = data
+    return config, lines
+
+
 def is_open(config):
-    """Returns whether sizes are still to be chosen."""
+    """Returns whether something is still to be chosen."""
+    if config.data.format != "synthetic" and scenes.is_open(config.data):
+        return True
     space = config.get("space")
     if not space or not space.skip_empty:
         return False
     field = config.features.resolutions if config.field == "grid" else config.fine.num_freqs
-    return not all([*(space[name] for name in _SIZES), field])
+    return not all([*(space.get(name, "nothing") for name in SIZES), field])
 
 
 def fill_from(config, fitted):
     """Returns a copy whose open sizes are those of a fitted configuration."""
     config = copy.deepcopy(config)
     if is_open(config):
-        for name in _SIZES:
-            config.space[name] = config.space[name] or fitted.space[name]
+        with config.data.unlocked():
+            for name in scenes.OPEN:
+                if config.data.get(name) in scenes.OPEN[name]:
+                    config.data[name] = fitted.data[name]
+        if not (config.get("space") and config.space.skip_empty):
+            return config
+        for name in SIZES:
+            if not config.space.get(name, "nothing"):
+                config.space[name] = fitted.space[name]
         config.features.resolutions = config.features.resolutions or fitted.features.resolutions
         config.fine.num_freqs = config.fine.num_freqs or fitted.fine.num_freqs
     return config
@@ -97,15 +121,35 @@ def _footprint(views, ndc):
     return float(np.median(distances / np.asarray(views.cameras.focal)[:, 0]))
 
 
-def _box(views, masks, *, ndc):
+def _outside(config, views):
+    """Returns what is outside of the box, and in words why."""
+    if config.data.ndc:
+        return "nothing", "normalised device coordinates hold all that is seen"
+    if views.box is not None:
+        return "nothing", "the file says how far the scene goes"
+    if config.space.masks and views.pixels.shape[-1] == 4:
+        return "nothing", "alpha shows where the object ends"
+    return "contracted", "nothing says how far the surroundings go"
+
+
+def _box(views, masks, *, ndc, contracted):
     """Returns lower, upper, and in words where they come from."""
     if ndc:
         lower, upper = _ends_of_rays(views)
         return lower, upper, "which holds all rays"
+    if views.box is not None:
+        return *np.asarray(views.box, np.float64), "as the file says"
     center = poses.gaze_center(views.cameras.to_world)
     distance = np.linalg.norm(np.asarray(views.cameras.to_world)[:, :, 3] - center, axis=-1)
     # As wide as the widest image is in the middle of the scene.
     width = distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / np.asarray(views.cameras.focal)
+    if contracted:
+        room = float(np.median(width.min(axis=1)))  # what most images hold whole is worth most cells
+        return (
+            center - 2 * room,
+            center + 2 * room,
+            f"of which {room:.2g} around its middle are not contracted",
+        )
     lower, upper = center - width.max(), center + width.max()
     if not masks:
         return lower, upper, "as wide as the images where all cameras look; nothing is known to be empty"

@@ -12,7 +12,7 @@ from jaxnerf.engine import build, parallel, records, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
-from jaxnerf.engine.fit import fit_config
+from jaxnerf.engine.fit import fit_config, fit_data
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
 
@@ -31,16 +31,18 @@ def train_and_evaluate(config, folder):
         ValueError: on bad input, or when too many steps in a row were not finite.
     """
     started = time.perf_counter()
-    views = build.load_views(
-        config.data, "train"
-    )  # before the workdir is made: bad input leaves nothing behind
+    config, found = fit_data(config)
+    views = build.load_views(config.data, "train")  # before the workdir is made: bad input leaves nothing
     config, chosen = fit_config(config, views)
     experiment = build.build(config)
     options = experiment.train
     devices = parallel.devices_of(options.parallel)
     parallel.split_positions(options.batch_size, len(devices), options.block_size)
     workdir.claim(folder, config)
-    print("\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *chosen]), file=sys.stderr)
+    print(
+        "\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *found, *chosen]),
+        file=sys.stderr,
+    )
     finished = train(experiment, views, folder)
     if finished and experiment.eval.at_end:
         evaluate(folder)

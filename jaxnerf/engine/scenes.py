@@ -1,13 +1,57 @@
 """The views of a split, as the data section of a configuration describes them."""
 
+import copy
+import dataclasses
 import os
 import pathlib
 
 import numpy as np
 
-from jaxnerf.data import blender, llff, subset, synthetic
+from jaxnerf.data import blender, bounds, formats, photos, subset, synthetic, world
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
+WORLDS = {
+    "file": "as in the file",
+    "forward": "all cameras look one way, which becomes -z",
+    "around": "what the cameras look at becomes the origin, their distance 1",
+}
+OPEN = {"format": ("auto",), "factor": (0,), "world": (None, "auto"), "ndc": (None,)}  # left to the capture
+
+
+def settle(data):
+    """Returns a copy of a data section without what is left to the capture, and lines that say what it is.
+
+    See OPEN: the format, the factor that brings images to data.width, the world, and whether to use NDC.
+    """
+    data, lines = copy.deepcopy(data), []
+    if data.format == "synthetic" or not is_open(data):
+        return data, lines
+    folder = _scene_folder(data.dir)
+    if data.format == "auto":
+        found = formats.formats_in(folder)
+        data.format = found[0]
+        others = f", of {', '.join(found)}: --format takes another" if len(found) > 1 else ""
+        lines.append(f"format      {data.format}{others}")
+    capture = bounds.with_bounds(formats.read_capture(folder, data.format))
+    lines += [f"left out    {note}" for note in capture.notes]
+    if not data.factor:
+        width = photos.full_width(capture)
+        data.factor = max(round(width / data.width), 1)
+        lines.append(f"factor      {data.factor}, of images {width} px wide")
+    forward = world.looks_forward(capture)
+    if data.get("world", "auto") == "auto":
+        with data.unlocked():  # runs from before there was a choice have no such field
+            data.world = "file" if data.format == "blender" else "forward" if forward else "around"
+        lines.append(f"world       {data.world}: {WORLDS[data.world]}")
+    if data.ndc is None:
+        data.ndc = data.world == "forward"
+        lines.append(f"rays        {'in normalised device coordinates' if data.ndc else 'straight'}")
+    return data, lines
+
+
+def is_open(data):
+    """Returns whether settle has anything to choose."""
+    return any(data.get(name) in values for name, values in OPEN.items())
 
 
 def load_views(data, split):
@@ -29,7 +73,11 @@ def load_views(data, split):
 def _read_views(data, split):
     if data.format == "synthetic":
         return synthetic.load_views(split=split, size=data.size)
+    data, _ = settle(data)
     folder = _scene_folder(data.dir)
+    if data.world not in WORLDS or (data.format == "blender" and data.world != "file"):
+        names = "'file'" if data.format == "blender" else ", ".join(WORLDS)
+        raise ValueError(f"data.world is {data.world!r}, wanted {names} or 'auto'")
     if data.format == "blender":
         return blender.load_views(
             folder,
@@ -39,9 +87,15 @@ def _read_views(data, split):
             far=data.far,
             background=background_of(data),
         )
-    if data.format == "llff":
-        return llff.load_views(folder, split=split, factor=data.factor)
-    raise ValueError(f"data.format is {data.format!r}, wanted 'synthetic', 'blender' or 'llff'")
+    capture = bounds.with_bounds(formats.read_capture(folder, data.format))
+    to_file = np.eye(4)
+    if data.world == "forward":
+        capture, to_file = world.recenter(capture)
+    elif data.world == "around":
+        capture, to_file = world.center(capture)
+    views = photos.load_views(capture, split=split, factor=data.factor, background=background_of(data))
+    box = None if capture.box is None else np.float32(capture.box)
+    return dataclasses.replace(views, to_file=np.float32(to_file), box=box)
 
 
 def _scene_folder(name):

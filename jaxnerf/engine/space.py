@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core import occupancy
+from jaxnerf.core import contraction, occupancy
 from jaxnerf.core.sampling import samples_from_edges, stepped_edges
 from jaxnerf.data.batches import live_pixels, view_rays
 from jaxnerf.data.hull import visual_hull
@@ -25,9 +25,10 @@ class Space(NamedTuple):
     upper: tuple[float, float, float]
     shape: tuple[int, int, int]  # cells
     step: float  # world units between samples
-    threshold: float  # 1 / world unit, the density below which a cell is empty
+    threshold: float  # 1 / world unit, the density below which a plain cell is empty
     create: Callable[..., occupancy.Grid]  # possible [X, Y, Z] bool -> Grid
     update: Callable[..., occupancy.Grid]  # (step, params, Grid, cells [L] int32) -> Grid
+    contracted: bool = False  # see Grid
 
     @property
     def cell(self):
@@ -37,31 +38,48 @@ class Space(NamedTuple):
 
 
 def make_space(
-    lower, upper, *, resolution, step, seed, field, threshold, update_every, look_at_once, passes_from_start=8
+    lower,
+    upper,
+    *,
+    resolution,
+    step,
+    seed,
+    field,
+    threshold,
+    update_every,
+    look_at_once,
+    contracted=False,
+    passes_from_start=8,
 ):
     """Returns the Space of a box.
 
     Args:
         lower, upper: [3] world units.
         resolution: cells along the longest side; along the others so many that they are cubes.
-        step: world units between samples.
+        step: world units between samples, where space is plain.
         seed: of the places that are looked at.
         field: Field; its density under params["fine"] is what counts. None where there are no updates.
         threshold: the share of light absorbed in a step below which a cell is empty.
         update_every: steps between two looks.
         look_at_once: cells a look. Where there are more, looks at the start come more often, until all cells
             have been seen passes_from_start times; and that long neighbours of dense cells count, too.
+        contracted: whether the box holds all of space, see Grid.
     """
     if threshold <= 0 or step <= 0:
         raise ValueError(f"space.threshold is {threshold} and space.step {step}, wanted both above 0")
     sides = [high - low for low, high in zip(lower, upper, strict=True)]
     shape = tuple(max(round(side / max(sides) * resolution), 1) for side in sides)
     density = threshold / step
+    empty_below = density / _stretches(shape) if contracted else density
 
     def create(possible):
         # What is not looked at yet counts as ten times the threshold: half a dozen looks empty a cell.
         return occupancy.create_grid(
-            jnp.asarray(lower, jnp.float32), jnp.asarray(upper, jnp.float32), possible, assumed=10 * density
+            jnp.asarray(lower, jnp.float32),
+            jnp.asarray(upper, jnp.float32),
+            possible,
+            assumed=10 * density,
+            contracted=contracted,
         )
 
     def update(step, params, grid, cells):
@@ -87,14 +105,36 @@ def make_space(
                 grid,
                 functools.partial(field.apply, params["fine"]),
                 chosen,
-                threshold=density,
+                threshold=empty_below,
                 spread=young,
                 chunk=_CHUNK,
             )
 
         return jax.lax.cond(step % interval == interval - 1, looked, lambda: grid)
 
-    return Space(tuple(lower), tuple(upper), shape, step, density, create, update)
+    return Space(tuple(lower), tuple(upper), shape, step, density, create, update, contracted)
+
+
+def contracted_field(field, lower, upper):
+    """Returns the Field of all of space: what field is in the box from lower to upper, see Grid."""
+    middle = (jnp.asarray(lower) + jnp.asarray(upper)) / 2
+    room = (jnp.asarray(upper) - jnp.asarray(lower)) / 4
+
+    def apply(params, x, viewdirs, **options):
+        lead = (1,) * (x.ndim - 1)
+        center, scale = middle.reshape(*lead, 3), room.reshape(*lead, 3)
+        return field.apply(
+            params, center + scale * contraction.contract((x - center) / scale), viewdirs, **options
+        )
+
+    return field._replace(apply=apply)
+
+
+def _stretches(shape):
+    """Returns [X, Y, Z], how much longer than where space is plain the steps across contracted cells are."""
+    along = [np.abs(4 * (np.arange(size) + 0.5) / size - 2) for size in shape]
+    largest = np.max(np.meshgrid(*along, indexing="ij"), axis=0)
+    return np.float32(1 / np.minimum(2 - largest, 1) ** 2)
 
 
 def survey(views, space, *, masks, ndc=False, pixel_offset=0.5):
@@ -148,6 +188,8 @@ def pixels_that_meet(views, space, possible, *, ndc=False, pixel_offset=0.5, chu
         samples = samples_in_box(None, grid, rays, step=space.step, cell=space.cell)
         return ((samples.delta > 0) & occupancy.occupied_at(grid, rays, samples.t)).any(axis=-1)
 
+    if space.contracted:
+        return live  # every ray does
     colourless = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None)
     grid, found = space.create(possible), []
     for start in range(0, live.size, chunk):
@@ -167,19 +209,56 @@ def samples_in_box(key, grid, rays, *, step, cell, stretch=1.0):
 
     Args:
         key: see stepped_edges.
-        grid: Grid.
+        grid: Grid. Where all of space is contracted into its box, see samples_everywhere.
         rays: Rays [...].
         step: world units, a number.
         cell: [3] world units, numbers, the size of one of this grid's cells: they say how many
             samples a ray may need.
         stretch: how many steps one sample takes, at least 1, traced or not.
     """
-    inside = occupancy.cut_to_box(grid, rays)
-    longest = math.hypot(*(size * count for size, count in zip(cell, grid.possible.shape, strict=True)))
-    count = math.ceil(longest / step) + 1
-    count += -count % 32  # whole words for the packer's flags: padding them takes longer than asking
     x, y, z = (rays.directions[..., axis] for axis in range(3))
-    t_step = stretch * step / jnp.sqrt(x * x + y * y + z * z)
-    return samples_from_edges(
-        None, stepped_edges(key, inside.near, inside.far, step=t_step, num_segments=count)
-    )
+    speed = jnp.sqrt(x * x + y * y + z * z)
+    sides = [size * count for size, count in zip(cell, grid.possible.shape, strict=True)]
+    if grid.contracted:
+        return samples_everywhere(key, grid, rays, stretch * step / speed, max(sides) / 4 / step)
+    inside = occupancy.cut_to_box(grid, rays)
+    count = _whole_words(math.hypot(*sides) / step + 1)
+    edges = stepped_edges(key, inside.near, inside.far, step=stretch * step / speed, num_segments=count)
+    return samples_from_edges(None, edges)
+
+
+def samples_everywhere(key, grid, rays, t_step, steps_of_room):
+    """Returns Samples [..., S] from near to far, however far, whose steps grow as contracted cells do.
+
+    With r the distance to the box's center, r0 the ray's smallest, and R the side of its plain part over
+    the square root of 2, steps are equal in s where t = m tan(s / m), m = max(r0, R), counted from the place
+    of r0: plain near the center, times (r / R)^2 far from it, and alike at any scale where r0 exceeds R.
+
+    Args:
+        key: see stepped_edges.
+        grid: Grid, contracted.
+        rays: Rays [...].
+        t_step: [...] in t, where space is plain.
+        steps_of_room: a number, half of the plain part's side over the step.
+    """
+    middle, half = (grid.lower + grid.upper) / 2, (grid.upper - grid.lower).max() / 4 * math.sqrt(2)
+    middle = middle.reshape(*(1,) * rays.near.ndim, 3)
+    squares = (rays.directions**2).sum(axis=-1)
+    nearest = ((middle - rays.origins) * rays.directions).sum(axis=-1) / squares
+    away = rays.origins + nearest[..., None] * rays.directions - middle
+    smallest = half / jnp.sqrt(squares)
+    scale = jnp.maximum(jnp.sqrt((away**2).sum(axis=-1) / squares), smallest)
+    t_step = t_step * scale / smallest
+    last = scale * (math.pi / 2) - t_step / 2  # a whole step more would never end
+    near, far = (jnp.minimum(scale * jnp.arctan((t - nearest) / scale), last) for t in (rays.near, rays.far))
+    count = _whole_words(math.pi * math.sqrt(2) * steps_of_room + 1)
+    edges = stepped_edges(key, near, far, step=t_step, num_segments=count)
+    nearest, scale = nearest[..., None], scale[..., None]
+    edges = nearest + scale * jnp.tan(edges / scale)
+    return samples_from_edges(None, jnp.clip(edges, rays.near[..., None], rays.far[..., None]))
+
+
+def _whole_words(count):
+    """Returns a number of samples for which the packer's flags fill whole words: padding takes longer."""
+    count = math.ceil(count)
+    return count + -count % 32
