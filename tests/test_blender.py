@@ -164,6 +164,8 @@ def _pose(row, column, value):
         (_frame("file_path", "./train/r_9"), r"frame 1: .*r_9\.png does not exist"),
         (_frame("file_path", "train/../../r_1"), "frame 1: file_path .* leaves the folder"),
         (_frame("file_path", "/etc/passwd"), "frame 1: file_path .* leaves the folder"),
+        (_frame("file_path", "."), "frame 1: file_path '.' leaves the folder"),  # would read ../<folder>.png
+        (_frame("file_path", "train/a\nb"), "frame 1: file_path is"),
         (_frame("transform_matrix", _POSE[:3]), r"frame 1: .*shape \(3, 4\)"),
         (_frame("transform_matrix", [[1, 2], [3]]), "frame 1: .*unequal length"),
         (_frame("transform_matrix", [["a"] * 4] * 4), "frame 1: .*not numbers"),
