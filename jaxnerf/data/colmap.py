@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxnerf.core.structs import Camera
 from jaxnerf.data.capture import Capture, Frame
-from jaxnerf.data.checks import inside, is_number
+from jaxnerf.data.checks import check_inside, is_number
 from jaxnerf.data.colmap_model import AGAIN, UNDISTORT, count_images, model_file, model_suffix, read_model
 from jaxnerf.data.poses import check_pose
 
@@ -92,7 +92,7 @@ def _find_photographs(images, folder, source):
     photographs = folder / "images" if (folder / "images").is_dir() else folder
     found, missing = {}, []
     for image in images:
-        path = inside(photographs, image.name, f"{image.where}: its name")
+        path = photographs / check_inside(image.name, key="its name", source=image.where)
         if path in found:
             raise ValueError(
                 f"{image.where}: {image.name[:80]!r} occurs twice, wanted one pose for each; {AGAIN}"
