@@ -27,8 +27,8 @@ def get_config():
         {
             "seed": 0,
             "data": {
-                # "synthetic" (embedded, rendered once and cached), "blender", "transforms", "colmap", "llff", or
-                # "auto": what is in the folder
+                # "synthetic" (embedded, rendered once and cached), "blender", "transforms" (transforms.json),
+                # "colmap", "llff", or "auto": what is in the folder
                 "format": "synthetic",
                 "dir": "",  # the scene's folder, here or under $JAXNERF_SCENES
                 "factor": 1,  # images are area-averaged down this many times; 0: to data.width
@@ -69,7 +69,7 @@ def get_config():
             "space": {  # where the scene is asked; what is 0 or () fits cameras, masks and images
                 "skip_empty": False,  # one field on equal steps where something is; no coarse network
                 "masks": True,  # alpha 0 shows that nothing is there
-                "outside": "nothing",  # of the box; "contracted": the box holds all of space; "": by the capture
+                "outside": "nothing",  # of the box; "contracted": all of space is in it; "": by the capture
                 "lower": (),  # world units, the box
                 "upper": (),
                 "step": 0.0,  # world units between samples
