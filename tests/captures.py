@@ -70,7 +70,7 @@ def orbit(count, *, height=24, width=32, lens="pinhole", distance=4.0, first=0, 
     return _aim(eyes, np.zeros((count, 3)), height, width, lens, changes)
 
 
-def front(count, *, height=24, width=32, lens="pinhole", distance=4.0, spread=0.6, **changes):
+def front(count, *, height=24, width=32, lens="pinhole", distance=4.0, spread=0.4, **changes):
     """Returns Camera [count] side by side before the scene, all looking along +y, as LLFF's are."""
     steps = np.arange(count)
     across = spread * (np.mod(0.5 + 0.7548776662 * steps, 1) - 0.5) * 2
