@@ -23,6 +23,7 @@ def with_sizes(config):
     """Returns the configuration with what its views would fill in."""
     if config.space.skip_empty:
         sizes = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3, "resolution": 8, "step": 0.1}
+        sizes["outside"] = "nothing"
         config.space.update({name: size for name, size in sizes.items() if not config.space[name]})
         config.features.resolutions = config.features.resolutions or (4, 8)
         config.fine.num_freqs = config.fine.num_freqs or 4
@@ -45,7 +46,7 @@ def test_it_builds_and_invents_no_field(name):
     known = fields(default)
     for field, value in fields(config).items():
         assert field in known, f"{field} is not in configs/default.py"
-        assert type(value) is type(known[field]), field
+        assert value is None or type(value) is type(known[field]), field
     experiment = build(with_sizes(config))
     params = jax.eval_shape(experiment.model.init, jax.random.key(0))
     assert ("coarse" in params) == (bool(config.sampling.num_fine) and not config.space.skip_empty)

@@ -32,16 +32,20 @@ def settle(data):
         data.format = found[0]
         others = f", of {', '.join(found)}: --format takes another" if len(found) > 1 else ""
         lines.append(f"format      {data.format}{others}")
-    capture = bounds.with_bounds(formats.read_capture(folder, data.format))
-    lines += [f"left out    {note}" for note in capture.notes]
+    if data.format == "blender" and data.factor:  # whose cameras stand where they should: nothing to look up
+        capture, chosen = None, "file"
+    else:
+        capture = bounds.with_bounds(formats.read_capture(folder, data.format))
+        lines += [f"left out    {note}" for note in capture.notes]
+        forward = "forward" if world.looks_forward(capture) else "around"
+        chosen = "file" if data.format == "blender" else forward
     if not data.factor:
         width = photos.full_width(capture)
         data.factor = max(round(width / data.width), 1)
         lines.append(f"factor      {data.factor}, of images {width} px wide")
-    forward = world.looks_forward(capture)
     if data.get("world", "auto") == "auto":
         with data.unlocked():  # runs from before there was a choice have no such field
-            data.world = "file" if data.format == "blender" else "forward" if forward else "around"
+            data.world = chosen
         lines.append(f"world       {data.world}: {WORLDS[data.world]}")
     if data.ndc is None:
         data.ndc = data.world == "forward"
