@@ -1,4 +1,4 @@
-"""Captures from the folder to the rays: each feature, written by the generator, shows the scene it was made of.
+"""Captures from the folder to the rays: each feature, as written, shows the scene it was made of.
 
 The scene is known in closed form, so a ray of the Views, taken back to the file's world, has to see the
 colour of its pixel: formats, conventions, lenses, sizes, masks and worlds are all in that.
