@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core.cameras import ndc_rays, ndc_to_t, norm, rays_from_pixels
+from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
+from jaxnerf.core.numerics import norm
 from jaxnerf.core.structs import Batch
 
 BATCHINGS = ("all_images", "single_image")

@@ -11,7 +11,8 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 
-from jaxnerf.core.cameras import pixel_grid, turntable
+from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.core.paths import turntable
 from jaxnerf.core.rendering import render_image
 from jaxnerf.data.poses import gaze_center
 from jaxnerf.engine.load import newest_step, open_run
