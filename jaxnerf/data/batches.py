@@ -36,10 +36,16 @@ def view_rays(views, index, pixels, *, ndc=False):
 
 
 def world_depth(views, index, pixels, depth, *, ndc=False):
-    """Returns the distance [...] along the rays of view_rays, in world units, of depth [...] in their t."""
+    """Returns the distance [...] along the rays of view_rays of depth [...] in their t.
+
+    It is in world units of the capture's file, whatever the reader made of them: views.to_file says.
+    """
     rays = view_rays(views, index, pixels)
     t = ndc_to_t(depth, rays) if ndc else depth
-    return t * norm(rays.directions)
+    distance = t * norm(rays.directions)
+    if views.to_file is None:
+        return distance
+    return distance * norm(jnp.asarray(views.to_file)[:3, 0])  # each axis of a similarity has its scale
 
 
 def live_pixels(views):
