@@ -176,6 +176,13 @@ def test_an_ellipse_passes_through_cameras_on_one():
         np.testing.assert_allclose(center[:, :, 3] @ tilt @ UP, center[0, :, 3] @ tilt @ UP, atol=1e-4)
 
 
+def test_up_is_across_the_horizons_of_an_arc_and_the_mean_of_views_that_look_one_way():
+    tilt = turn([1, 0, 0], 70)
+    np.testing.assert_allclose(up_of(ring(16, height=4.0, tilt=tilt)[:6]), tilt @ UP, atol=1e-5)
+    forward = np.stack([pose(tilt @ turn([0, 1, 0], angle), [0, 0, 0]) for angle in (-5, 5)])
+    np.testing.assert_allclose(up_of(forward), tilt[:, 1], atol=1e-6)
+
+
 def test_a_spiral_sways_as_the_cameras_do():
     offsets = np.random.default_rng(0).normal(size=(20, 3)) * [1.0, 0.5, 0.1]
     cameras = np.stack([pose(np.eye(3), offset) for offset in offsets - offsets.mean(0)])

@@ -61,12 +61,19 @@ def through_views(views, num_frames, closed):
     return np.asarray(poses), np.stack(focal, axis=-1)
 
 
-def up_of(poses, tolerance=10.0):
-    """Returns the unit mean [3] of what is up for the cameras; z where that is as near to it (degrees)."""
-    mean = poses[:, :, 1].sum(axis=0)
-    mean = mean / max(np.linalg.norm(mean), 1e-30)
-    # Files that know which way is up call it z; the mean over uneven views is off by some degrees.
-    return np.array([0.0, 0.0, 1.0]) if mean[2] > np.cos(np.radians(tolerance)) or not mean.any() else mean
+def up_of(poses):
+    """Returns the unit vector [3] that is up for cameras [V, 3, 4].
+
+    Who walks around a scene holds the horizon level: up is across all the cameras' x axes. Where all look
+    one way, so that these span no plane, it is the mean of their y axes, which leans with their pitch.
+    """
+    mean = poses[:, :, 1].mean(axis=0)
+    length = np.linalg.norm(mean)
+    mean = mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    spread, axes = np.linalg.eigh(np.einsum("ni,nj->ij", poses[:, :, 0], poses[:, :, 0]) / len(poses))
+    across = axes[:, 0] if axes[:, 0] @ mean > 0 else -axes[:, 0]
+    # Of a sum of 1: an arc of 25 degrees either way has a second spread of 0.05.
+    return across if spread[1] > 0.05 and spread[0] < 0.25 * spread[1] else mean
 
 
 KINDS = {"turntable": (turntable, 48), "spiral": (spiral, 120), "ellipse": (ellipse, 120)}  # and their N
