@@ -4,15 +4,7 @@ A scene is any function (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [
 Importing this needs jax only; load_scene brings in the rest when it is called.
 """
 
-from jaxnerf.core.cameras import (
-    look_at,
-    ndc_rays,
-    ndc_to_t,
-    pixel_grid,
-    rays_from_pixels,
-    turntable,
-    undistort,
-)
+from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, rays_from_pixels, undistort
 from jaxnerf.core.compositing import (
     composite,
     expected_depth,
@@ -24,6 +16,7 @@ from jaxnerf.core.encoding import positional_encoding
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
 from jaxnerf.core.occupancy import Grid, create_grid, grid_of_scene, restrict_scene, update_grid
 from jaxnerf.core.packing import render_packed
+from jaxnerf.core.paths import look_at, turntable
 from jaxnerf.core.rendering import positions, render_hierarchical, render_image, render_rays, render_samples
 from jaxnerf.core.sampling import (
     importance_points,

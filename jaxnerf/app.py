@@ -7,12 +7,15 @@ from absl import app, flags, logging
 FORMATS = ("blender", "transforms", "colmap", "llff")
 
 
-def run(main, *, positional=False):
+def run(
+    main, *, positional=False, stopped="before there was anything to save; the same command starts again"
+):
     """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line.
 
     positional: whether arguments without a flag are taken, as argv[1:].
+    stopped: what Ctrl-C left behind, and what to do.
     """
-    app.run(_without_traceback(main, positional), flags_parser=_parse)
+    app.run(_without_traceback(main, positional, stopped), flags_parser=_parse)
 
 
 def use_data(config, data_dir, format=None):
@@ -47,7 +50,7 @@ def _parse(argv):
         _leave(2, error)
 
 
-def _without_traceback(main, positional):
+def _without_traceback(main, positional, stopped):
     def wrapped(argv):
         try:
             if len(argv) > 1 and not positional:
@@ -56,7 +59,7 @@ def _without_traceback(main, positional):
         except (ValueError, OSError) as error:
             _leave(1, error)
         except KeyboardInterrupt:
-            _leave(130, "stopped before there was anything to save; the same command starts again")
+            _leave(130, f"stopped {stopped}")
 
     return wrapped
 

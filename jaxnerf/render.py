@@ -1,33 +1,57 @@
-"""python -m jaxnerf.render --workdir=DIR: renders a turn around a trained scene."""
+"""python -m jaxnerf.render --workdir=DIR: pictures and a video of a trained scene along a camera path."""
+
+import sys
 
 from absl import flags
 
 from jaxnerf import app
 
+_SIDE = {"lower_bound": 1, "upper_bound": 16384}
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
 _CHUNK = flags.DEFINE_integer("chunk", None, "Rays at once; config.eval.chunk when not given.", lower_bound=1)
-_FRAMES = flags.DEFINE_integer("frames", 48, "Of the turn.", lower_bound=1)
-_FPS = flags.DEFINE_float("fps", 24.0, "Frames a second.", lower_bound=0.1)
-_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier video.")
+_SKIP_EMPTY = flags.DEFINE_bool("skip_empty", None, "Leave out what is not seen of a dense model.")
+_PATH = flags.DEFINE_string(
+    "path", None, "turntable, spiral, ellipse, interpolate or FILE.json; chosen by the views when not given."
+)
+_FRAMES = flags.DEFINE_integer("frames", None, "Of the path; 48 a turn, else 120 or 6 a view.", lower_bound=1)
+_CLOSED = flags.DEFINE_bool("closed", False, "Let --path=interpolate come back to the first view.")
+_WIDTH = flags.DEFINE_integer("width", None, "px; the first view's when not given.", **_SIDE)
+_HEIGHT = flags.DEFINE_integer("height", None, "px; as --width asks when not given.", **_SIDE)
+_FPS = flags.DEFINE_float("fps", None, "Frames a second; the file's, or 24.", lower_bound=0.1)
+_VIDEO = flags.DEFINE_string("video", "auto", "mp4, gif, none, or auto: mp4 where there is ffmpeg.")
+_DEPTH = flags.DEFINE_bool("depth", False, "Make a video of the depth, too.")
+_RGBA = flags.DEFINE_bool("rgba", False, "Write rgba/0000.png, too: straight alpha, no background.")
+_NAME = flags.DEFINE_string("name", None, "Of the folder and video, in place of the path's.")
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Delete the frames of an earlier call first.")
 
 
 def main(argv):
     del argv
-    from jaxnerf.engine.turntable import render_turntable
+    from jaxnerf.engine.frames import render_path
 
-    path = render_turntable(
+    written = render_path(
         _WORKDIR.value,
+        path=_PATH.value,
         step=_STEP.value,
         data_dir=_DATA_DIR.value,
+        settings={} if _SKIP_EMPTY.value is None else {"skip_empty": _SKIP_EMPTY.value},
+        size=(_WIDTH.value, _HEIGHT.value),
         num_frames=_FRAMES.value,
-        frames_per_second=_FPS.value,
+        closed=_CLOSED.value,
+        fps=_FPS.value,
         chunk=_CHUNK.value,
+        name=_NAME.value,
+        rgba=_RGBA.value,
+        depth=_DEPTH.value,
+        kind=_VIDEO.value,
         overwrite=_OVERWRITE.value,
     )
-    print(path)
+    print(*written, sep="\n")
+    if _VIDEO.value == "auto" and written[-1].suffix == ".gif":
+        print("a GIF, as there is no ffmpeg: pip install 'jaxnerf[video]' for MP4", file=sys.stderr)
 
 
 if __name__ == "__main__":
-    app.run(main)
+    app.run(main, stopped="between two frames; the same command goes on from there")

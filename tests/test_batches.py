@@ -144,7 +144,7 @@ def test_alpha_is_composited_over_the_background(dtype):
 
 
 @pytest.mark.parametrize("ndc", [False, True])
-def test_world_depth_is_the_distance_to_the_point(ndc):
+def test_world_depth_is_the_distance_to_the_point_in_the_files_units(ndc):
     scene, pixels = views(), np.float32([[0.5, 1.5], [3.5, 3.5]])
     axis = np.float32([2.0, 8.0])  # along the camera's axis
     t = 1 - 1 / axis if ndc else axis  # Eq. 25 for a camera at the origin looking along -z
@@ -153,3 +153,7 @@ def test_world_depth_is_the_distance_to_the_point(ndc):
     # The depth in normalised coordinates needs height and width, which views of one size have.
     alike = Views(**{**vars(scene), "cameras": Camera(**{**vars(scene.cameras), "height": 4, "width": 4})})
     np.testing.assert_allclose(batches.world_depth(alike, 2, pixels, t, ndc=ndc), wanted, rtol=1e-5)
+    turn = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    file = np.block([[0.01 * turn, np.full((3, 1), 7.0)], [np.zeros((1, 3)), 1.0]])
+    scaled = Views(**{**vars(alike), "to_file": file})
+    np.testing.assert_allclose(batches.world_depth(scaled, 2, pixels, t, ndc=ndc), 0.01 * wanted, rtol=1e-5)

@@ -26,3 +26,21 @@ def at_least_float32(*arrays):
     arrays = [jnp.asarray(array) for array in arrays]
     dtype = jnp.result_type(jnp.float32, *(array.dtype for array in arrays))
     return [array.astype(dtype) for array in arrays]
+
+
+def norm(vectors):
+    """Returns the length [...] of vectors [..., D] without over- or underflow; 0, with gradient 0, for 0."""
+    largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
+    nonzero = largest != 0  # NaN stays NaN
+    largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
+    squares = ((vectors / largest) ** 2).sum(axis=-1, keepdims=True)
+    return jnp.where(nonzero, largest * jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)[..., 0]
+
+
+def normalize(vectors):
+    """Returns vectors [..., D] at unit length; 0, with gradient 0, for a zero vector."""
+    largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
+    nonzero = largest != 0  # NaN stays NaN
+    scaled = vectors / jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
+    squares = (scaled**2).sum(axis=-1, keepdims=True)
+    return jnp.where(nonzero, scaled / jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)

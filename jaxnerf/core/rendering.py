@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxnerf.core import compositing, sampling
-from jaxnerf.core.cameras import norm
+from jaxnerf.core.numerics import norm
 from jaxnerf.core.structs import Rendering, check_shapes, without_weights
 
 

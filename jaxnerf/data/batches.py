@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core.cameras import ndc_rays, ndc_to_t, norm, rays_from_pixels
+from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
+from jaxnerf.core.numerics import norm
 from jaxnerf.core.structs import Batch
 
 BATCHINGS = ("all_images", "single_image")
@@ -35,10 +36,16 @@ def view_rays(views, index, pixels, *, ndc=False):
 
 
 def world_depth(views, index, pixels, depth, *, ndc=False):
-    """Returns the distance [...] along the rays of view_rays, in world units, of depth [...] in their t."""
+    """Returns the distance [...] along the rays of view_rays of depth [...] in their t.
+
+    It is in world units of the capture's file, whatever the reader made of them: views.to_file says.
+    """
     rays = view_rays(views, index, pixels)
     t = ndc_to_t(depth, rays) if ndc else depth
-    return t * norm(rays.directions)
+    distance = t * norm(rays.directions)
+    if views.to_file is None:
+        return distance
+    return distance * norm(jnp.asarray(views.to_file)[:3, 0])  # each axis of a similarity has its scale
 
 
 def live_pixels(views):

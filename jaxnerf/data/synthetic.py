@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core import cameras, compositing, rendering, sampling, structs
+from jaxnerf.core import cameras, compositing, paths, rendering, sampling, structs
 from jaxnerf.core.structs import Camera, Rays, Views
 from jaxnerf.data import images
 from jaxnerf.data.cache import load_or_make
@@ -144,7 +144,7 @@ def _cameras(split, size):
     azimuth = golden * steps + list(_COUNT).index(split)  # a radian between splits: no pose comes twice
     around = np.sqrt(1 - height**2)
     eyes = _DISTANCE * np.stack([around * np.cos(azimuth), around * np.sin(azimuth), height], axis=-1)
-    poses = jax.vmap(lambda eye: cameras.look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))(eyes)
+    poses = jax.vmap(lambda eye: paths.look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))(eyes)
     return Camera(
         to_world=np.asarray(poses),
         focal=np.full((count, 2), 1.36 * size, np.float32),  # the whole plinth fits
@@ -156,6 +156,7 @@ def _cameras(split, size):
 
 def _fingerprint():
     """Returns a hash of the source code that the pixels depend on: a changed scene is rendered anew."""
-    modules = (showcase, cameras, compositing, rendering, sampling, structs, images, sys.modules[__name__])
+    own = sys.modules[__name__]
+    modules = (showcase, cameras, compositing, paths, rendering, sampling, structs, images, own)
     source = "".join(inspect.getsource(module) for module in modules)
     return hashlib.sha256(source.encode()).hexdigest()[:16]

@@ -27,7 +27,7 @@ class Experiment(NamedTuple):
     load_views: Callable[[str], Any]  # split -> Views
     draw: Callable[..., tuple]  # (step, positions, (Views, live, cells)) -> (keys, Batch)
     view_rays: Callable[..., Any]  # (Views, index, pixels) -> Rays
-    world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in world units
+    world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in the file's units
     survey: Callable[..., tuple]  # Views -> possible cells, live pixels, cells to look at; each may be None
     samples_per_ray: int  # of the network that has most
     seed: int

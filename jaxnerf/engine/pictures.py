@@ -1,5 +1,6 @@
 """The files that evaluation writes: colours, depths, a sheet to look at."""
 
+import os
 import pathlib
 
 import imageio.v3 as iio
@@ -14,12 +15,45 @@ def to_8_bits(image):
 
 
 def write_view(folder, name, rgb, truth, depth):
-    """Writes color/<name>.png, gt-color/<name>.png and depth/<name>.tiff (float32, world units)."""
+    """Writes color/<name>.png, gt-color/<name>.png and depth/<name>.tiff (float32, the capture's units)."""
     folder = pathlib.Path(folder)
     files = {"color": to_8_bits(rgb), "gt-color": to_8_bits(truth), "depth": np.asarray(depth, np.float32)}
     for kind, pixels in files.items():
         (folder / kind).mkdir(parents=True, exist_ok=True)
         iio.imwrite(folder / kind / f"{name}.{'tiff' if kind == 'depth' else 'png'}", pixels)
+
+
+def write_whole(path, pixels):
+    """Writes an image so that it is there whole or not at all; the suffix of its path names the format."""
+    partial = path.with_name(path.name + ".tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(partial, pixels, extension=path.suffix)
+    os.replace(partial, path)
+
+
+def cut_out(rgb, opacity, background):
+    """Returns [H, W, 4] uint8, straight alpha, of what was rendered over a background (None: black).
+
+    Compositing it over that background again gives rgb. Colour is 0 where alpha rounds to 0.
+    """
+    alpha = to_8_bits(opacity)[..., None] / 255  # rounded first, so that the colour makes up for it
+    own = np.asarray(rgb) - (1 - alpha) * np.asarray((0.0, 0.0, 0.0) if background is None else background)
+    straight = np.where(alpha > 0, own / np.maximum(alpha, 1 / 255), 0)
+    return to_8_bits(np.concatenate([straight, alpha], axis=-1))
+
+
+def depth_range(depths, share=0.98):
+    """Returns (near, far), between which that share of the finite, positive depths of an iterable lies."""
+    samples = np.concatenate([np.ravel(depth)[::17] for depth in depths])  # enough to know the range by
+    samples = samples[np.isfinite(samples) & (samples > 0)]
+    return tuple(np.quantile(samples, [0.5 - share / 2, 0.5 + share / 2])) if samples.size else (1.0, 2.0)
+
+
+def depth_picture(depth, near, far):
+    """Returns uint8 [H, W]: white at near, black at far and beyond, even in 1 / depth as parallax is."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(depth > 0, 1 / depth, np.inf)
+    return to_8_bits((inverse - 1 / far) / max(1 / near - 1 / far, 1e-30))
 
 
 def write_sheet(path, pairs):

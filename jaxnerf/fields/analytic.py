@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core.cameras import norm
+from jaxnerf.core.numerics import norm
 from jaxnerf.core.structs import SceneFn
 
 GREY = (0.5, 0.5, 0.5)

@@ -12,7 +12,7 @@ import numpy as np
 
 from hard_cases.checks import Case, Check, absolute, count, not_finite, relative
 from jaxnerf import Camera, Rays, look_at, ndc_rays, pixel_grid, rays_from_pixels, undistort
-from jaxnerf.core.cameras import norm, normalize
+from jaxnerf.core.numerics import norm, normalize
 
 EPS = float(np.finfo(np.float32).eps)
 COUNT, FOCAL, HEIGHT, WIDTH = 500, 400.0, 300, 400
