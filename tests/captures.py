@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from PIL import Image
 
-from jaxnerf.core import cameras, rendering
+from jaxnerf.core import cameras, paths, rendering
 from jaxnerf.core.structs import Camera, Rays
 from jaxnerf.data import synthetic
 from jaxnerf.fields import showcase
@@ -317,7 +317,7 @@ def surface_points(shots, *, count=200, seed=0, sharp=0.06):
     return Points(xyz[kept], rgb[kept], seen[:, kept], at[:, kept], depth[:, kept])
 
 
-_look_at = jax.jit(cameras.look_at)
+_look_at = jax.jit(paths.look_at)
 
 
 def _aim(eyes, targets, height, width, lens, changes):

@@ -57,13 +57,13 @@ def test_centered_cameras_stand_upright_at_distance_one(up):
     found = world.poses_of(after)
     np.testing.assert_allclose(gaze_center(found), 0, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(found[:, :, 3], axis=-1), 1, rtol=1e-4)
-    mean = found[:, :, 1].sum(0)
-    np.testing.assert_allclose(mean / np.linalg.norm(mean), [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(found[:, 2, 0], 0, atol=1e-5)  # all hold the horizon level
+    assert found[:, 2, 1].mean() > 0
 
 
 def test_a_world_that_is_upright_is_not_turned():
     _, back = world.center(capture_of(captures.orbit(12)))
-    assert np.abs(back[:3, :3] / np.cbrt(np.linalg.det(back[:3, :3])) - np.eye(3)).max() < 0.2
+    assert np.abs(back[:3, :3] / np.cbrt(np.linalg.det(back[:3, :3])) - np.eye(3)).max() < 1e-5
     box = (np.full(3, -2.0), np.full(3, 2.0))
     moved, back = world.center(capture_of(captures.orbit(12), box=box))
     corners = np.array(np.meshgrid(*zip(*box, strict=True))).reshape(3, -1).T

@@ -60,3 +60,18 @@ def gaze_center(to_world):
     eyes, axes = poses[:, :, 3], poses[:, :, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projections onto the planes across the axes
     return np.linalg.lstsq(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0], rcond=None)[0]
+
+
+def up_of(poses):
+    """Returns the unit vector [3] that is up for cameras [V, 3, 4].
+
+    Who walks around a scene holds the horizon level: up is across all the cameras' x axes. Where all look
+    one way, so that these span no plane, it is the mean of their y axes, which leans with their pitch.
+    """
+    mean = poses[:, :, 1].mean(axis=0)
+    length = np.linalg.norm(mean)
+    mean = mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    spread, axes = np.linalg.eigh(np.einsum("ni,nj->ij", poses[:, :, 0], poses[:, :, 0]) / len(poses))
+    across = axes[:, 0] if axes[:, 0] @ mean > 0 else -axes[:, 0]
+    # Of a sum of 1: an arc of 25 degrees either way has a second spread of 0.05.
+    return across if spread[1] > 0.05 and spread[0] < 0.25 * spread[1] else mean

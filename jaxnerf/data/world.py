@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxnerf.data.poses import gaze_center
+from jaxnerf.data.poses import gaze_center, up_of
 
 _FORWARD = (
     0.85  # cosine of the widest angle between an axis and their mean: LLFF's grids stay within 20 degrees
@@ -40,8 +40,8 @@ def recenter(capture, *, bound_share=0.75):
 def center(capture):
     """Returns the capture with what its cameras look at in the middle, and [4, 4] back to the file.
 
-    The point nearest to all axes becomes the origin, the cameras' mean up becomes z, and their median
-    distance becomes 1. A world that is upright already is not turned.
+    The point nearest to all axes becomes the origin, what is up becomes z, and the cameras' median distance
+    becomes 1. A world that is upright already is not turned.
     """
     poses = poses_of(capture)
     middle = gaze_center(poses)
@@ -51,15 +51,12 @@ def center(capture):
             f"{capture.source}: all {len(poses)} cameras stand where they look at ({middle.round(3).tolist()}"
             "), wanted different places; correct the poses"
         )
-    return _moved(capture, 1 / distance, _turn_upright(poses[:, :, 1].sum(0)), middle)
+    return _moved(capture, 1 / distance, _turn_upright(up_of(poses)), middle)
 
 
 def _turn_upright(up):
     """Returns the rotation [3, 3] by the smallest angle that takes a direction to z."""
     z = np.array([0.0, 0.0, 1.0])
-    if np.linalg.norm(up) < 1e-9:
-        return np.eye(3)
-    up = _unit(up)
     if up[2] < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
     # Rodrigues' formula with the axis up x z, whose length is the sine of the angle.

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxnerf.core import paths
-from jaxnerf.data.poses import gaze_center
+from jaxnerf.data.poses import gaze_center, up_of
 
 _interpolate = jax.jit(paths.interpolate, static_argnames=("num_frames", "closed"))
 
@@ -59,21 +59,6 @@ def through_views(views, num_frames, closed):
     times = np.asarray(paths.path_times(num_frames, count, closed=closed))
     focal = [np.interp(times, np.arange(count), side, period=count if closed else None) for side in focal.T]
     return np.asarray(poses), np.stack(focal, axis=-1)
-
-
-def up_of(poses):
-    """Returns the unit vector [3] that is up for cameras [V, 3, 4].
-
-    Who walks around a scene holds the horizon level: up is across all the cameras' x axes. Where all look
-    one way, so that these span no plane, it is the mean of their y axes, which leans with their pitch.
-    """
-    mean = poses[:, :, 1].mean(axis=0)
-    length = np.linalg.norm(mean)
-    mean = mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
-    spread, axes = np.linalg.eigh(np.einsum("ni,nj->ij", poses[:, :, 0], poses[:, :, 0]) / len(poses))
-    across = axes[:, 0] if axes[:, 0] @ mean > 0 else -axes[:, 0]
-    # Of a sum of 1: an arc of 25 degrees either way has a second spread of 0.05.
-    return across if spread[1] > 0.05 and spread[0] < 0.25 * spread[1] else mean
 
 
 KINDS = {"turntable": (turntable, 48), "spiral": (spiral, 120), "ellipse": (ellipse, 120)}  # and their N
