@@ -5,8 +5,11 @@ import dataclasses
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from PIL import Image
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageOps
 
+from captures import write_image
 from jaxnerf import Camera
 from jaxnerf.data import photos
 from jaxnerf.data.capture import Capture, Frame
@@ -171,8 +174,6 @@ def test_alpha_of_some_makes_the_rest_opaque(tmp_path):
 
 @pytest.mark.parametrize("turn", range(1, 9))
 def test_exif_orientation_is_followed_unless_the_camera_says_otherwise(tmp_path, turn):
-    from PIL import ImageOps
-
     stored, exif = pixels(0, 4, 7), Image.Exif()
     exif[0x0112] = turn
     path = tmp_path / "turned.png"
@@ -203,3 +204,24 @@ def test_lenses_of_one_scene():
     with pytest.raises(ValueError, match="mix lenses.*fisheye"):
         photos.stack_cameras([a_camera(), fisheye], "ab")
     assert dataclasses.replace(stack).height == HEIGHT
+
+
+@settings(deadline=None, max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), kind=st.sampled_from(["png", "jpg", "webp", "png16"]))
+def test_a_damaged_image_is_an_image_or_one_line(tmp_path, data, kind):
+    path = tmp_path / f"view.{kind[:4].removesuffix('16')}"
+    write_image(path, pixels(0, 20, 30, dtype=np.uint16 if kind == "png16" else np.uint8))
+    content = bytearray(path.read_bytes())
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content) - 1))]
+    else:
+        for _ in range(data.draw(st.integers(1, 6))):
+            content[data.draw(st.integers(0, min(len(content), 400) - 1))] ^= 1 << data.draw(
+                st.integers(0, 7)
+            )
+    path.write_bytes(content)
+    for read in (read_image, image_size, read_mask):
+        try:
+            assert np.size(read(path)) <= 2**28
+        except ValueError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
