@@ -37,9 +37,9 @@ SURFACE = {
     "render_hierarchical": "key coarse fine rays | num_coarse num_fine rule='segments' in_disparity=False "
     "importance_floor=0.0 background=None",
     "render_image": "render rays | chunk",
-    "create_grid": "lower upper possible | assumed",
+    "create_grid": "lower upper possible | assumed contracted=False",
     "update_grid": "key grid scene cells | threshold decay=0.6 smoothing=0.2 spread=True chunk=8192",
-    "grid_of_scene": "key scene lower upper shape | threshold looks=4 chunk=8192",
+    "grid_of_scene": "key scene lower upper shape | threshold contracted=False looks=4 chunk=8192",
     "restrict_scene": "scene grid |",
     "render_packed": "scene grid rays samples | capacity stop=0.0 background=None",
     "psnr": "a b | mask=None",

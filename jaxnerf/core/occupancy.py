@@ -100,7 +100,7 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
     return dataclasses.replace(grid, peak=peak, mean=jnp.where(occupied, mean, -1), occupied=occupied)
 
 
-def grid_of_scene(key, scene, lower, upper, shape, *, threshold, looks=4, chunk=8192):
+def grid_of_scene(key, scene, lower, upper, shape, *, threshold, contracted=False, looks=4, chunk=8192):
     """Returns the Grid of a scene that was trained without one (a grid of arXiv:2201.05989).
 
     Args:
@@ -109,13 +109,14 @@ def grid_of_scene(key, scene, lower, upper, shape, *, threshold, looks=4, chunk=
         lower, upper: [3] world units, the box; outside of it nothing will be asked.
         shape: cells along x, y and z.
         threshold, chunk: see update_grid.
+        contracted: see create_grid.
         looks: random points in each cell. A cell is occupied where one of them, or of a neighbour's, is
             above the threshold, so that matter much thinner than a cell may be missed.
 
     Returns:
         Grid.
     """
-    grid = create_grid(lower, upper, jnp.ones(shape, bool), assumed=0.0)
+    grid = create_grid(lower, upper, jnp.ones(shape, bool), assumed=0.0, contracted=contracted)
     cells = jnp.arange(grid.possible.size)
 
     def look(index, grid):

@@ -31,7 +31,8 @@ def visible_grid(scene, space, rays, *, samples_at_once, background):
         background: see render_samples.
     """
     bounds = (jnp.asarray(bound, jnp.float32) for bound in (space.lower, space.upper))
-    grid = occupancy.grid_of_scene(jax.random.key(0), scene, *bounds, space.shape, threshold=space.threshold)
+    options = {"threshold": space.threshold, "contracted": space.contracted}
+    grid = occupancy.grid_of_scene(jax.random.key(0), scene, *bounds, space.shape, **options)
 
     def look(marked, rays):
         samples = samples_in_box(None, grid, rays, step=space.step, cell=space.cell)
@@ -45,9 +46,9 @@ def visible_grid(scene, space, rays, *, samples_at_once, background):
 
 
 def crop_grid(grid):
-    """Returns the Grid of the smallest box of whole cells that holds the occupied ones."""
+    """Returns the Grid of the smallest box of cells that holds the occupied ones; all if it is contracted."""
     occupied = np.asarray(grid.occupied)
-    if not occupied.any():
+    if grid.contracted or not occupied.any():
         return grid
     places = np.argwhere(occupied)
     first, end = places.min(axis=0), places.max(axis=0) + 1

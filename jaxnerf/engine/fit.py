@@ -109,6 +109,9 @@ def skipping(config):
     if not config.get("space"):
         raise ValueError("eval.skip_empty: the configuration has no space section; give one with --config")
     config.space.update({"skip_empty": True, "masks": False})
+    if config.data.get("world") == "around":  # there may be surroundings
+        with config.space.unlocked():
+            config.space.outside = ""
     return config
 
 

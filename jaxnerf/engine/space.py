@@ -25,7 +25,7 @@ class Space(NamedTuple):
     upper: tuple[float, float, float]
     shape: tuple[int, int, int]  # cells
     step: float  # world units between samples
-    threshold: float  # 1 / world unit, the density below which a plain cell is empty
+    threshold: float | np.ndarray  # 1 / world unit, the density below which a cell is empty; or of each
     create: Callable[..., occupancy.Grid]  # possible [X, Y, Z] bool -> Grid
     update: Callable[..., occupancy.Grid]  # (step, params, Grid, cells [L] int32) -> Grid
     contracted: bool = False  # see Grid
@@ -112,7 +112,7 @@ def make_space(
 
         return jax.lax.cond(step % interval == interval - 1, looked, lambda: grid)
 
-    return Space(tuple(lower), tuple(upper), shape, step, density, create, update, contracted)
+    return Space(tuple(lower), tuple(upper), shape, step, empty_below, create, update, contracted)
 
 
 def contracted_field(field, lower, upper):
