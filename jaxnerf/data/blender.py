@@ -9,7 +9,15 @@ import numpy as np
 
 from jaxnerf.core.structs import Camera, Views
 from jaxnerf.data.capture import Capture, Frame
-from jaxnerf.data.checks import check_background, check_factor, check_range, is_number, read_json, required
+from jaxnerf.data.checks import (
+    check_background,
+    check_factor,
+    check_range,
+    inside,
+    is_number,
+    read_json,
+    required,
+)
 from jaxnerf.data.images import average_blocks, image_size, read_image
 from jaxnerf.data.poses import check_pose
 
@@ -128,11 +136,7 @@ def _image_path(source, frame, where):
     name = required(frame, "file_path", where)
     if not isinstance(name, str) or not name:
         raise ValueError(f"{where}: file_path is {name!r}, wanted a path as ./train/r_0; export again")
-    # Judged by its text and not resolved: a link inside the folder is the owner's choice, ".." the file's.
-    inside = os.path.normpath(name)
-    if os.path.isabs(inside) or inside.split(os.sep)[0] == "..":
-        raise ValueError(f"{where}: file_path {name!r} leaves the folder, wanted one inside; move the image")
-    path = source.parent / inside
+    path = inside(source.parent, name, f"{where}: file_path")
     tried = [path, path.with_name(path.name + ".png")]
     found = [candidate for candidate in tried if candidate.is_file()]
     if not found:

@@ -2,8 +2,11 @@
 
 import json
 import operator
+import os
 
 import numpy as np
+
+LARGEST = 3.4e38  # that float32 can hold
 
 
 def check_factor(factor):
@@ -40,7 +43,16 @@ def check_background(background):
 def is_number(value):
     """Returns whether value is a real number that float32 can hold; NaN, infinity and booleans are none."""
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return real and bool(abs(value) <= 3.4e38)
+    return real and bool(abs(value) <= LARGEST)
+
+
+def inside(folder, name, where):
+    """Returns the path of the file that a capture names, below a folder; ValueError if it leads out of it."""
+    # Judged by its text and not resolved: a link inside the folder is the owner's choice, ".." the file's.
+    path = os.path.normpath(name)
+    if os.path.isabs(path) or path.split(os.sep)[0] == "..":
+        raise ValueError(f"{where} {name[:80]!r} leaves the folder, wanted one inside; move the image")
+    return folder / path
 
 
 def read_json(path):
