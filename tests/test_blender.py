@@ -2,30 +2,16 @@
 
 import json
 import math
-import struct
-import zlib
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from captures import write_png16
 from jaxnerf.data.blender import load_views
 from jaxnerf.data.images import average_blocks, read_image, to_straight
 
 _POSE = [[1.0, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
-
-
-def _write_png16(path, pixels):
-    """Writes [H, W, 3 or 4] uint16, which Pillow cannot."""
-
-    def chunk(kind, body):
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    height, width, channels = pixels.shape
-    header = struct.pack(">IIBBBBB", width, height, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
-    parts = [chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
 
 
 def _pixels(seed, shape=(12, 8, 4), dtype=np.uint8):
@@ -116,7 +102,7 @@ def test_rgb_is_taken_only_without_a_background(scene, tmp_path):
 @pytest.mark.parametrize("channels", [3, 4])
 def test_sixteen_bits_survive(tmp_path, channels):
     pixels = _pixels(3, (5, 7, channels), np.uint16)
-    _write_png16(tmp_path / "deep.png", pixels)
+    write_png16(tmp_path / "deep.png", pixels)
     np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), pixels)
 
 
@@ -164,6 +150,8 @@ def _pose(row, column, value):
         (_frame("file_path", "./train/r_9"), r"frame 1: .*r_9\.png does not exist"),
         (_frame("file_path", "train/../../r_1"), "frame 1: file_path .* leaves the folder"),
         (_frame("file_path", "/etc/passwd"), "frame 1: file_path .* leaves the folder"),
+        (_frame("file_path", "."), "frame 1: file_path '.' leaves the folder"),  # would read ../<folder>.png
+        (_frame("file_path", "train/a\nb"), "frame 1: file_path is"),
         (_frame("transform_matrix", _POSE[:3]), r"frame 1: .*shape \(3, 4\)"),
         (_frame("transform_matrix", [[1, 2], [3]]), "frame 1: .*unequal length"),
         (_frame("transform_matrix", [["a"] * 4] * 4), "frame 1: .*not numbers"),
@@ -214,7 +202,7 @@ def test_bad_files_are_named(scene, tmp_path):
     Image.fromarray(_pixels(1, (12, 12, 4))).save(second)
     with pytest.raises(ValueError, match=r"r_1\.png: is 12 x 12 uint8.*wanted 8 x 12 uint8 as r_0\.png"):
         load_views(tmp_path)
-    _write_png16(second, _pixels(1, dtype=np.uint16))
+    write_png16(second, _pixels(1, dtype=np.uint16))
     with pytest.raises(ValueError, match=r"r_1\.png: is 8 x 12 uint16"):
         load_views(tmp_path)
     for text in ("{", "[1]", "\xff"):

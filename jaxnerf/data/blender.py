@@ -12,8 +12,8 @@ from jaxnerf.data.capture import Capture, Frame
 from jaxnerf.data.checks import (
     check_background,
     check_factor,
+    check_inside,
     check_range,
-    inside,
     is_number,
     read_json,
     required,
@@ -133,10 +133,8 @@ def _declared_size(scene, source):
 
 
 def _image_path(source, frame, where):
-    name = required(frame, "file_path", where)
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{where}: file_path is {name!r}, wanted a path as ./train/r_0; export again")
-    path = inside(source.parent, name, f"{where}: file_path")
+    inside = check_inside(required(frame, "file_path", where), key="file_path", source=where)
+    path = source.parent / inside
     tried = [path, path.with_name(path.name + ".png")]
     found = [candidate for candidate in tried if candidate.is_file()]
     if not found:

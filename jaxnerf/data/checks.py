@@ -3,6 +3,7 @@
 import json
 import operator
 import os
+import unicodedata
 
 import numpy as np
 
@@ -71,6 +72,40 @@ def read_json(path):
 def required(entries, key, source):
     """Returns entries[key]; ValueError that lists the keys that are there if it is missing."""
     if key not in entries:
-        there = ", ".join(sorted(entries)) or "none"
+        # A key may hold anything, a line break too: its repr is one line.
+        there = ", ".join(repr(key)[1:-1] for key in sorted(entries))[:200] or "none"
         raise ValueError(f"{source}: has no {key}, only {there}; wanted {key} as in the Blender format")
     return entries[key]
+
+
+def check_inside(name, *, key, source):
+    """Returns a path that a file states, normalised and relative to that file's folder, which it stays in.
+
+    Judged by its text and not resolved: a link inside the folder is the owner's choice, ".." the file's.
+
+    Args:
+        name: what the file has for the key; / or \\ between folders.
+        key, source: where it stands, for the message.
+
+    Returns:
+        str with / between folders, such as "images/0001.jpg".
+
+    Raises:
+        ValueError: if it is no path, or leads out of the folder.
+    """
+    # Messages and notes show the name: one with line breaks or other control characters is no file's.
+    odd = ("Cc", "Cs", "Zl", "Zp")
+    if not isinstance(name, str) or not name or any(unicodedata.category(letter) in odd for letter in name):
+        raise ValueError(f"{source}: {key} is {shown(name)}, wanted a path as ./train/r_0; export again")
+    inside = os.path.normpath(name.replace("\\", "/"))
+    if os.path.isabs(inside) or inside.split("/")[0] in (".", ".."):
+        raise ValueError(
+            f"{source}: {key} {shown(name)} leaves the folder, wanted one inside; move the image"
+        )
+    return inside
+
+
+def shown(value):
+    """Returns a value of a file as a message shows it: one line, and not all of a long one."""
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

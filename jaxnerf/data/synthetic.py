@@ -75,7 +75,7 @@ def render_views(stack, *, num_segments=384, chunk=1024):
             that length take half as many, which saves a quarter of the work and keeps the segments short.
         chunk: rays at once. No pixel depends on it.
     """
-    rays = _rays(stack)
+    rays = scene_rays(stack)
     way = rays.far - rays.near  # negative: the ray misses
     seen = np.zeros((way.size, 4))
     longest = max(way.max(), 0.0)
@@ -88,6 +88,45 @@ def render_views(stack, *, num_segments=384, chunk=1024):
         if parts:
             seen[indices] = np.concatenate(parts)[: indices.size]
     return images.to_straight(seen[:, :3], seen[:, 3], background=_WHITE)
+
+
+def scene_rays(stack):
+    """Returns the rays through all pixels of a stack of cameras, cut to the part that can hold matter.
+
+    Args:
+        stack: Camera [V], of one height and width.
+
+    Returns:
+        Rays [V * H * W], arrays of numpy, from entering to leaving a cylinder around the scene; near >= far
+        where they miss it, and where a lens has no ray for the pixel.
+    """
+    rays = _all_rays(stack)
+    origins, directions, viewdirs = (
+        np.asarray(leaf).reshape(-1, 3) for leaf in (rays.origins, rays.directions, rays.viewdirs)
+    )
+    # The round side is a quadratic in t.
+    start, slope = origins[:, :2], directions[:, :2]
+    square = np.maximum((slope**2).sum(axis=-1), 1e-12)  # a ray along the axis never meets the side
+    middle = -(start * slope).sum(axis=-1) / square
+    closest = ((start + middle[:, None] * slope) ** 2).sum(axis=-1)
+    half = np.sqrt(np.maximum(_CYLINDER["radius"] ** 2 - closest, 0) / square)
+    with np.errstate(divide="ignore"):  # a level ray meets the ends at infinity
+        ends = np.sort((np.float32([_CYLINDER["ends"]]) - origins[:, 2:]) / directions[:, 2:], axis=-1)
+    near = np.maximum(middle - half, ends[:, 0])
+    through = np.asarray(rays.far).reshape(-1) > 0
+    return Rays(
+        origins=origins,
+        directions=directions,
+        viewdirs=viewdirs,
+        near=near,
+        far=np.where(through, np.minimum(middle + half, ends[:, 1]), near),
+    )
+
+
+@jax.jit  # step by step, each of a lens's operations would be compiled by itself
+def _all_rays(stack):
+    grid = cameras.pixel_grid(stack.height, stack.width).reshape(-1, 2)
+    return jax.vmap(lambda camera: cameras.rays_from_pixels(camera, grid, near=0.0, far=1.0))(stack)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -112,30 +151,6 @@ def _cameras(split, size):
         center=np.full((count, 2), size / 2, np.float32),
         height=size,
         width=size,
-    )
-
-
-def _rays(stack):
-    """Returns Rays [V * H * W] from entering to leaving the cylinder; near >= far where they miss it."""
-    grid = cameras.pixel_grid(stack.height, stack.width).reshape(-1, 2)
-    rays = jax.vmap(lambda camera: cameras.rays_from_pixels(camera, grid, near=0.0, far=0.0))(stack)
-    origins, directions, viewdirs = (
-        np.asarray(leaf).reshape(-1, 3) for leaf in (rays.origins, rays.directions, rays.viewdirs)
-    )
-    # The round side is a quadratic in t.
-    start, slope = origins[:, :2], directions[:, :2]
-    square = np.maximum((slope**2).sum(axis=-1), 1e-12)  # a ray along the axis never meets the side
-    middle = -(start * slope).sum(axis=-1) / square
-    closest = ((start + middle[:, None] * slope) ** 2).sum(axis=-1)
-    half = np.sqrt(np.maximum(_CYLINDER["radius"] ** 2 - closest, 0) / square)
-    with np.errstate(divide="ignore"):  # a level ray meets the ends at infinity
-        ends = np.sort((np.float32([_CYLINDER["ends"]]) - origins[:, 2:]) / directions[:, 2:], axis=-1)
-    return Rays(
-        origins=origins,
-        directions=directions,
-        viewdirs=viewdirs,
-        near=np.maximum(middle - half, ends[:, 0]),
-        far=np.minimum(middle + half, ends[:, 1]),
     )
 
 
