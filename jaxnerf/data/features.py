@@ -34,13 +34,13 @@ def shrink(pixels):
     height, width = pixels.shape[:2]
     factor = max(1, -(-max(height, width) // _LONGEST))
     height, width = max(height // factor, 1), max(width // factor, 1)
-    largest = np.iinfo(pixels.dtype).max
-    blocks = pixels[: height * factor, : width * factor].astype(np.float32) / largest
-    grey = blocks[..., :3] @ np.float32([0.299, 0.587, 0.114])
+    blocks = pixels[: height * factor, : width * factor]
+    weights = np.float32([0.299, 0.587, 0.114]) / np.iinfo(pixels.dtype).max
+    grey = sum(blocks[..., k] * weights[k] for k in range(3))
     if pixels.shape[-1] == 4:
-        grey = 1 + blocks[..., 3] * (grey - 1)
-    rows = grey.reshape(height, -1, grey.shape[1]).mean(axis=1)
-    return rows.reshape(height, width, -1).mean(axis=2), factor
+        grey = 1 + blocks[..., 3] * np.float32(1 / np.iinfo(pixels.dtype).max) * (grey - 1)
+    rows = np.add.reduceat(grey, np.arange(0, len(grey), factor), axis=0) / factor
+    return rows.reshape(height, width, factor).mean(axis=2), factor
 
 
 def find(grey, factor):
@@ -72,15 +72,16 @@ def blur(image, sigma):
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     weights = (weights / weights.sum()).astype(np.float32)
     for axis in (-2, -1):
-        size = image.shape[axis]
-        padding = [(0, 0)] * image.ndim
+        size, padding = image.shape[axis], [(0, 0)] * image.ndim
         padding[axis] = (reach, reach)
-        padded = np.moveaxis(np.pad(image, padding, mode="edge"), axis, 0)
-        summed = weights[reach] * padded[reach : reach + size]
-        for shift in range(1, reach + 1):
-            pair = padded[reach - shift : reach - shift + size] + padded[reach + shift : reach + shift + size]
-            summed += weights[reach + shift] * pair
-        image = np.moveaxis(summed, 0, axis)
+        padded = np.pad(image, padding, mode="edge")
+        shifted = [
+            padded[(..., slice(k, k + size)) if axis == -1 else (..., slice(k, k + size), slice(None))]
+            for k in range(2 * reach + 1)
+        ]
+        image = weights[reach] * shifted[reach]
+        for k in range(reach):
+            image += weights[k] * (shifted[k] + shifted[-1 - k])
     return image
 
 
@@ -113,17 +114,21 @@ def _peak(before, here, after):
 
 def _describe(along_x, along_y, places):
     """Returns [N, 128]: how much brightness changes in each direction, at 4 x 4 places around each corner."""
-    strength = np.hypot(along_x, along_y)
-    turn = np.arctan2(along_y, along_x) * (_TURNS / (2 * np.pi))
-    maps = np.empty((_TURNS, *strength.shape), np.float32)
-    for index in range(_TURNS):
-        off = np.abs((turn - index + _TURNS / 2) % _TURNS - _TURNS / 2)
-        maps[index] = strength * np.maximum(1 - off, 0)
-    maps = blur(maps, _SPACING / 2)
+    height, width = (size // 2 for size in along_x.shape)
+    angles = np.float32(2 * np.pi / _TURNS * np.arange(_TURNS))
+    maps = np.empty((_TURNS, height, width), np.float32)
+    least = 1 / np.sqrt(np.maximum(along_x**2 + along_y**2, 1e-12))
+    for index, angle in enumerate(angles):
+        slope = np.maximum(np.cos(angle) * along_x + np.sin(angle) * along_y, 0)  # as DAISY (Tola 2010),
+        narrow = np.square(slope * least)
+        slope *= np.square(narrow)  # but narrower: times a power of the cosine between the two
+        slope = slope[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+        maps[index] = slope[:, 0, :, 0] + slope[:, 0, :, 1] + slope[:, 1, :, 0] + slope[:, 1, :, 1]
+    maps = blur(maps, _SPACING / 4)  # of half as many px
     offsets = _SPACING * (np.arange(_GRID) - (_GRID - 1) / 2)
     grid = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
-    x, y = np.rint(places[:, None] + grid).astype(int).transpose(2, 0, 1)
-    x, y = np.clip(x, 0, strength.shape[1] - 1), np.clip(y, 0, strength.shape[0] - 1)
+    x, y = np.rint((places[:, None] + grid) / 2 - 0.25).astype(int).transpose(2, 0, 1)
+    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
     values = maps[:, y, x].transpose(1, 2, 0).reshape(len(places), -1)
     values = np.minimum(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9), _CLIP)
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)

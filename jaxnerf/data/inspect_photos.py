@@ -13,7 +13,7 @@ from jaxnerf.data.photos import check_size
 from jaxnerf.data.world import poses_of
 
 _THUMB = 24  # px, side of what stands for a photograph when looking for others like it
-_SAME = 0.004  # mean difference of such, in [0, 1], below which two are one
+_SAME = 0.0015  # mean difference of such, in [0, 1], below which two are one
 _BLURRED = 0.25  # of the sharpness of the views beside
 
 
