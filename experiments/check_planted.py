@@ -6,6 +6,7 @@ A photograph that is the same file in several copies is read once, so only the f
 the clean one, tells how long a check takes.
 """
 
+import os
 import sys
 import tempfile
 import time
@@ -19,7 +20,7 @@ SCENES = {"lego": "lego", "fern": "fern", "fox": "fox", "can": "can", "can as LL
 
 
 def defects(scene):
-    """Returns name -> (kind of the finding that is wanted, what plants it in a folder, flags of the check)."""
+    """Returns name -> (kind of finding that is wanted, what plants it in a folder, flags of the check)."""
     edit = planting.edit_poses
     chosen = {
         "clean": (None, lambda folder: None, {}),
@@ -41,11 +42,33 @@ def defects(scene):
     if scene in ("fern", "can as LLFF"):
         chosen["bounds in cm"] = ("bounds", lambda folder: planting.scale_bounds(folder, 100), {})
     if scene == "fox":
-        chosen["frame without mask"] = ("mask", lambda folder: planting.add_masks(folder, without=["0007"]), {})
-        chosen["mask file missing"] = ("mask", lambda folder: planting.add_masks(folder, unwritten=["0007"]), {})
+        chosen["frame without mask"] = (
+            "mask",
+            lambda folder: planting.add_masks(folder, without=["0007"]),
+            {},
+        )
+        chosen["mask file missing"] = (
+            "mask",
+            lambda folder: planting.add_masks(folder, unwritten=["0007"]),
+            {},
+        )
     else:
         chosen["image without alpha"] = ("alpha", lambda folder: planting.remove_alpha(folder, 3), {})
     return chosen
+
+
+def read_once():
+    """Returns inspect_photos._read such that what was seen in a photograph stands for every link to it."""
+    kept, read = {}, inspect_photos._read
+
+    def remembered(frame):
+        stat = frame.image.resolve().stat()
+        key = frame.image.resolve(), stat.st_mtime_ns, frame.mask, frame.camera.height, frame.camera.width
+        if key not in kept:
+            kept[key] = read(frame)
+        return kept[key]
+
+    return remembered
 
 
 def check(folder, wanted, flags):
@@ -68,13 +91,13 @@ def check(folder, wanted, flags):
 
 
 def main(names):
-    _read_once()
+    inspect_photos._read = read_once()
     for scene in names or SCENES:
         print(f"{scene}")
         for name, (wanted, plant, flags) in defects(scene).items():
             with tempfile.TemporaryDirectory() as temporary:
                 without = {"can as LLFF": ("sparse",), "can": ("poses_bounds.npy",)}.get(scene, ())
-                source = inspection_folder(SCENES[scene])
+                source = _scene_folder(SCENES[scene])
                 folder = planting.copy(source, Path(temporary) / SCENES[scene], without=without)
                 plant(folder)
                 start, cpu = time.perf_counter(), time.process_time()
@@ -85,10 +108,8 @@ def main(names):
                     print(f"      {line.replace(temporary, '')[:260]}", flush=True)
 
 
-def inspection_folder(name):
+def _scene_folder(name):
     """Returns the folder of a real scene."""
-    import os
-
     return Path(os.environ["JAXNERF_SCENES"]) / name
 
 
@@ -100,20 +121,6 @@ def _mirror(folder):
 def _swap(folder, first, second):
     files = planting.images(folder)
     planting.swap(files[first], files[second])
-
-
-def _read_once():
-    """Lets what was seen in a photograph stand for every link to it."""
-    kept, read = {}, inspect_photos._read
-
-    def remembered(frame):
-        stat = frame.image.resolve().stat()
-        key = frame.image.resolve(), stat.st_mtime_ns, frame.mask, frame.camera.height, frame.camera.width
-        if key not in kept:
-            kept[key] = read(frame)
-        return kept[key]
-
-    inspect_photos._read = remembered
 
 
 if __name__ == "__main__":

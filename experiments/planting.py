@@ -4,7 +4,6 @@ Photographs are links to the originals but for those that are changed.
 """
 
 import json
-import os
 import shutil
 import struct
 from pathlib import Path
@@ -95,8 +94,16 @@ def scale_focal(folder, factor):
         rows[:, 14] *= factor
         np.save(path, rows)
     if (path := Path(folder) / "sparse" / "0" / "cameras.bin").is_file():
-        data = bytearray(path.read_bytes())  # of one camera with one focal length, as `can` has
-        struct.pack_into("<d", data, 32, factor * struct.unpack_from("<d", data, 32)[0])
+        data, at = bytearray(path.read_bytes()), 8
+        for _ in range(struct.unpack_from("<Q", data)[0]):  # SIMPLE_RADIAL, as `can` has
+            kind, focal = (
+                struct.unpack_from("<i", data, at + 4)[0],
+                struct.unpack_from("<d", data, at + 24)[0],
+            )
+            if kind != 2:
+                raise ValueError(f"{path}: a camera is of kind {kind}, wanted 2 (SIMPLE_RADIAL)")
+            struct.pack_into("<d", data, at + 24, factor * focal)
+            at += 24 + 4 * 8
         path.write_bytes(data)
 
 
@@ -136,11 +143,11 @@ def remove_alpha(folder, index):
         image.load()
         if place == index:
             path.unlink()
-            image.convert("RGB").save(path.with_suffix(".png"))
+            image.convert("RGB").save(path, format="PNG")
         elif image.mode != "RGBA":
             path.unlink()
             half = image.resize([side // 2 for side in image.size]).convert("RGBA")
-            half.save(path.with_suffix(".png"), compress_level=1)
+            half.save(path, format="PNG", compress_level=1)  # by whatever name, as a COLMAP model knows it
 
 
 def add_masks(folder, *, without=(), unwritten=()):
@@ -150,10 +157,9 @@ def add_masks(folder, *, without=(), unwritten=()):
     (Path(folder) / "masks").mkdir()
     for frame in content["frames"]:
         path, name = Path(folder) / frame["file_path"], Path(frame["file_path"]).stem
-        if not path.is_file() or name in without:
-            continue
-        frame["mask_path"] = f"masks/{name}.png"
-        if name not in unwritten:
+        if name not in without:
+            frame["mask_path"] = f"masks/{name}.png"
+        if path.is_file() and name not in (*without, *unwritten):
             Image.new("L", Image.open(path).size, 255).save(Path(folder) / frame["mask_path"])
     source.write_text(json.dumps(content))
 
@@ -180,7 +186,6 @@ def _edit_colmap(path, change):
         turn = (pose[:, :3] @ _SWAP_YZ).T
         struct.pack_into("<7d", data, place + 4, *_quaternion(turn), *(-turn @ pose[:, 3]))
     path.write_bytes(data)
-    os.utime(path)
 
 
 def _rotation(w, v):

@@ -11,7 +11,9 @@ from absl import flags
 from jaxnerf import app
 
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder.")
-_FORMAT = flags.DEFINE_string("format", "auto", "blender, transforms, colmap or llff; auto: as training would.")
+_FORMAT = flags.DEFINE_string(
+    "format", "auto", "blender, transforms, colmap or llff; auto: as training would."
+)
 _NEAR = flags.DEFINE_float("near", None, "Where training's rays begin, in t; its default when not given.")
 _FAR = flags.DEFINE_float("far", None, "Where they end.")
 _OUT = flags.DEFINE_string("out", None, "PNG of cameras and points; check-<folder>.png here when not given.")

@@ -51,7 +51,7 @@ def _axes(poses):
 
 
 def _frustum(camera, pose):
-    """Returns the eye and the image's four corners at distance 1 along the axis, and its upper middle, [6, 3]."""
+    """Returns the eye, the image's four corners at distance 1 along the axis, and its top, [6, 3]."""
     width, height = camera.width or 2 * camera.center[0], camera.height or 2 * camera.center[1]
     pixels = np.array([[0, 0], [width, 0], [width, height], [0, height], [width / 2, -height / 5]])
     x, y = ((pixels - camera.center) / camera.focal).T
@@ -102,7 +102,7 @@ def _draw_scale(draw, place, view, panel, text):
     left, bottom = panel * _SIZE + 16, _SIZE - 16
     end = left + unit * place.scale
     draw.line([(left, bottom), (end, bottom)], fill=_INK, width=2)
-    draw.text((left, bottom - 18), f"{unit:g} world units", fill=_INK, font=text)
+    draw.text((left, bottom - 18), f"length {unit:g}", fill=_INK, font=text)
     corner = panel * _SIZE + 16
     draw.line([(corner, 60), (corner + 30, 60)], fill=_INK)
     draw.line([(corner, 60), (corner, 30)], fill=_INK)

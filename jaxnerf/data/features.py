@@ -86,7 +86,7 @@ def blur(image, sigma):
 
 
 def _corners(along_x, along_y):
-    """Returns [N, 2] (x, y) px of shrunk pixels' centres, to a fraction, where brightness changes two ways."""
+    """Returns [N, 2] (x, y) px of shrunk pixels' centres where brightness changes both ways."""
     xx, yy, xy = blur(np.stack([along_x**2, along_y**2, along_x * along_y]), 1.5)
     response = 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy**2))  # the smaller eigenvalue (Shi, Tomasi)
     rim = int(_SPACING * _GRID / 2)
@@ -129,6 +129,6 @@ def _describe(along_x, along_y, places):
     grid = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
     x, y = np.rint((places[:, None] + grid) / 2 - 0.25).astype(int).transpose(2, 0, 1)
     x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
-    values = maps[:, y, x].transpose(1, 2, 0).reshape(len(places), -1)
+    values = maps[:, y, x].transpose(1, 2, 0).reshape(len(places), _TURNS * _GRID**2)
     values = np.minimum(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9), _CLIP)
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)

@@ -89,8 +89,19 @@ def focal_change(capture, factor):
     if capture.format == "llff":
         return f"poses_bounds.npy: row 3 of every column 5 to about {focal[0]:.5g}"
     if capture.format == "colmap":
-        return f"the cameras file: focal length to about {focal[0]:.5g}; or run COLMAP again"
+        return f"the cameras file: every focal length times {factor:.3g}, or run COLMAP again"
     return f"transforms.json: fl_x, fl_y (or camera_angle_x) to about {focal[0]:.5g}, {focal[1]:.5g}"
+
+
+def percent(share, digits=0):
+    """Returns a share as text."""
+    return f"{100 * share:.{digits}f} %"
+
+
+def named(capture, indices):
+    """Returns the names of the frames with these indices, of many only some."""
+    names = ", ".join(capture.frames[index].name for index in indices[:5])
+    return names + (f" and {len(indices) - 5} more" if len(indices) > 5 else "")
 
 
 def _entries(turn):

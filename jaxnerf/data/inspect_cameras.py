@@ -2,13 +2,10 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from jaxnerf.core.cameras import project
 from jaxnerf.data import consistency, tracks
-from jaxnerf.data.bounds import depths
-from jaxnerf.data.findings import Finding, axes_change, axes_name, focal_change
+from jaxnerf.data.findings import Finding, axes_change, axes_name, focal_change, percent
 from jaxnerf.data.world import poses_of
 
 _ENOUGH = 60  # tracks, to judge anything
@@ -17,7 +14,6 @@ _OFF = 0.07  # of the focal length, from where it is reported: lens and noise re
 _SURE = 5.0  # standard errors
 _STRANGE = 0.35  # of the usual share of matches that fit: below, a photograph is not from its camera
 _PARALLAX = np.deg2rad(1.5)  # between rays, for a place to have a depth
-_OBSERVED = 0.01  # of the longer side: a model's points are off by a tenth of that
 
 
 class Evidence(NamedTuple):
@@ -60,8 +56,8 @@ def judge_axes(capture, evidence):
     if other.share > max(stated.share + _CLEARLY, 4 / 3 * stated.share):
         mended = evidence._replace(poses=consistency.as_meant(evidence.poses, other), share=other.share)
         found = (
-            f"{capture.source}: the poses are in {axes_name(other)}: {_percent(other.share)} of what the "
-            f"photographs share fits then, {_percent(stated.share)} as they are"
+            f"{capture.source}: the poses are in {axes_name(other)}: {percent(other.share)} of what the "
+            f"photographs share fits then, {percent(stated.share)} as they are"
         )
         wanted = "camera-to-world with x right, y up, looking along -z (as the format has it)"
         return [Finding("ruins", "axes", found, wanted, axes_change(capture.format, other))], mended
@@ -100,10 +96,12 @@ def judge_views(capture, evidence):
     share = fit / np.maximum(matches, 1)
     usual = np.median(share)
     if usual < 0.2 or len(evidence.tracks.shown) < _ENOUGH:
-        found = f"{capture.source}: only {_percent(usual)} of what neighbouring photographs share fits"
-        change = "the poses: they or the lens are wrong in a way that no turn of axes mends; compute them anew"
+        found = f"{capture.source}: only {percent(usual)} of what neighbouring photographs share fits"
+        change = (
+            "the poses: they or the lens are wrong in a way that no turn of axes mends; compute them anew"
+        )
         return [Finding("ruins", "pose", found, "at least 20 %", change)] if matches.sum() > _ENOUGH else []
-    strange = [view for view in views if share[view] < _STRANGE * usual]
+    strange = [view for view in views if share[view] < _STRANGE * usual and len(evidence.found[view].pixels)]
     findings, left = [], list(strange)
     for first in strange:
         for second in strange:
@@ -113,7 +111,7 @@ def judge_views(capture, evidence):
             if all(good >= 8 and good > 0.6 * usual * every for good, every in mended):
                 findings.append(_swapped(capture, first, second))
                 left = [view for view in left if view not in (first, second)]
-    return findings + [_stranger(capture, view, fit[view], matches[view]) for view in left]
+    return findings + [_stranger(capture, evidence, view, fit[view], matches[view]) for view in left]
 
 
 def places(evidence):
@@ -130,40 +128,6 @@ def places(evidence):
     return found[good], tracks.Tracks(*(part[good] for part in followed))
 
 
-def judge_points(capture):
-    """Returns Findings about how a model's own points lie before its cameras."""
-    if capture.points is None or all(frame.seen is None or not len(frame.seen) for frame in capture.frames):
-        return []
-    behind, off = np.array([_of_points(frame, capture.points) for frame in capture.frames]).T
-    findings = []
-    if np.nanmean(behind) > 0.02:
-        found = f"{capture.source}: {_percent(np.nanmean(behind))} of its points lie behind cameras that see them"
-        change = "the poses: export the model again, poses and points together"
-        findings.append(Finding("ruins", "points", found, "none", change))
-    bad = np.flatnonzero(off > _OBSERVED)
-    if len(bad) and np.isfinite(off).any():
-        named = ", ".join(capture.frames[index].name for index in bad[:5])
-        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-        found = f"{capture.source}: its points are {_percent(np.nanmedian(off[bad]), 1)} of the image off in {named}{more}"
-        change = "poses and lens: copy cameras, images and points of one model, or run COLMAP again"
-        wanted = f"less than {_percent(_OBSERVED)}"
-        findings.append(Finding("ruins", "points", found, wanted, change, tuple(bad.tolist())))
-    return findings
-
-
-def _of_points(frame, points):
-    """Returns the share of a frame's points behind it, and how far off they are, as a share of its size."""
-    if frame.seen is None or not len(frame.seen):
-        return np.nan, np.nan
-    seen = points[frame.seen]
-    behind = float((depths(frame.camera, seen) <= 0).mean())
-    padded = np.repeat(seen[:1], 1 << (len(seen) - 1).bit_length(), axis=0)  # few shapes to compile
-    padded[: len(seen)] = seen
-    at = np.asarray(jax.jit(project)(frame.camera, padded)[0])[: len(seen)]
-    off = np.linalg.norm(at - frame.seen_at, axis=1)
-    return behind, float(np.median(off)) / max(frame.camera.height or 1, frame.camera.width or 1)
-
-
 def _swapped(capture, first, second):
     one, two = capture.frames[first], capture.frames[second]
     found = f"{one.image} and {two.image} show what the other's camera sees"
@@ -171,13 +135,11 @@ def _swapped(capture, first, second):
     return Finding("ruins", "swap", found, wanted, "rename the two files to each other", (first, second))
 
 
-def _stranger(capture, view, fit, matches):
+def _stranger(capture, evidence, view, fit, matches):
     frame = capture.frames[view]
+    larger = evidence.scale[view] / np.median(evidence.scale[evidence.near[view]])
     found = f"{frame.image} does not show what its camera sees ({fit} of {matches} matches fit)"
     change = f"{frame.name} in {capture.source}: correct its pose or its file, or remove it"
-    few = matches < 20  # a photograph of something that no other shows, too dark, or blurred
-    return Finding("note" if few else "ruins", "pose", found, "matches that fit its pose", change, (view,))
-
-
-def _percent(share, digits=0):
-    return f"{100 * share:.{digits}f} %"
+    # Few: it shows what no other does, is too dark, or blurred. Larger or smaller: corners look different.
+    unsure = matches < 20 or not 2 / 3 < larger < 1.5
+    return Finding("note" if unsure else "ruins", "pose", found, "matches that fit its pose", change, (view,))

@@ -20,7 +20,9 @@ def ranges(capture, near, far):
         both = (_BLENDER[0] if near is None else near, _BLENDER[1] if far is None else far)
         return np.tile(both, (len(capture.frames), 1)), "config.data.near, config.data.far"
     if all(frame.bounds is not None for frame in capture.frames):
-        return np.array([frame.bounds for frame in capture.frames]), f"the last two columns of {capture.source}"
+        return np.array(
+            [frame.bounds for frame in capture.frames]
+        ), f"the last two columns of {capture.source}"
     return np.array([frame.bounds for frame in with_bounds(capture).frames]), None
 
 

@@ -5,7 +5,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxnerf.data import formats, inspect_cameras, inspect_depths, inspect_photos, photos, tracks
+from jaxnerf.data import (
+    compare_photos,
+    formats,
+    inspect_cameras,
+    inspect_depths,
+    inspect_photos,
+    inspect_points,
+    photos,
+    tracks,
+)
 from jaxnerf.data.capture import Capture
 from jaxnerf.data.findings import Finding
 from jaxnerf.data.poses import gaze_center
@@ -34,7 +43,9 @@ class Report(NamedTuple):
         lines = [f"{name:{width}}  {value}" for name, value in self.facts]
         lines += [finding.line() for finding in self.findings]
         count = sum(finding.severity == "ruins" for finding in self.findings)
-        verdict = f"{count} found that would ruin training" if count else "nothing found that would ruin training"
+        verdict = (
+            f"{count} found that would ruin training" if count else "nothing found that would ruin training"
+        )
         return "\n".join([*lines, verdict])
 
 
@@ -54,8 +65,8 @@ def inspect(folder, *, format="auto", near=None, far=None):
     capture = _part(whole)
     pictures, findings = inspect_photos.read(capture)
     near_views = tracks.neighbours(poses_of(capture))
-    findings += inspect_photos.compare(capture, pictures, near_views)
-    findings += inspect_cameras.judge_points(capture)
+    findings += compare_photos.compare(capture, pictures, near_views)
+    findings += inspect_points.judge_points(capture)
     evidence = inspect_cameras.gather(capture, pictures, near_views)
     turned, evidence = inspect_cameras.judge_axes(capture, evidence)
     focal, evidence = inspect_cameras.judge_focal(capture, evidence)
@@ -122,8 +133,8 @@ def _camera_facts(capture, evidence):
     return [
         (
             "lens",
-            f"focal length {focal[0]:.5g}, {focal[1]:.5g} px, so {view[0]:.1f} x {view[1]:.1f} degrees; centre "
-            f"{off[0]:+.1f}, {off[1]:+.1f} px off the middle; {lenses}",
+            f"focal length {focal[0]:.5g}, {focal[1]:.5g} px, so {view[0]:.1f} x {view[1]:.1f} degrees; "
+            f"centre {off[0]:+.1f}, {off[1]:+.1f} px off the middle; {lenses}",
         ),
         ("poses", f"{'right-handed' if right else 'mirrored'}; up is {up} within {angle:.0f} degrees"),
         ("looking", f"{looks}; {away.min():.4g} to {away.max():.4g} from {np.round(middle, 3).tolist()}"),

@@ -11,7 +11,6 @@ import numpy as np
 
 from jaxnerf.core.cameras import undistort
 from jaxnerf.data import features
-from jaxnerf.data.world import poses_of
 
 _NEIGHBOURS = 5  # views that each is compared with
 
