@@ -154,6 +154,12 @@ def test_one_wrong_pose_is_named(folders, tmp_path):
     assert kinds(report) == {"pose"} and report.findings[0].frames == (4,)
 
 
+def test_poses_in_another_order_are_found(folders, tmp_path):
+    order = np.random.default_rng(0).permutation(12)
+    report = planted(folders, tmp_path, "llff", lambda f: planting.edit_poses(f, lambda poses: poses[order]))
+    assert kinds(report) == {"pose"} and "sure matches" in report.text()
+
+
 def test_poses_that_left_their_points_behind_are_found(folders, tmp_path):
     def move(folder):
         path = folder / "sparse" / "0" / "cameras.txt"
@@ -278,11 +284,23 @@ def test_the_program_says_what_it_found_and_keeps_its_hands_off_the_capture(fold
 
 
 SCENES = {
-    "lego": ["clean", "world mirrored", "focal x 0.8", "far images swapped"],
+    "lego": ["clean", "world mirrored", "far images swapped"],
     "fern": ["clean", "y and z flipped", "focal x 1.2", "next images swapped", "bounds in cm"],
-    "fox": ["clean", "y and z flipped", "focal x 0.8", "frame without mask"],
+    "fox": ["clean", "focal x 0.8", "frame without mask"],
     "can": ["clean", "y and z flipped", "far images swapped", "truncated image"],
 }
+
+
+@pytest.mark.scenes("can")
+def test_photographs_too_far_apart_to_judge_by_ruin_nothing(scenes_dir, tmp_path):
+    folder = planting.copy(scenes_dir / "can", tmp_path / "can", without=("sparse",))
+    for index, path in enumerate(planting.images(folder)):
+        if index % 8:
+            path.unlink()
+    rows = np.load(folder / "poses_bounds.npy")
+    np.save(folder / "poses_bounds.npy", rows[::8])
+    report = inspection.inspect(folder)  # the can has one label on both sides, which look alike
+    assert not report.ruined, report.text()
 
 
 @pytest.mark.scenes("lego", "fern", "fox", "can")
@@ -294,5 +312,6 @@ def test_planted_in_real_scenes(scenes_dir, tmp_path, scene, monkeypatch):
         folder = planting.copy(scenes_dir / scene, tmp_path / name.replace(" ", "-") / scene)
         plant(folder)
         verdict, lines = check_planted.check(folder, wanted, flags)
+        # A model's points, which stay where they were, tell of wrong poses, too.
         good = ("nothing ruins",) if wanted is None else ("found (ruins)", "found by the reader")
-        assert verdict in good, (name, verdict, lines)
+        assert verdict.removesuffix(", also points") in good, (name, verdict, lines)

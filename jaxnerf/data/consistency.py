@@ -130,3 +130,31 @@ def fits(found, points, near, poses, scale, *, content, place):
     if not len(tracks.shown):
         return 0, 0
     return int((errors(tracks, poses, scale) < 0.75 * NEAR).sum()), len(tracks.shown)
+
+
+def circles(found, points, view, others):
+    """Returns the Tracks of three views where each corner leads to the next and back, None without any.
+
+    Chance closes no circle: whatever the cameras are, these are true matches.
+    """
+    rows = []
+    leads = {other: _leads(found, points, view, other) for other in others}
+    for first, second in itertools.combinations(others, 2):
+        corners = np.flatnonzero((leads[first] >= 0) & (leads[second] >= 0))
+        between = _leads(found, points, first, second)
+        corners = corners[between[leads[first][corners]] == leads[second][corners]]
+        three = np.stack([corners, leads[first][corners], leads[second][corners]], axis=1)
+        views = np.tile([view, first, second], (len(corners), 1))
+        where = [points[which][0][column] for which, column in zip(views[:1].ravel(), three.T, strict=False)]
+        if len(corners):
+            rows.append(Tracks(views, np.stack(where, axis=1), three, np.ones(three.shape, bool)))
+    return Tracks(*(np.concatenate(part) for part in zip(*rows, strict=True))) if rows else None
+
+
+def _leads(found, points, first, second):
+    """Returns for each corner of a view its match in another, or -1."""
+    result = np.full(len(found[first].pixels), -1)
+    matched = features.match(found[first], found[second])
+    good = points[first][1][matched[:, 0]] & points[second][1][matched[:, 1]]
+    result[matched[good, 0]] = matched[good, 1]
+    return result

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxnerf.data import consistency, tracks
+from jaxnerf.data import consistency, features, tracks
 from jaxnerf.data.findings import Finding, axes_change, axes_name, focal_change, percent
 from jaxnerf.data.world import poses_of
 
@@ -13,6 +13,11 @@ _CLEARLY = 0.1  # share of tracks by which other axes must fit better, and a thi
 _OFF = 0.07  # of the focal length, from where it is reported: lens and noise reach 0.02
 _SURE = 5.0  # standard errors
 _STRANGE = 0.35  # of the usual share of matches that fit: below, a photograph is not from its camera
+_RARE = 0.2  # share of matches that fit, where views share too little, or nothing is right
+_CIRCLES = 15  # matches that close a circle, to be sure
+_CLOSED = 0.5  # of these, where the poses are right: mostly above 0.8
+_NONE = 0.1  # of these, where all poses are wrong; a can with one label twice closes circles that fit to 0.2
+_TRUSTED = 0.33  # usual share of matches that fit, for one photograph alone to be called wrong
 _PARALLAX = np.deg2rad(1.5)  # between rays, for a place to have a depth
 
 
@@ -95,12 +100,8 @@ def judge_views(capture, evidence):
     fit, matches = np.array([fits(view, view) for view in views]).T
     share = fit / np.maximum(matches, 1)
     usual = np.median(share)
-    if usual < 0.2 or len(evidence.tracks.shown) < _ENOUGH:
-        found = f"{capture.source}: only {percent(usual)} of what neighbouring photographs share fits"
-        change = (
-            "the poses: they or the lens are wrong in a way that no turn of axes mends; compute them anew"
-        )
-        return [Finding("ruins", "pose", found, "at least 20 %", change)] if matches.sum() > _ENOUGH else []
+    if usual < _RARE:
+        return _judge_all(capture, evidence)
     strange = [view for view in views if share[view] < _STRANGE * usual and len(evidence.found[view].pixels)]
     findings, left = [], list(strange)
     for first in strange:
@@ -111,7 +112,7 @@ def judge_views(capture, evidence):
             if all(good >= 8 and good > 0.6 * usual * every for good, every in mended):
                 findings.append(_swapped(capture, first, second))
                 left = [view for view in left if view not in (first, second)]
-    return findings + [_stranger(capture, evidence, view, fit[view], matches[view]) for view in left]
+    return findings + [finding for view in left for finding in _stranger(capture, evidence, view, usual)]
 
 
 def places(evidence):
@@ -135,11 +136,46 @@ def _swapped(capture, first, second):
     return Finding("ruins", "swap", found, wanted, "rename the two files to each other", (first, second))
 
 
-def _stranger(capture, evidence, view, fit, matches):
+def _stranger(capture, evidence, view, usual):
+    """Returns the Findings about a photograph that does not fit those beside it."""
+    counts = [
+        0 if other == view else len(features.match(evidence.found[view], evidence.found[other]))
+        for other in range(len(capture.frames))
+    ]
+    others = np.argsort(counts, kind="stable")[::-1][: evidence.near.shape[1]]  # by what they show alone
+    sure, share = _of_circles(evidence, [(view, others)])
+    if sure >= _CIRCLES and share > _CLOSED:
+        return []  # it fits elsewhere: what is beside it is too far off, or looks another way
     frame = capture.frames[view]
-    larger = evidence.scale[view] / np.median(evidence.scale[evidence.near[view]])
-    found = f"{frame.image} does not show what its camera sees ({fit} of {matches} matches fit)"
     change = f"{frame.name} in {capture.source}: correct its pose or its file, or remove it"
-    # Few: it shows what no other does, is too dark, or blurred. Larger or smaller: corners look different.
-    unsure = matches < 20 or not 2 / 3 < larger < 1.5
-    return Finding("note" if unsure else "ruins", "pose", found, "matches that fit its pose", change, (view,))
+    if sure >= _CIRCLES:
+        found = (
+            f"{frame.image} does not show what its camera sees ({percent(share)} of {sure} sure matches fit)"
+        )
+        severity = "ruins" if usual > _TRUSTED else "note"
+        return [Finding(severity, "pose", found, "nearly all", change, (view,))]
+    found = f"{frame.image} shows nothing that is recognised in the views beside it"
+    return [Finding("note", "pose", found, "overlap", change, (view,))]
+
+
+def _judge_all(capture, evidence):
+    """Returns Findings where hardly any match fits: because poses are wrong, or views too far apart?"""
+    sure, share = _of_circles(evidence, list(enumerate(evidence.near)))
+    if sure < _CIRCLES:
+        found = f"{capture.source}: the photographs have too little in common to judge the poses by"
+        change = "nothing, or take more photographs between these"
+        return [Finding("note", "overlap", found, "overlap", change)]
+    if share > _CLOSED:
+        return []
+    severity = "ruins" if share < _NONE else "note"
+    found = f"{capture.source}: {percent(share)} of {sure} sure matches between photographs fit the poses"
+    change = "the poses or the lens: wrong in a way that no turn of axes mends, so compute them anew"
+    return [Finding(severity, "pose", found, "nearly all", change)]
+
+
+def _of_circles(evidence, groups):
+    """Returns how many matches are sure among (view, others) of each group, and the share that fits."""
+    closed = [consistency.circles(evidence.found, evidence.points, *group) for group in groups]
+    off = [consistency.errors(part, evidence.poses, evidence.scale) for part in closed if part is not None]
+    off = np.concatenate([*off, np.zeros(0)])
+    return len(off), float((off < consistency.NEAR).mean()) if len(off) else 0.0
