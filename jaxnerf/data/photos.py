@@ -168,7 +168,7 @@ def _read(frame, shrink, background):
         pixels = pixels[..., :3]
     full = pixels.shape[:2]
     if declared is not None:
-        _check_size(frame.image, full, declared)
+        check_size(frame.image, full, declared)
     mask = None
     if frame.mask is not None:
         mask = read_mask(frame.mask, stored=full)
@@ -190,7 +190,7 @@ def _read(frame, shrink, background):
     return _Photo(pixels, mask, camera)
 
 
-def _check_size(path, found, declared):
+def check_size(path, found, declared):
     """Raises a ValueError unless an image is as large as its camera, or all of it that many times smaller."""
     times = max(round(declared[0] / found[0]), 1)
     if any(abs(want / times - have) >= 1 for want, have in zip(declared, found, strict=True)):
