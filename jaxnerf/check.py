@@ -24,14 +24,13 @@ def main(argv):
     del argv
     from jaxnerf.data import camera_plot, inspection
     from jaxnerf.data.checks import check_range
+    from jaxnerf.engine.scenes import scene_folder
 
     if not _DATA_DIR.value:
         raise ValueError("nothing to check: give --data_dir=DIR of a capture")
     if None not in (_NEAR.value, _FAR.value):
         check_range(_NEAR.value, _FAR.value)
-    folder = pathlib.Path(_DATA_DIR.value)
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder, wanted a capture's; correct --data_dir")
+    folder = scene_folder(_DATA_DIR.value)
     out = _picture(folder)
     report = inspection.inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value)
     flagged = {index for finding in report.findings for index in finding.frames}

@@ -26,7 +26,7 @@ def settle(data):
     data, lines = copy.deepcopy(data), []
     if data.format == "synthetic" or not is_open(data):
         return data, lines
-    folder = _scene_folder(data.dir)
+    folder = scene_folder(data.dir)
     if data.format == "auto":
         found = formats.formats_in(folder)
         data.format = found[0]
@@ -78,7 +78,7 @@ def _read_views(data, split):
     if data.format == "synthetic":
         return synthetic.load_views(split=split, size=data.size)
     data, _ = settle(data)
-    folder = _scene_folder(data.dir)
+    folder = scene_folder(data.dir)
     if data.world not in WORLDS or (data.format == "blender" and data.world != "file"):
         names = "'file'" if data.format == "blender" else ", ".join(WORLDS)
         raise ValueError(f"data.world is {data.world!r}, wanted {names} or 'auto'")
@@ -102,7 +102,7 @@ def _read_views(data, split):
     return dataclasses.replace(views, to_file=np.float32(to_file), box=box)
 
 
-def _scene_folder(name):
+def scene_folder(name):
     """Returns the folder of that name here, or else under $JAXNERF_SCENES."""
     scenes = os.environ.get("JAXNERF_SCENES")
     places = [pathlib.Path(name)] + ([pathlib.Path(scenes, name)] if scenes else [])
