@@ -87,11 +87,11 @@ def get_config():
                 "block_size": 0,  # rays whose gradient is taken at once; 0: what the device is fastest with
                 "batching": "all_images",  # "all_images", or "single_image": a view a step
                 "parallel": "auto",  # "jit", "sharded", "pmap"; auto: jit on one device, else sharded
-                "max_steps": 200_000,
+                "max_steps": 200_000,  # 0, with space.skip_empty, fits the images
                 "max_seconds": 0.0,  # s of training without compilation; 0: no limit
                 "lr_init": 5e-4,  # Adam
                 "lr_final": 5e-5,  # reached exponentially at lr_steps
-                "lr_steps": 200_000,  # the run may end before or after
+                "lr_steps": 200_000,  # the run may end before or after; 0, with space.skip_empty: max_steps
                 "warmup_steps": 0,  # linear from 0
                 "beta1": 0.9,
                 "beta2": 0.999,

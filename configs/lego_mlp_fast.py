@@ -11,8 +11,7 @@ def get_config():
     network.depth, network.width, network.view_width, network.num_freqs = 4, 64, 32, 0
     # A ReLU that has died cannot come back, and this learning rate is high.
     network.density_activation, network.density_bias = "softplus", -1.0
-    config.space.step = 0.03  # wider than a cell: this network resolves less
     train = config.train
-    train.batch_size, train.max_steps, train.lr_steps = 320, 20_000, 20_000
+    train.batch_size, train.max_steps, train.lr_steps = 320, 24_000, 20_000
     train.lr_init, train.lr_final, train.epsilon = 8e-3, 3e-4, 1e-8
     return config

@@ -6,7 +6,7 @@ import time
 
 import speed_machine
 
-from jaxnerf.engine import records
+from jaxnerf.engine import records, workdir
 from jaxnerf.engine.evaluate import evaluate
 from jaxnerf.engine.loop import train_and_evaluate
 
@@ -15,12 +15,13 @@ def _curve(config, seconds, **overrides):
     return {"config": config, "overrides": overrides, "seconds": seconds}
 
 
-# The small network along whole rays: samples as far apart as its steps in lego's box, from near to far, and
-# the octaves that engine.fit chooses for these images where it knows a box.
+# The small network along whole rays: samples 0.03 apart where rays go from 2 to 6, and the octaves that
+# engine.fit chooses for these images where it knows a box.
 _DENSE = {"space.skip_empty": False, "sampling.num_fine": 0, "sampling.num_coarse": 133}
 _DENSE["fine.num_freqs"] = 7
-# Where nothing is known to be empty: no alpha, and as many octaves with skipping as without.
+# Where nothing is known to be empty: no alpha, and octaves and steps as far apart with skipping as without.
 _EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "space.masks": False, "fine.num_freqs": 7}
+_EMBEDDED["space.step"] = 0.03
 _FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.background": "none"}
 _FERN |= {"space.masks": False, "space.step": 2 / 133, "fine.num_freqs": 7}
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
@@ -107,7 +108,7 @@ def run_to(stop, config, where, before):
     piece = trained - last["seconds"]
     return {
         "stop": stop,
-        "ended": result["step"] >= config.train.max_steps,
+        "ended": result["step"] >= workdir.read_config(where).train.max_steps,
         "seconds": trained,
         "comparable": last["comparable"] + speed_machine.comparable(piece, sum(speed) / 2),
         "gflops": speed,

@@ -27,6 +27,8 @@ def with_sizes(config):
         config.space.update({name: size for name, size in sizes.items() if not config.space[name]})
         config.features.resolutions = config.features.resolutions or (4, 8)
         config.fine.num_freqs = config.fine.num_freqs or 4
+        config.train.max_steps = config.train.max_steps or 100
+        config.train.lr_steps = config.train.lr_steps or config.train.max_steps
     return config
 
 

@@ -129,6 +129,24 @@ def test_a_network_of_octaves_is_fitted_too(views):
     build(config)
 
 
+def test_finer_images_are_trained_on_longer(views):
+    """Sixteen times the pixels a side: four times the steps. What is set is kept, and lr_steps follows it."""
+    config = an_open(lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    config.train.max_steps = config.train.lr_steps = 0
+    assert is_open(config)
+    got, lines = fit_config(config, views)
+    sharp, _ = fit_config(config, dataclasses.replace(views, size=16 * views.size))
+    assert sharp.train.max_steps == pytest.approx(4 * got.train.max_steps, abs=4)
+    assert got.train.max_steps == got.train.lr_steps == round(800 * 24**0.5) and not is_open(got)
+    assert any(line.startswith("training") and "3,919" in line for line in lines)
+    filled = fill_from(config, got)
+    assert filled.to_json_best_effort() == got.to_json_best_effort()
+    config.train.max_steps = 7
+    got, lines = fit_config(config, views)
+    assert (got.train.max_steps, got.train.lr_steps) == (7, 7)
+    assert not any(line.startswith("training") for line in lines)
+
+
 def test_the_box_holds_all_matter_of_the_embedded_scene(fitted):
     lower, upper = (np.float32(bound) for bound in (fitted[0].space.lower, fitted[0].space.upper))
     x = np.random.default_rng(0).uniform(-2, 2, (1, 300_000, 3)).astype(np.float32)
@@ -219,5 +237,6 @@ def test_sizes_of_lego(scenes_dir):
     assert 64 <= space.resolution <= 128 and 64 <= config.features.resolutions[-1] <= 256
     build(config)
     slow, _ = fit_config(lego_mlp_fast.get_config(), lego)
-    assert slow.space.lower == space.lower and slow.space.step == 0.03  # set in that file
+    assert slow.space.lower == space.lower and slow.space.step == space.step
+    assert config.train.max_steps == config.train.lr_steps == 8000
     build(slow)

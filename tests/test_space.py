@@ -172,6 +172,8 @@ def test_every_pixel_that_shows_something_is_live(views, step):
     shown = np.flatnonzero(views.pixels[:, 3] > 0)
     assert np.isin(shown, live).all()
     assert live.size < 0.98 * len(views.pixels)
+    # Their rays are not followed; all others are.
+    np.testing.assert_array_equal(live, spaces.pixels_that_meet(views, space, possible))
 
 
 def test_pixels_outside_their_mask_are_not_live(views):
@@ -182,6 +184,8 @@ def test_pixels_outside_their_mask_are_not_live(views):
     wanted = spaces.pixels_that_meet(views, space, possible)
     got = spaces.pixels_that_meet(masked, space, possible, chunk=1000)  # a chunk is no matter
     np.testing.assert_array_equal(got, wanted[mask[wanted]])
+    got = spaces.pixels_that_meet(masked, space, ~possible, np.arange(mask.size) % 4 == 0)
+    np.testing.assert_array_equal(got, np.arange(0, mask.size, 12))
 
 
 def test_a_box_that_no_ray_meets_is_named(views):

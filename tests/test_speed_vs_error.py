@@ -11,6 +11,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "experim
 
 import speed_figures
 import speed_machine
+import speed_training
+
+from jaxnerf.engine import workdir
 
 
 def test_the_front_holds_what_no_other_point_beats():
@@ -53,3 +56,23 @@ def test_the_slope_is_the_power(power):
     assert speed_figures.slope(values, [3 * value**power for value in values]) == pytest.approx(
         power, abs=1e-9
     )
+
+
+@pytest.mark.parametrize("step, ended", [(5, False), (7, True)])
+def test_a_curve_ends_where_its_run_does_even_if_the_images_say_where(monkeypatch, tmp_path, step, ended):
+    config = speed_training.configuration("grid 200")
+    assert config.train.max_steps == 0
+
+    def train(config, where):
+        config = config.copy_and_resolve_references()
+        config.train.max_steps = 7
+        workdir.claim(where, config)
+        return True
+
+    names = ("psnr", "ssim", "seconds_per_frame", "views", "parameters", "rays_seen", "compile_seconds")
+    scores = {**dict.fromkeys(names, 1.0), "step": step, "training_seconds": 2.0}
+    monkeypatch.setattr(speed_training, "train_and_evaluate", train)
+    monkeypatch.setattr(speed_training, "evaluate", lambda where, overwrite: scores)
+    monkeypatch.setattr(speed_machine, "matrix_gflops", lambda: 2 * speed_machine.REFERENCE)
+    point = speed_training.run_to(3, config, tmp_path, None)
+    assert (point["ended"], point["seconds"], point["comparable"]) == (ended, 2.0, 4.0)

@@ -13,7 +13,8 @@ _SPACING = 0.7  # of a pixel's footprint: the finest thing that images can tell 
 _FINEST = (32, 256)  # vertices along the longest side, at least and at most
 SIZES = ("lower", "upper", "resolution", "step", "outside")
 OUTSIDE = ("nothing", "contracted")  # what is taken to be outside of the box
-_MOST_STEPS = 170  # along the longest side: finer images need finer features sooner than finer steps
+_MOST_STEPS = 144  # along the longest side: finer images need finer features sooner than finer steps
+_TRAINING = 800  # steps for the square root of a pixel: finer images need more, though not as many more
 _LARGEST_GRID = 128  # cells: beyond, looking at all of them costs more than the samples it saves
 
 
@@ -62,6 +63,11 @@ def fit_config(config, views):
     if config.field == "grid" and not len(config.features.resolutions):
         config.features.resolutions = tuple(max(finest // 2**level, 2) for level in (3, 2, 1, 0))
         lines.append(f"features    {config.features.resolutions} vertices along the longest side")
+    train = config.train
+    if not train.max_steps:
+        train.max_steps = round(_TRAINING * float(np.sqrt(np.prod(views.size, axis=1)).mean()) ** 0.5)
+        lines.append(f"training    {train.max_steps:,} steps, by the size of the images")
+    train.lr_steps = train.lr_steps or train.max_steps
     lines.append("left out    coarse network and importance points: the cells say where to ask")
     return config, lines
 
@@ -82,7 +88,8 @@ def is_open(config):
     if not space or not space.skip_empty:
         return False
     field = config.features.resolutions if config.field == "grid" else config.fine.num_freqs
-    return not all([*(space.get(name, "nothing") for name in SIZES), field])
+    sizes = [*(space.get(name, "nothing") for name in SIZES), field]
+    return not all([*sizes, config.train.max_steps, config.train.lr_steps])
 
 
 def fill_from(config, fitted):
@@ -100,6 +107,8 @@ def fill_from(config, fitted):
                 config.space[name] = fitted.space[name]
         config.features.resolutions = config.features.resolutions or fitted.features.resolutions
         config.fine.num_freqs = config.fine.num_freqs or fitted.fine.num_freqs
+        for name in ("max_steps", "lr_steps"):
+            config.train[name] = config.train[name] or fitted.train[name]
     return config
 
 

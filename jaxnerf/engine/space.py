@@ -151,7 +151,8 @@ def survey(views, space, *, masks, ndc=False, pixel_offset=0.5):
         has to look at; cells: the flat indices of those that are possible.
     """
     possible = possible_cells(views, space, masks=masks)
-    live = pixels_that_meet(views, space, possible, ndc=ndc, pixel_offset=pixel_offset)
+    shown = views.pixels[:, 3] > 0 if masks and views.pixels.shape[-1] == 4 else None
+    live = pixels_that_meet(views, space, possible, shown, ndc=ndc, pixel_offset=pixel_offset)
     return possible, live, np.flatnonzero(possible).astype(np.int32)
 
 
@@ -170,8 +171,16 @@ def possible_cells(views, space, *, masks):
     return visual_hull(views, lower, upper, resolution=count)[:x, :y, :z]
 
 
-def pixels_that_meet(views, space, possible, *, ndc=False, pixel_offset=0.5, chunk=2**12):
-    """Returns [L] int32, ascending: the ids of live pixels whose rays meet a possible cell.
+def pixels_that_meet(views, space, possible, shown=None, *, ndc=False, pixel_offset=0.5, chunk=2**12):
+    """Returns [L] int32, ascending: the ids of live pixels that are shown or whose rays meet a possible cell.
+
+    Args:
+        views: Views.
+        space: Space.
+        possible: [X, Y, Z] bool.
+        shown: [P] bool, the pixels that have alpha, whose rays need not be followed; None follows all.
+        ndc, pixel_offset: see draw_batch.
+        chunk: rays followed at once.
 
     Raises:
         ValueError: if there are none.
@@ -191,11 +200,12 @@ def pixels_that_meet(views, space, possible, *, ndc=False, pixel_offset=0.5, chu
     if space.contracted:
         return live  # every ray does
     colourless = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None)
-    grid, found = space.create(possible), []
-    for start in range(0, live.size, chunk):
-        ids = live[np.minimum(np.arange(start, start + chunk), live.size - 1)]  # one compiled shape
-        found.append(meets(colourless, grid, ids))
-    met = live[np.concatenate([np.asarray(part) for part in found])[: live.size]]
+    found = np.zeros(live.size, bool) if shown is None else shown[live]
+    grid, asked = space.create(possible), np.flatnonzero(~found)
+    for start in range(0, asked.size, chunk):
+        places = asked[np.minimum(np.arange(start, start + chunk), asked.size - 1)]  # one compiled shape
+        found[places] = meets(colourless, grid, live[places])
+    met = live[found]
     if not met.size:
         raise ValueError(
             f"no ray of {len(views.offset)} views meets anything in the box {space.lower} to {space.upper}; "
