@@ -1,9 +1,9 @@
 """The table of measured results, from the results.json files under workdirs.
 
-    python experiments/table.py WORKDIR ... [--readme=README.md]
+    python experiments/table.py WORKDIR ... [--readme=README.md] [--table=results]
 
 Prints one row a scored checkpoint. With --readme the table in that file between the lines
-<!-- results --> and <!-- end of results --> is replaced.
+<!-- results --> and <!-- end of results --> is replaced; --table is the word there.
 """
 
 import json
@@ -15,6 +15,7 @@ from jaxnerf import app
 from jaxnerf.engine.workdir import write_text
 
 _README = flags.DEFINE_string("readme", None, "File whose table is replaced.")
+_TABLE = flags.DEFINE_string("table", "results", "Which table of that file.")
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 HEADS = ("run", "step", "training", "compiling", "PSNR", "SSIM", "views", "parameters")
 
@@ -30,7 +31,8 @@ def main(argv):
     lines = markdown(HEADS, rows)
     print("\n".join(lines))
     if _README.value:
-        replace(pathlib.Path(_README.value), lines)
+        marks = f"<!-- {_TABLE.value} -->", f"<!-- end of {_TABLE.value} -->"
+        replace(pathlib.Path(_README.value), lines, marks)
 
 
 def row(path):

@@ -55,7 +55,12 @@ def main(argv):
         settings = {} if _SKIP_EMPTY.value is None else {"skip_empty": _SKIP_EMPTY.value}
         if _ERROR_BUDGET.value is not None:
             settings = budget.choose(
-                _WORKDIR.value, _ERROR_BUDGET.value, config=config, split=_SPLIT.value, step=_STEP.value
+                _WORKDIR.value,
+                _ERROR_BUDGET.value,
+                config=config,
+                split=_SPLIT.value,
+                step=_STEP.value,
+                overwrite=_OVERWRITE.value,
             )
         results = evaluate.evaluate(
             _WORKDIR.value,

@@ -1,10 +1,12 @@
 """Rendering settings picked by error, and empty space found in a network trained along whole rays."""
 
+import shutil
+
 import jax.numpy as jnp
 import pytest
 
 from jaxnerf.data.batches import random_rays
-from jaxnerf.engine import budget, packed
+from jaxnerf.engine import budget, load, packed
 from jaxnerf.engine.load import newest_step, open_run
 from runs import run
 
@@ -56,3 +58,13 @@ def test_what_is_skipped_afterwards_is_not_seen(trained, monkeypatch):
 def test_the_program_knows_the_flag():
     code, _, err = run("eval", "--workdir=nowhere", "--error_budget=-1")
     assert code == 2 and "error_budget" in err
+
+
+def test_a_result_that_is_there_is_noticed_before_the_search(trained, tmp_path, monkeypatch):
+    folder = tmp_path / "copy"
+    shutil.copytree(trained, folder, ignore=shutil.ignore_patterns("eval"))
+    steps = load.open_run(folder).steps()
+    (folder / "eval" / str(steps[-1])).mkdir(parents=True)
+    monkeypatch.setattr(budget, "cheapest_settings", lambda *_, **__: pytest.fail("searched"))
+    with pytest.raises(ValueError, match="is there already; give --overwrite"):
+        budget.choose(folder, 0.5)

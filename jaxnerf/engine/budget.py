@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from jaxnerf.data.batches import random_rays
+from jaxnerf.engine.evaluate import claim_target
 from jaxnerf.engine.load import newest_step, open_run
 
 _EXACT = {"samples": 4.0, "stop": 0.0, "skip_empty": False}  # what the error is measured against
@@ -23,9 +24,11 @@ class Choice(NamedTuple):
     seconds: float  # for the rays that were tried
 
 
-def choose(folder, error_budget, **options):
-    """Returns the settings of cheapest_settings, and prints what was tried and picked."""
-    choice, tried = cheapest_settings(folder, error_budget, **options)
+def choose(folder, error_budget, *, config=None, split=None, step=None, overwrite=False):
+    """Returns the settings of cheapest_settings for evaluate, and prints what was tried and picked."""
+    # The search takes a while, so what would end the scoring after it comes first.
+    claim_target(open_run(folder, config), folder, split=split, step=step, overwrite=overwrite)
+    choice, tried = cheapest_settings(folder, error_budget, config=config, split=split, step=step)
     for other in tried:
         print(f"{_text(other)}{'  <- picked' if other is choice else ''}", file=sys.stderr)
     return choice.settings

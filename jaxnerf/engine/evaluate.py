@@ -44,12 +44,9 @@ def evaluate(folder, *, config=None, split=None, step=None, chunk=None, settings
 
 def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False, views=None):
     """As evaluate, for a run that is open already and views that may be read already."""
-    options = run.experiment.eval
-    step, chunk, split = newest_step(run, folder, step), chunk or options.chunk, split or options.split
-    name = str(step) if split == options.split else f"{step}-{split}"
-    target = pathlib.Path(folder) / "eval" / name
-    if target.exists() and not overwrite:
-        raise ValueError(f"{target}: is there already; give --overwrite to score again, or another --step")
+    step, chunk = newest_step(run, folder, step), chunk or run.experiment.eval.chunk
+    target = claim_target(run, folder, split=split, step=step, overwrite=overwrite)
+    split, name = split or run.experiment.eval.split, target.name
     views = run.experiment.load_views(split) if views is None else views
     weights = run.weights(step)
     partial = target.with_name(name + ".tmp")
@@ -66,6 +63,16 @@ def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False
     os.replace(partial, target)
     shutil.rmtree(target.with_name(name + ".old"), ignore_errors=True)
     return results
+
+
+def claim_target(run, folder, *, split=None, step=None, overwrite=False):
+    """Returns the folder that a score goes to; ValueError if it is there already and not to be replaced."""
+    step, own = newest_step(run, folder, step), run.experiment.eval.split
+    name = str(step) if split in (None, own) else f"{step}-{split}"
+    target = pathlib.Path(folder) / "eval" / name
+    if target.exists() and not overwrite:
+        raise ValueError(f"{target}: is there already; give --overwrite to score again, or another --step")
+    return target
 
 
 def _write_scores(run, folder, views, weights, *, split, step, chunk, partial):
