@@ -6,6 +6,7 @@ from configs import default
 def get_config():
     """Returns the configuration; give the scene with --data_dir."""
     config = default.get_config()
+    config.data.near, config.data.far = 2.0, 6.0
     config.data.format = "blender"
     config.data.dir = "lego"
     config.data.pixel_offset = 0.0  # the code looks through pixel corners; the paper says nothing

@@ -10,7 +10,7 @@ def get_config():
     config = lego_fast.get_config()
     data = config.data
     data.format, data.dir, data.factor, data.width = "auto", "", 0, 200
-    data.background, data.ndc = "none", config_dict.placeholder(bool)
+    data.background, data.ndc = "", config_dict.placeholder(bool)
     space = config.space
     # Nothing is known to be empty at first, and what is faint in photographs is fog that no view needs.
     space.outside, space.threshold, space.samples_per_ray = "", 0.03, 27

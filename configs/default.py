@@ -34,9 +34,10 @@ def get_config():
                 "factor": 1,  # images are area-averaged down this many times; 0: to data.width
                 "width": 800,  # px, about
                 "size": 100,  # px, side of the embedded scene's images
-                "near": 2.0,  # in t; the embedded scene brings its own
-                "far": 6.0,  # in t
-                "background": "white",  # behind alpha and behind the scene: "white", "black" or "none"
+                "near": 0.0,  # along the camera's axis, in the file's units; 0: by the capture, 2 for Blender
+                "far": 0.0,  # the same; 0: by the capture, 6 for Blender
+                # behind alpha and behind the scene: "white", "black", "none"; "": white where there is alpha
+                "background": "white",
                 "hold_out": 0,  # every n-th training view is in the split "held_out" instead
                 "pixel_offset": 0.5,  # px; 0.5 looks through pixel centres, 0 is what the 2020 code did
                 # "file": as cameras stand there; "forward": recentred for NDC; "around": what they look at in

@@ -15,9 +15,11 @@ def contract(x):
         x: [..., 3], in halves of the plain cube's side.
 
     Returns:
-        [..., 3]; m = max |x_i| > 1 becomes 2 - 1 / m, the direction stays. Infinity goes to 2.
+        [..., 3]; m = max |x_i| > 1 becomes 2 - 1 / m, the direction stays. A component of more than 1e30 counts
+        as 1e30, so that infinity goes to 2.
     """
     check_shapes("contract", x=(x, "... 3"))
+    x = jnp.clip(x, -1e30, 1e30)
     largest = _largest(x)
     outside = largest > 1
     safe = jnp.where(outside, largest, 1)
@@ -25,12 +27,12 @@ def contract(x):
 
 
 def expand(y):
-    """Returns the points x [..., 3] with contract(x) = y [..., 3]; infinite where a component is 2."""
+    """Returns the points x [..., 3] with contract(x) = y [..., 3], whose components are less than 2."""
     check_shapes("expand", y=(y, "... 3"))
     largest = _largest(y)
     outside = largest > 1
     safe = jnp.where(outside, largest, 1)
-    return jnp.where(outside, y / safe / jnp.maximum(2 - safe, 0), y)
+    return jnp.where(outside, y / safe / (2 - safe), y)
 
 
 def _largest(x):

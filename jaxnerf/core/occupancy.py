@@ -87,7 +87,8 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
     corner = jnp.stack(jnp.unravel_index(cells, grid.occupied.shape), axis=-1)
     place = (corner + jax.random.uniform(key, corner.shape)) / jnp.array([grid.occupied.shape])
     if grid.contracted:
-        place = (contraction.expand(4 * place - 2) + 2) / 4
+        # A draw of nearly 1 rounds up to the far end of the last cell, which is at infinity.
+        place = (contraction.expand(jnp.clip(4 * place - 2, -_JUST_INSIDE, _JUST_INSIDE)) + 2) / 4
     x = grid.lower[None] + place * (grid.upper - grid.lower)[None]
     # Density has no direction; any will do.
     ask = lambda x: scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]))[0][0, 0]  # noqa: E731

@@ -41,7 +41,9 @@ def world_depth(views, index, pixels, depth, *, ndc=False):
     It is in world units of the capture's file, whatever the reader made of them: views.to_file says.
     """
     rays = view_rays(views, index, pixels)
-    t = ndc_to_t(depth, rays) if ndc else depth
+    t = depth
+    if ndc:  # a ray that turns away from the box meets nothing in it
+        t = jnp.where(rays.directions[..., 2] < 0, ndc_to_t(depth, rays), jnp.inf)
     distance = t * norm(rays.directions)
     if views.to_file is None:
         return distance

@@ -9,6 +9,7 @@ _STRAYS = 1.0  # percent of points at each end that may be wrong matches
 _MARGIN = 0.8  # what the points miss: near is that much nearer, far as much farther
 _FEWEST = 8  # points that a view must show to tell
 _OTHERS = 2  # views, beside its own, that must see a place for its matter to be placed
+_WITNESSES = 64  # other views at most, spread over all
 _FARTHEST = 10.0  # times the distance to what the cameras look at, where nothing tells more
 
 
@@ -20,17 +21,35 @@ def with_bounds(capture):
     """
     if all(frame.bounds is not None for frame in capture.frames):
         return capture
-    poses = poses_of(capture)
-    shared = None
+    found = [frame.bounds or _of_points(capture, frame) for frame in capture.frames]
+    unknown = [index for index, bounds in enumerate(found) if bounds is None]
+    for index, bounds in zip(unknown, _shared_depths(capture, unknown), strict=True):
+        found[index] = bounds
+    frames = [frame._replace(bounds=bounds) for frame, bounds in zip(capture.frames, found, strict=True)]
+    return capture._replace(frames=tuple(frames))
+
+
+def given(capture, near, far, to_file):
+    """Returns the capture with near and far in place of its frames' bounds, each where it is not 0.
+
+    Args:
+        capture: Capture with bounds in every frame.
+        near, far: in units of the capture's file, along the axis.
+        to_file: [4, 4] from the capture's world to the file's.
+
+    Raises:
+        ValueError: if a frame's near is not less than its far then.
+    """
+    unit = np.cbrt(np.linalg.det(np.asarray(to_file)[:3, :3]))
     frames = []
-    for index, frame in enumerate(capture.frames):
-        if frame.bounds is None:
-            bounds = _of_points(capture, frame)
-            if bounds is None:
-                shared = _shared_depths(capture, poses) if shared is None else shared
-                bounds = shared[index]
-            frame = frame._replace(bounds=bounds)
-        frames.append(frame)
+    for frame in capture.frames:
+        bounds = near / unit or frame.bounds[0], far / unit or frame.bounds[1]
+        if not 0 <= bounds[0] < bounds[1]:
+            raise ValueError(
+                f"{capture.source}: {frame.name} has near {bounds[0] * unit:g} and far {bounds[1] * unit:g}, "
+                "wanted near < far; correct data.near and data.far, or set them to 0"
+            )
+        frames.append(frame._replace(bounds=bounds))
     return capture._replace(frames=tuple(frames))
 
 
@@ -51,23 +70,30 @@ def _of_points(capture, frame):
     return float(near * _MARGIN), float(far / _MARGIN)
 
 
-def _shared_depths(capture, poses):
-    """Returns (near, far) of each view from the pyramids that the cameras see."""
+def _shared_depths(capture, chosen):
+    """Returns (near, far) of each of the chosen views, from the pyramids that the cameras see."""
+    poses = poses_of(capture)
     middle = gaze_center(poses)
     distance = float(np.median(np.linalg.norm(poses[:, :, 3] - middle, axis=-1)))
+    distance = max(distance, 1e-6 * (1 + float(np.abs(poses[:, :, 3]).max())))  # all may stand in one place
+    # Cameras that look away from each other say nothing of how far off it is what they see.
+    inwards = ((poses[:, :, 3] - middle) * poses[:, :, 2]).sum(axis=-1) > 0
+    farthest = distance * (_FARTHEST if inwards.mean() > 0.5 else _FARTHEST**3)
     steps = distance * np.geomspace(1e-2, _FARTHEST, 128)
+    others = np.unique(np.linspace(0, len(poses) - 1, _WITNESSES).astype(int))
     result = []
-    for index, frame in enumerate(capture.frames):
-        pose, slopes = poses[index], _slopes(frame.camera)
-        places = pose[:, 3] + steps[:, None, None] * (slopes @ pose[:, :3].T)
-        count = sum(_sees(other.camera, places) for j, other in enumerate(capture.frames) if j != index)
-        wanted = min(_OTHERS, len(poses) - 1)
-        found = np.flatnonzero((count >= wanted).any(axis=1)) if wanted else []
+    for index in chosen:
+        camera = capture.frames[index].camera
+        slopes = _slopes(camera) @ poses[index, :, :3].T
+        places = poses[index, :, 3] + steps[:, None, None] * slopes
+        witnesses = others[others != index]
+        count = sum(_sees(capture.frames[other].camera, places) for other in witnesses)
+        found = np.flatnonzero((count >= min(_OTHERS, len(witnesses))).any(axis=1)) if len(witnesses) else []
         near = float(steps[found[0]]) if len(found) else 0.1 * distance
-        far = _FARTHEST * distance
+        far = farthest
         if capture.box is not None:
             corners = np.stack(np.meshgrid(*np.transpose(capture.box), indexing="ij"), axis=-1).reshape(-1, 3)
-            far = max(float(depths(frame.camera, corners).max()), 2 * near)
+            far = max(float(depths(camera, corners).max()), 2 * near)
         result.append((near, far))
     return result
 

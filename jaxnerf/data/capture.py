@@ -15,6 +15,7 @@ class Frame(NamedTuple):
     image: Path  # exists
     camera: Camera  # float64; height and width are what the format states for the photograph, or None
     mask: Path | None = None  # exists; grey, where 0 the photograph is to be ignored
+    turned: bool = True  # whether EXIF orientation is followed: COLMAP counts pixels as they are stored
     bounds: tuple[float, float] | None = None  # nearest and farthest matter, world units along the axis
     seen: Any = None  # [M] indices of the Capture's points that this photograph shows; None: not known
     seen_at: Any = None  # [M, 2] px where

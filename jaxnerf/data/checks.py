@@ -50,7 +50,7 @@ def is_number(value):
 def read_json(path):
     """Returns the object that a JSON file holds; ValueError if it is unreadable or not an object."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}, wanted a JSON file that can be read") from None
     except (ValueError, RecursionError) as error:

@@ -34,7 +34,7 @@ def find_model(folder):
     Raises:
         ValueError: if there are several, and one's images cannot be counted.
     """
-    models = _find_models(Path(folder))
+    models = models_in(Path(folder))
     return models[0] if len(models) == 1 else max(models, key=count_images, default=None)
 
 
@@ -71,7 +71,7 @@ def read_capture(folder):
     return Capture("colmap", model, frames, points=points, notes=tuple(notes))
 
 
-def _find_models(folder):
+def models_in(folder):
     for base in (folder / "sparse", folder / "colmap" / "sparse"):
         numbered = [path for path in base.glob("*") if path.name.isdecimal() and model_suffix(path)]
         if numbered:
@@ -82,7 +82,7 @@ def _find_models(folder):
 
 
 def _other_models(folder, model):
-    others = [path.name for path in _find_models(folder) if path != model]
+    others = [path.name for path in models_in(folder) if path != model]
     said = f"{model}: read, as it has most images; left out beside it: {', '.join(others)}"
     return [said] if others else []
 
@@ -115,7 +115,7 @@ def _frame(path, name, image, intrinsics, ids):
     index = np.searchsorted(ids, image.points)
     known = np.isin(image.points, ids)
     camera = _camera(intrinsics, _to_world(image, where))
-    return Frame(name, path, camera, seen=index[known], seen_at=image.seen_at[known])
+    return Frame(name, path, camera, turned=False, seen=index[known], seen_at=image.seen_at[known])
 
 
 def _to_world(image, where):

@@ -8,6 +8,7 @@ from jaxnerf.data.findings import Finding, named
 from jaxnerf.data.world import poses_of
 
 _SAME = 0.0015  # mean difference of thumbnails, in [0, 1], below which two show one picture
+_PLAIN = 1e-6  # sharpness of what has no texture at all
 _BLURRED = 0.25  # of the sharpness of the views beside
 
 
@@ -95,8 +96,8 @@ def _blurred(capture, photos, near):
         beside = [photos[other].sharpness for other in others if photos[other] is not None]
         if photos[index] is None or len(beside) < 2:
             continue
-        share = photos[index].sharpness / max(np.median(beside), 1e-9)
-        if share < _BLURRED:
+        share = photos[index].sharpness / max(np.median(beside), _PLAIN)
+        if np.median(beside) > _PLAIN and share < _BLURRED:
             found = f"{capture.frames[index].image} has {100 * share:.0f} % of the detail of the views beside"
             findings.append(Finding("note", "blur", found, "sharp images", "leave that image out", (index,)))
     return findings

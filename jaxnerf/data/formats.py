@@ -22,7 +22,7 @@ def formats_in(folder):
     there = {
         "blender": (folder / "transforms_train.json").is_file(),
         "transforms": (folder / "transforms.json").is_file(),
-        "colmap": colmap.find_model(folder) is not None,
+        "colmap": bool(colmap.models_in(folder)),
         "llff": (folder / "poses_bounds.npy").is_file(),
     }
     found = [name for name, is_there in there.items() if is_there]

@@ -20,13 +20,14 @@ _UPRIGHT = {  # its values, and what undoes each
 }
 
 
-def read_image(path, *, stored=None):
+def read_image(path, *, stored=None, turn=True):
     """Returns the pixels of an image file, upright, at the precision that the file has.
 
     Args:
         path: an 8 or 16 bit PNG, or an 8 bit file of another kind that Pillow reads.
-        stored: (height, width) that the pixels are known to have as the cameras count them. Where they are
-            stored like that, an EXIF orientation that would turn them is not followed.
+        stored: (height, width) of the pixels as the cameras count them, or a multiple. Where they are stored
+            like that, an EXIF orientation that would turn them is not followed.
+        turn: whether EXIF orientation is followed at all.
 
     Returns:
         [H, W, 3] opaque or [H, W, 4] with straight alpha, uint8 or uint16. Grey becomes three equal
@@ -35,9 +36,16 @@ def read_image(path, *, stored=None):
     Raises:
         ValueError: if the file is missing, no image, or cut short.
     """
-    pixels, turn = _open(path, lambda image: (_decode(path, image), _orientation(image)))
-    upright = np.ascontiguousarray(_UPRIGHT[turn](pixels)) if turn in _UPRIGHT else pixels
-    return pixels if pixels.shape[:2] == stored != upright.shape[:2] else upright
+    pixels, value = _open(path, lambda image: (_decode(path, image), _orientation(image)))
+    upright = np.ascontiguousarray(_UPRIGHT[value](pixels)) if turn and value in _UPRIGHT else pixels
+    kept = stored and fits(pixels.shape[:2], stored) and not fits(upright.shape[:2], stored)
+    return pixels if kept else upright
+
+
+def fits(found, declared):
+    """Returns whether (height, width) is what is declared, or all of that a whole number of times smaller."""
+    times = max(round(declared[0] / found[0]), 1)
+    return all(abs(want / times - have) < 1 for want, have in zip(declared, found, strict=True))
 
 
 def read_mask(path, *, stored=None):
@@ -46,10 +54,15 @@ def read_mask(path, *, stored=None):
     return pixels[..., 0] > np.iinfo(pixels.dtype).max // 2
 
 
-def image_size(path):
-    """Returns the (width, height) in px of an image file, upright, from its first bytes; see read_image."""
-    size, turn = _open(path, lambda image: (image.size, _orientation(image)))
-    return size[::-1] if turn >= 5 else size
+def image_size(path, *, turn=True):
+    """Returns the (width, height) in px of an image file from its first bytes; see read_image."""
+    size, value = _open(path, lambda image: (image.size, _orientation(image)))
+    return size[::-1] if turn and value >= 5 else size
+
+
+def has_alpha(path):
+    """Returns whether read_image gives an image file four channels."""
+    return _open(path, lambda image: image.has_transparency_data)
 
 
 def _open(path, use):

@@ -11,6 +11,8 @@ from jaxnerf.data.world import poses_of
 _ENOUGH = 60  # tracks, to judge anything
 _CLEARLY = 0.1  # share of tracks by which other axes must fit better, and a third more
 _OFF = 0.07  # of the focal length, from where it is reported: lens and noise reach 0.02
+_WITNESSES = 3  # views, from where the spread among them tells anything
+_LEAST_GAIN = 0.02  # px: less is nothing, however sure
 _SURE = 5.0  # standard errors
 _STRANGE = 0.35  # of the usual share of matches that fit: below, a photograph is not from its camera
 _RARE = 0.2  # share of matches that fit, where views share too little, or nothing is right
@@ -74,7 +76,8 @@ def judge_focal(capture, evidence):
     if len(evidence.tracks.shown) < _ENOUGH:
         return [], evidence
     factor, gain, error = consistency.focal_factor(evidence.tracks, evidence.poses, evidence.scale)
-    if abs(np.log(factor)) < np.log1p(_OFF) or gain < _SURE * error:
+    told = len(np.unique(evidence.tracks.views)) >= _WITNESSES and gain > _LEAST_GAIN
+    if abs(np.log(factor)) < np.log1p(_OFF) or gain < _SURE * error or not told:
         return [], evidence
     focal = np.mean(capture.frames[0].camera.focal)
     found = (

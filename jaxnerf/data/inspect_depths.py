@@ -11,19 +11,23 @@ _ENOUGH = 30  # places
 _INSIDE = 0.5  # share of the places between near and far, below which training has no chance
 _CUT = 0.9  # below which something is cut off
 _LOOSE = 20.0  # times the farthest place's depth, or the nearest's in near: samples are spread thin
-_BLENDER = (2.0, 6.0)  # configs/default.py
+_BLENDER = (2.0, 6.0)  # what data.near and data.far are for Blender where they are 0
+_FIELDS = "config.data.near, config.data.far"
 
 
 def ranges(capture, near, far):
     """Returns where rays of each view begin and end [V, 2], world units along the axis, and who says so."""
-    if near is not None or far is not None or capture.format == "blender":
-        both = (_BLENDER[0] if near is None else near, _BLENDER[1] if far is None else far)
-        return np.tile(both, (len(capture.frames), 1)), "config.data.near, config.data.far"
-    if all(frame.bounds is not None for frame in capture.frames):
-        return np.array(
-            [frame.bounds for frame in capture.frames]
-        ), f"the last two columns of {capture.source}"
-    return np.array([frame.bounds for frame in with_bounds(capture).frames]), None
+    if capture.format == "blender":
+        bounds, stated = np.tile(_BLENDER, (len(capture.frames), 1)), _FIELDS
+    else:
+        stated = None
+        if all(frame.bounds is not None for frame in capture.frames):
+            stated = f"the last two columns of {capture.source}"
+        bounds = np.array([frame.bounds for frame in with_bounds(capture).frames])
+    for column, given in enumerate((near, far)):
+        if given is not None:
+            bounds[:, column], stated = given, _FIELDS
+    return bounds, stated
 
 
 def view_depths(evidence, places, tracks):
@@ -48,7 +52,7 @@ def judge_bounds(capture, evidence, places, tracks, bounds, stated):
         f"photographs show, which lies {low:.4g} to {high:.4g} from the cameras"
     )
     ratio = np.median(depth) / np.sqrt(np.median(near) * np.median(far))
-    change = f"{stated or '--near and --far'}: to about {0.8 * low:.3g} and {1.25 * high:.3g}"
+    change = f"{stated or _FIELDS}: to about {0.8 * low:.3g} and {1.25 * high:.3g}"
     if inside < _INSIDE and not 0.1 < ratio < 10:
         change += f" (they are in other units: times {ratio:.2g})"
     severity = "ruins" if inside < _INSIDE else "note"

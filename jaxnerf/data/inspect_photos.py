@@ -41,7 +41,7 @@ def read(capture):
 def _read(frame):
     camera = frame.camera
     declared = None if None in (camera.height, camera.width) else (camera.height, camera.width)
-    pixels = read_image(frame.image, stored=declared)
+    pixels = read_image(frame.image, stored=declared, turn=frame.turned)
     size = pixels.shape[:2]
     if declared is not None:
         check_size(frame.image, size, declared)

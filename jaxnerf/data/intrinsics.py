@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from PIL import Image
 
 from jaxnerf.core.structs import Camera
 from jaxnerf.data.checks import is_number, shown
+from jaxnerf.data.images import image_size
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -35,7 +35,7 @@ def read_camera(levels, *, to_world, image):
     fields, where = _fields(levels), levels[-1][0]
     size = [_size(fields, key) for key in "wh"]
     if None in size and (size != [None, None] or not {"cx", "cy", "fl_x"} <= fields.keys()):
-        found = _image_size(image)
+        found = image_size(image)
         size = [have if want is None else want for want, have in zip(size, found, strict=True)]
     lens, distortion = _lens(fields, where)
     center = [
@@ -125,14 +125,3 @@ def _size(fields, key):
     if pixels != int(pixels):
         raise wrong(fields[key][1], key, pixels, "whole pixels; correct or remove it")
     return int(pixels)
-
-
-def _image_size(path):
-    """Returns (width, height) of an image after the turn that its EXIF asks for."""
-    try:
-        with Image.open(path) as image:
-            turned = image.getexif().get(0x0112, 1) in (5, 6, 7, 8)  # Orientation: rows are columns
-            return image.size[::-1] if turned else image.size
-    except Exception as error:  # a damaged file makes Pillow's decoders raise almost anything
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise ValueError(f"{path}: unreadable ({reason}), wanted an image; copy it again") from None

@@ -7,6 +7,7 @@ import numpy as np
 from jaxnerf.core.structs import Camera
 from jaxnerf.data import photos, world
 from jaxnerf.data.capture import Capture, Frame
+from jaxnerf.data.copies import image_files, smaller_folders
 from jaxnerf.data.npy import read_npy
 from jaxnerf.data.poses import check_pose
 
@@ -51,7 +52,7 @@ def read_capture(folder):
             height=int(height),
             width=int(width),
         )
-        frames.append(Frame(path.stem, path, camera, bounds=tuple(bound.tolist())))
+        frames.append(Frame(path.stem, path, camera, turned=False, bounds=tuple(bound.tolist())))
     return Capture("llff", source, tuple(frames))
 
 
@@ -81,8 +82,8 @@ def _read_poses(path):
 
 def _image_paths(folder):
     """Returns the image files by name, of images/ or else of the least shrunk images_N/."""
-    smaller = photos.smaller_folders(folder)
+    smaller = smaller_folders(folder)
     for place in [folder / "images", *(smaller[number] for number in sorted(smaller))]:
-        if files := photos.image_files(place):
+        if files := image_files(place):
             return files
     raise ValueError(f"{folder}: has no images/ or images_N/ with images, wanted one; copy the photographs")

@@ -8,9 +8,9 @@ import numpy as np
 
 from jaxnerf.core.structs import Camera, Views
 from jaxnerf.data.checks import check_background, check_factor
-from jaxnerf.data.images import average_blocks, image_size, read_image, read_mask
+from jaxnerf.data.copies import choose_copies
+from jaxnerf.data.images import average_blocks, fits, read_image, read_mask
 
-IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # coefficients
 
 
@@ -23,8 +23,9 @@ class _Photo(NamedTuple):
 def split_indices(capture, split, *, hold=8):
     """Returns the indices [N] of a split's frames.
 
-    The capture's own splits count where it has some. Otherwise every hold-th by name, from the first, is
-    held out as "test"; "val" is the same, and so it is where a capture has only one of the two.
+    The capture's own splits count where it has some; training has all the others where it is not named, and
+    so has the test where only training is. Otherwise every hold-th by name, from the first, is held out as
+    "test"; "val" is the same, and so it is where a capture has only one of the two.
 
     Raises:
         ValueError: if there is no such split, or nothing in it.
@@ -33,7 +34,8 @@ def split_indices(capture, split, *, hold=8):
         raise ValueError(f"{capture.source}: split is {split!r}, wanted 'train', 'val' or 'test'; give one")
     if capture.splits:
         other = {"val": "test", "test": "val"}.get(split, split)
-        chosen = np.array(capture.splits.get(split, capture.splits.get(other, ())), int)
+        rest = np.setdiff1d(np.arange(len(capture.frames)), sum(capture.splits.values(), ()))
+        chosen = np.array(capture.splits.get(split, capture.splits.get(other, rest)), int)
     else:
         held = np.arange(len(capture.frames)) % hold == 0
         chosen = np.flatnonzero(~held if split == "train" else held)
@@ -63,7 +65,7 @@ def load_views(capture, *, split="train", factor=1, hold=8, background=None):
         ValueError: names the file, what was found, what was wanted and what to do.
     """
     factor, background = check_factor(factor), check_background(background)
-    frames, shrink = _smaller_copies(capture.frames, factor)
+    frames, shrink = choose_copies(capture.frames, factor)
     chosen = [frames[index] for index in split_indices(capture, split, hold=hold)]
 
     def read(frame):
@@ -80,8 +82,9 @@ def load_views(capture, *, split="train", factor=1, hold=8, background=None):
         masks = [np.ones(p.pixels.shape[:2], bool) if p.mask is None else p.mask for p in photos]
         masks = np.concatenate([mask.reshape(-1) for mask in masks])
     bounds = np.float32([frame.bounds for frame in chosen])
+    pixels = _alike([photo.pixels for photo in photos])
     return Views(
-        pixels=_alike([photo.pixels for photo in photos]),
+        pixels=pixels,
         offset=np.append(0, ends[:-1]).astype(np.int32),
         size=sizes.astype(np.int32),
         cameras=stack_cameras([photo.camera for photo in photos], [frame.name for frame in chosen]),
@@ -89,7 +92,7 @@ def load_views(capture, *, split="train", factor=1, hold=8, background=None):
         far=bounds[:, 1],
         mask=masks,
         names=tuple(frame.name for frame in chosen),
-        background=background if photos[0].pixels.shape[-1] == 4 else None,
+        background=background if pixels.shape[-1] == 4 else None,
     )
 
 
@@ -115,71 +118,19 @@ def stack_cameras(cameras, names):
     return Camera(**numbers, distortion=distortion, lens=lens, height=height, width=width)
 
 
-def full_width(capture):
-    """Returns how wide the widest photograph is, in px, where all are as large as their cameras say."""
-    return max(frame.camera.width or image_size(frame.image)[0] for frame in capture.frames)
-
-
-def image_files(folder):
-    """Returns the images in a folder, by name."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGES)
-
-
-def smaller_folders(folder):
-    """Returns N -> path of the folders images_N in a scene's folder."""
-    found = {path.name.removeprefix("images_"): path for path in folder.glob("images_*") if path.is_dir()}
-    return {int(number): path for number, path in found.items() if number.isascii() and number.isdigit()}
-
-
-def _smaller_copies(frames, factor):
-    """Returns the frames with images as small as the factor allows, and what is left of the factor."""
-    folders = {frame.image.parent for frame in frames}
-    first = frames[0].image.parent
-    if len(folders) > 1 or not (first.name == "images" or first.name.startswith("images_")):
-        return frames, factor
-    there = smaller_folders(first.parent)
-    if first.name == "images":
-        there.setdefault(1, first)
-    fitting = [number for number in there if number and factor % number == 0]
-    if not fitting:
-        names = ", ".join(f"images_{number}" for number in sorted(there))
-        raise ValueError(
-            f"{first.parent}: has {names} and no images, factor is {factor}; choose data.factor among these"
-        )
-    number = max(fitting)
-    if there[number] == first:
-        return frames, factor // number
-    # Tools that shrink images rename them, too, or only change their kind; they keep the order.
-    files, before = image_files(there[number]), image_files(first)
-    if len(files) != len(before):
-        if 1 in there:
-            return frames, factor
-        raise ValueError(f"{there[number]}: has {len(files)} images, {first.name} has {len(before)}; mend it")
-    copies = dict(zip(before, files, strict=True))
-    return tuple(frame._replace(image=copies[frame.image]) for frame in frames), factor // number
-
-
 def _read(frame, shrink, background):
     """Returns the _Photo of a frame."""
     camera = frame.camera
-    declared = None if None in (camera.height, camera.width) else (camera.height, camera.width)
-    pixels = read_image(frame.image, stored=declared)
+    declared = camera.height, camera.width
+    pixels = read_image(frame.image, stored=declared, turn=frame.turned)
     if background is None:
         pixels = pixels[..., :3]
     full = pixels.shape[:2]
-    if declared is not None:
-        check_size(frame.image, full, declared)
-    mask = None
-    if frame.mask is not None:
-        mask = read_mask(frame.mask, stored=full)
-        if mask.shape != full:
-            raise ValueError(
-                f"{frame.mask}: is {mask.shape[1]} x {mask.shape[0]}, wanted {full[1]} x {full[0]} as "
-                f"{frame.image.name}; make it again"
-            )
+    check_size(frame.image, full, declared)
+    mask = None if frame.mask is None else _read_mask(frame, full)
     if shrink > 1:
         pixels, mask = _shrink(frame.image, pixels, mask, shrink, background)
-    scale = np.array(full[::-1]) / (declared or full)[::-1] / shrink
+    scale = np.array(full[::-1]) / declared[::-1] / shrink
     camera = dataclasses.replace(
         camera,
         focal=camera.focal * scale,
@@ -192,12 +143,30 @@ def _read(frame, shrink, background):
 
 def check_size(path, found, declared):
     """Raises a ValueError unless an image is as large as its camera, or all of it that many times smaller."""
-    times = max(round(declared[0] / found[0]), 1)
-    if any(abs(want / times - have) >= 1 for want, have in zip(declared, found, strict=True)):
+    if not fits(found, declared):
         raise ValueError(
             f"{path}: is {found[1]} x {found[0]}, its camera is for {declared[1]} x {declared[0]}; wanted "
             "that size or a whole part of it; copy the original or correct the camera"
         )
+
+
+def _read_mask(frame, full):
+    """Returns the mask [H, W] of a frame at its image's size; a mask for the original shrinks with it."""
+    mask = read_mask(frame.mask, stored=full)
+    times = max(round(mask.shape[0] / full[0]), 1)
+    if not fits(full, mask.shape) or any(
+        times * have > side for have, side in zip(full, mask.shape, strict=True)
+    ):
+        raise ValueError(
+            f"{frame.mask}: is {mask.shape[1]} x {mask.shape[0]}, wanted {full[1]} x {full[0]} as "
+            f"{frame.image.name}; make it again"
+        )
+    return _all_blocks(mask, *full, times)
+
+
+def _all_blocks(mask, height, width, times):
+    """Returns [height, width] bool: a pixel counts where all of its block of the mask does."""
+    return mask[: height * times, : width * times].reshape(height, times, width, times).all((1, 3))
 
 
 def _shrink(path, pixels, mask, shrink, background):
@@ -205,9 +174,7 @@ def _shrink(path, pixels, mask, shrink, background):
     if not height or not width:
         raise ValueError(f"{path}: is {pixels.shape[1]} x {pixels.shape[0]}, too small for factor {shrink}")
     small = average_blocks(pixels[:height, :width], shrink, background=background)
-    if mask is not None:  # a pixel counts where all of it does
-        mask = mask[:height, :width].reshape(height // shrink, shrink, width // shrink, shrink).all((1, 3))
-    return small, mask
+    return small, None if mask is None else _all_blocks(mask, height // shrink, width // shrink, shrink)
 
 
 def _alike(images):

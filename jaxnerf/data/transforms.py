@@ -8,11 +8,10 @@ import numpy as np
 
 from jaxnerf.data.capture import Capture, Frame
 from jaxnerf.data.checks import check_inside, is_number, read_json, required
+from jaxnerf.data.copies import IMAGES
 from jaxnerf.data.intrinsics import number, read_camera, wrong
 from jaxnerf.data.ply import read_points
 from jaxnerf.data.poses import check_pose
-
-_IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 def read_capture(folder):
@@ -97,7 +96,7 @@ def _entries(scene, source):
 
 def _find(folder, path):
     """Returns the file at a path inside the folder, which may lack its extension; None if there is none."""
-    for candidate in (path, *(path + extension for extension in _IMAGES)):
+    for candidate in (path, *(path + extension for extension in IMAGES)):
         if os.path.isfile(folder / candidate):
             return folder / candidate
     return None

@@ -6,21 +6,20 @@ import numpy as np
 
 from jaxnerf.data.poses import gaze_center, up_of
 
-_FORWARD = (
-    0.85  # cosine of the widest angle between an axis and their mean: LLFF's grids stay within 20 degrees
-)
-
 
 def poses_of(capture):
     """Returns the poses [V, 3, 4] of a capture's frames."""
     return np.stack([frame.camera.to_world for frame in capture.frames])
 
 
-def looks_forward(capture):
-    """Returns whether all cameras of a capture look one way, so that NDC holds what they see."""
+def looks_forward(capture, *, cosine=0.85):
+    """Returns whether all cameras of a capture look one way, so that NDC holds what they see.
+
+    cosine: of the widest angle between an axis and their mean. LLFF's grids stay within 20 degrees.
+    """
     backs = poses_of(capture)[:, :, 2]
     mean = backs.mean(axis=0)
-    return len(backs) > 1 and bool((backs @ mean > _FORWARD * np.linalg.norm(mean)).all())
+    return len(backs) > 1 and bool((backs @ mean > cosine * np.linalg.norm(mean)).all())
 
 
 def recenter(capture, *, bound_share=0.75):
@@ -30,7 +29,12 @@ def recenter(capture, *, bound_share=0.75):
     lies at 1 / bound_share: what normalised device coordinates with a near plane of 1 want.
     """
     poses = poses_of(capture)
-    scale = 1 / (min(frame.bounds[0] for frame in capture.frames) * bound_share)
+    nearest = min(frame.bounds[0] for frame in capture.frames)
+    if not nearest > 0:
+        raise ValueError(
+            f"{capture.source}: the nearest bound is {nearest}, wanted more than 0; set data.near"
+        )
+    scale = 1 / (nearest * bound_share)
     back = _unit(poses[:, :, 2].sum(0))
     right = _unit(np.cross(poses[:, :, 1].sum(0), back))
     turn = np.stack([right, np.cross(back, right), back])

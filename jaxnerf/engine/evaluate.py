@@ -59,6 +59,7 @@ def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False
         shutil.rmtree(partial, ignore_errors=True)
         raise
     if target.exists():  # a kill between the two moves loses neither result
+        shutil.rmtree(target.with_name(name + ".old"), ignore_errors=True)  # of such a kill
         os.replace(target, target.with_name(name + ".old"))
     os.replace(partial, target)
     shutil.rmtree(target.with_name(name + ".old"), ignore_errors=True)

@@ -15,6 +15,7 @@ SIZES = ("lower", "upper", "resolution", "step", "outside")
 OUTSIDE = ("nothing", "contracted")  # what is taken to be outside of the box
 _MOST_STEPS = 144  # along the longest side: finer images need finer features sooner than finer steps
 _TRAINING = 800  # steps for the square root of a pixel: finer images need more, though not as many more
+_WIDEST = 3.0  # times all of contracted space: a box that is wider is no better than that
 _LARGEST_GRID = 128  # cells: beyond, looking at all of them costs more than the samples it saves
 
 
@@ -98,13 +99,13 @@ def fill_from(config, fitted):
     if is_open(config):
         with config.data.unlocked():
             for name in scenes.OPEN:
-                if config.data.get(name) in scenes.OPEN[name]:
+                if config.data.get(name) in scenes.OPEN[name] and name in fitted.data:
                     config.data[name] = fitted.data[name]
         if not (config.get("space") and config.space.skip_empty):
             return config
         for name in SIZES:
             if not config.space.get(name, "nothing"):
-                config.space[name] = fitted.space[name]
+                config.space[name] = fitted.space.get(name, "nothing")
         config.features.resolutions = config.features.resolutions or fitted.features.resolutions
         config.fine.num_freqs = config.fine.num_freqs or fitted.fine.num_freqs
         for name in ("max_steps", "lr_steps"):
@@ -137,7 +138,7 @@ def _outside(config, views):
     """Returns what is outside of the box, and in words why."""
     if config.data.ndc:
         return "nothing", "normalised device coordinates hold all that is seen"
-    if views.box is not None:
+    if views.box is not None and _side(views.box) <= _WIDEST * 4 * _room(views):
         return "nothing", "the file says how far the scene goes"
     if config.space.masks and views.pixels.shape[-1] == 4:
         return "nothing", "alpha shows where the object ends"
@@ -149,14 +150,11 @@ def _box(views, masks, *, ndc, contracted):
     if ndc:
         lower, upper = _ends_of_rays(views)
         return lower, upper, "which holds all rays"
-    if views.box is not None:
+    if views.box is not None and not contracted:
         return *np.asarray(views.box, np.float64), "as the file says"
-    center = poses.gaze_center(views.cameras.to_world)
-    distance = np.linalg.norm(np.asarray(views.cameras.to_world)[:, :, 3] - center, axis=-1)
-    # As wide as the widest image is in the middle of the scene.
-    width = distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / np.asarray(views.cameras.focal)
+    center, width = _widths(views)
     if contracted:
-        room = float(np.median(width.min(axis=1)))  # what most images hold whole is worth most cells
+        room = _room(views)
         return (
             center - 2 * room,
             center + 2 * room,
@@ -166,6 +164,22 @@ def _box(views, masks, *, ndc, contracted):
     if not masks:
         return lower, upper, "as wide as the images where all cameras look; nothing is known to be empty"
     return *hull.hull_bounds(views, lower, upper), "which holds all that the masks leave possible"
+
+
+def _widths(views):
+    """Returns the middle of what cameras look at [3], and half of how large images are there [V, 2]."""
+    center = poses.gaze_center(views.cameras.to_world)
+    distance = np.linalg.norm(np.asarray(views.cameras.to_world)[:, :, 3] - center, axis=-1)
+    return center, distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / np.asarray(views.cameras.focal)
+
+
+def _room(views):
+    """Returns how far from the middle what most images hold whole reaches: that is worth most cells."""
+    return float(np.median(_widths(views)[1].min(axis=1)))
+
+
+def _side(box):
+    return float(np.max(np.asarray(box[1]) - np.asarray(box[0])))
 
 
 def _ends_of_rays(views):

@@ -115,8 +115,9 @@ def _said(views):
 def _origin(run, step, views, path, closed):
     """Returns all that the frames depend on, for path.json."""
     digest = hashlib.sha256()
-    for leaf in (*jax.tree.leaves(views.cameras), views.near, views.far):
+    for leaf in jax.tree.leaves((views.cameras, views.near, views.far, views.to_file)):
         digest.update(np.ascontiguousarray(leaf).tobytes())
+    digest.update("/".join(views.names).encode())
     origin = {"path": path.source, "frames": len(path.poses), "width": path.width, "height": path.height}
     if path.source == "interpolate":
         origin["closed"] = closed

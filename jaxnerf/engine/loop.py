@@ -32,6 +32,7 @@ def train_and_evaluate(config, folder):
     """
     started = time.perf_counter()
     config, found = fit_data(config)
+    print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
     views = build.load_views(config.data, "train")  # before the workdir is made: bad input leaves nothing
     config, chosen = fit_config(config, views)
     experiment = build.build(config)
@@ -40,7 +41,7 @@ def train_and_evaluate(config, folder):
     parallel.split_positions(options.batch_size, len(devices), options.block_size)
     workdir.claim(folder, config)
     print(
-        "\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *found, *chosen]),
+        "\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *chosen]),
         file=sys.stderr,
     )
     finished = train(experiment, views, folder)

@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from jaxnerf.data import blender, bounds, formats, photos, subset, synthetic, world
+from jaxnerf.data import blender, bounds, copies, formats, images, photos, subset, synthetic, world
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 WORLDS = {
@@ -15,13 +15,21 @@ WORLDS = {
     "forward": "all cameras look one way, which becomes -z",
     "around": "what the cameras look at becomes the origin, their distance 1",
 }
-OPEN = {"format": ("auto",), "factor": (0,), "world": (None, "auto"), "ndc": (None,)}  # left to the capture
+# What is left to the capture.
+OPEN = {
+    "format": ("auto",),
+    "factor": (0,),
+    "world": (None, "auto"),
+    "ndc": (None,),
+    "background": ("",),
+}
 
 
 def settle(data):
     """Returns a copy of a data section without what is left to the capture, and lines that say what it is.
 
-    See OPEN: the format, the factor that brings images to data.width, the world, and whether to use NDC.
+    See OPEN: the format, the factor that brings images to data.width, the world, what is behind alpha, and
+    whether to use NDC.
     """
     data, lines = copy.deepcopy(data), []
     if data.format == "synthetic" or not is_open(data):
@@ -32,21 +40,28 @@ def settle(data):
         data.format = found[0]
         others = f", of {', '.join(found)}: --format takes another" if len(found) > 1 else ""
         lines.append(f"format      {data.format}{others}")
-    if data.format == "blender" and data.factor:  # whose cameras stand where they should: nothing to look up
+    if (
+        data.format == "blender" and data.factor and data.background
+    ):  # whose cameras stand where they should: nothing to look up
         capture, chosen = None, "file"
     else:
-        capture = bounds.with_bounds(formats.read_capture(folder, data.format))
+        capture = formats.read_capture(folder, data.format)
         lines += [f"left out    {note}" for note in capture.notes]
-        forward = "forward" if world.looks_forward(capture) else "around"
-        chosen = "file" if data.format == "blender" else forward
+        chosen = "forward" if data.ndc or world.looks_forward(capture) else "around"
+        if data.format == "blender":
+            chosen = "file"
+        elif data.get("world") is None and data.format == "llff":
+            chosen = "forward"  # as it was before there was a choice
     if not data.factor:
-        width = photos.full_width(capture)
-        data.factor = max(round(width / data.width), 1)
+        data.factor, width = copies.factor_for(capture, data.width)
         lines.append(f"factor      {data.factor}, of images {width} px wide")
     if data.get("world", "auto") == "auto":
         with data.unlocked():  # runs from before there was a choice have no such field
             data.world = chosen
         lines.append(f"world       {data.world}: {WORLDS[data.world]}")
+    if data.get("background") == "":
+        data.background = "white" if images.has_alpha(capture.frames[0].image) else "none"
+        lines.append(f"background  {data.background}")
     if data.ndc is None:
         data.ndc = data.world == "forward"
         lines.append(f"rays        {'in normalised device coordinates' if data.ndc else 'straight'}")
@@ -82,21 +97,29 @@ def _read_views(data, split):
     if data.world not in WORLDS or (data.format == "blender" and data.world != "file"):
         names = "'file'" if data.format == "blender" else ", ".join(WORLDS)
         raise ValueError(f"data.world is {data.world!r}, wanted {names} or 'auto'")
+    if data.ndc and data.world != "forward":
+        raise ValueError(
+            f"data.ndc is on in the world {data.world!r}, wanted 'forward', with cameras that look one way; "
+            "set data.ndc to False"
+        )
     if data.format == "blender":
         return blender.load_views(
             folder,
             split=split,
             factor=data.factor,
-            near=data.near,
-            far=data.far,
+            near=data.near or 2.0,
+            far=data.far or 6.0,
             background=background_of(data),
         )
     capture = bounds.with_bounds(formats.read_capture(folder, data.format))
     to_file = np.eye(4)
     if data.world == "forward":
+        if data.ndc and not world.looks_forward(capture, cosine=0.5):
+            raise ValueError(f"{folder}: data.ndc is on and the cameras look all ways; set it to False")
         capture, to_file = world.recenter(capture)
     elif data.world == "around":
         capture, to_file = world.center(capture)
+    capture = bounds.given(capture, data.near, data.far, to_file)
     views = photos.load_views(capture, split=split, factor=data.factor, background=background_of(data))
     box = None if capture.box is None else np.float32(capture.box)
     return dataclasses.replace(views, to_file=np.float32(to_file), box=box)

@@ -17,6 +17,8 @@ FREE = (
     "train.keep",
 )
 FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "eval.")
+# Fields that runs may be older than, and what they were then; None: whatever it is now.
+SINCE = {"data.width": None, "data.world": None, "space.outside": "nothing"}
 SECTIONS = ("data", "coarse", "fine", "sampling", "train", "eval")
 
 
@@ -29,6 +31,8 @@ def claim(workdir, config):
     path = pathlib.Path(workdir) / "config.json"
     if path.exists():
         old, new = _flat(read_config(workdir)), _flat(config)
+        for key, value in SINCE.items():
+            old.setdefault(key, new.get(key) if value is None else value)
         keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
         fixed = [key for key in keys if not key.startswith(FREE)]
         if fixed:
