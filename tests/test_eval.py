@@ -53,7 +53,8 @@ def test_results_say_all_that_a_score_needs(scored):
         "pixel_offset": 0.5,
         "split": "test",
     }
-    for key in ("psnr", "ssim", "psnr_float"):
+    assert [row["comparable"] for row in results["comparable_with"]] == [False] * 5
+    for key in ("psnr", "ssim", "psnr_float", "psnr_truncated"):
         assert results[key] == pytest.approx(np.mean([row[key] for row in results["images"]]))
     assert [row["name"] for row in results["images"]] == [f"test_{index:03d}" for index in range(8)]
 
@@ -67,6 +68,7 @@ def test_scores_are_those_of_the_images_on_disk(scored):
         assert row["psnr"] == pytest.approx(oracle.psnr(color / 255, truth / 255), abs=1e-4)
         assert row["ssim"] == pytest.approx(oracle.ssim(color / 255, truth / 255), abs=1e-5)
         assert 0 < abs(row["psnr"] - row["psnr_float"]) < 0.1
+        assert 0 < abs(row["psnr_truncated"] - row["psnr_float"]) < 0.3
 
 
 def test_pictures_show_the_model_and_its_depth(scored, run):
@@ -127,6 +129,8 @@ def test_predictions_made_elsewhere_score_the_same(scored, tmp_path):
         assert json.loads((target / "results.json").read_text()) == found
         assert found["psnr"] == pytest.approx(results["psnr"], abs=1e-4)
         assert found["ssim"] == pytest.approx(results["ssim"], abs=1e-5)
+        assert found["psnr_truncated"] == found["psnr"]  # of 8 bits already
+        assert found["conventions"]["size"] == [24, 24] and len(found["comparable_with"]) == 5
         with pytest.raises(ValueError, match="is there already"):
             predictions.score_folder(target, config=config)
     os.remove(tmp_path / "20" / "color" / "003.png")

@@ -8,6 +8,8 @@ import skimage.metrics
 import oracle
 from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import mse, psnr, round_to_8_bits, ssim
+from jaxnerf.data import blender
+from jaxnerf.engine.evaluate import reference
 
 
 def pair(seed, noise, shape=(17, 20, 3)):
@@ -59,14 +61,46 @@ def test_psnr_counts_the_pixels_in_the_mask_only():
 @pytest.mark.parametrize("noise", [0.0, 0.003, 0.05, 0.5])
 def test_ssim_is_that_of_the_oracle_scikit_image_and_dm_pix(noise):
     a, b = pair(4, noise)
-    a64, b64 = a.astype(np.float64), b.astype(np.float64)
+    assert_ssim_is_theirs(a, b)
+    np.testing.assert_allclose(
+        fast_ssim(a, b), oracle.ssim(a.astype(np.float64), b.astype(np.float64)), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("shape", [(16, 23, 3), (90, 70, 3)])
+def test_random_images_have_the_figures_of_scikit_image_and_dm_pix(shape):
+    a, b = np.random.default_rng(7).uniform(size=(2, *shape)).astype(np.float32)
+    assert_ssim_is_theirs(a, b)
+    assert_psnr_is_theirs(a, b)
+    assert_psnr_is_theirs(*pair(8, 0.003, shape))
+
+
+@pytest.mark.scenes("lego")
+def test_photographs_have_the_figures_of_scikit_image_and_dm_pix(scenes_dir):
+    """800 x 800 px, mostly white; a pair, and one beside itself with noise of 40 dB in 8 bits."""
+    views = blender.load_views(scenes_dir / "lego", split="test", factor=1)
+    a, b = (np.asarray(reference(views, index)) for index in (0, 1))
+    noise = np.random.default_rng(9).normal(scale=0.01, size=a.shape).astype(np.float32)
+    for other in (b, np.asarray(round_to_8_bits(a + noise))):
+        assert_ssim_is_theirs(a, other)
+        assert_psnr_is_theirs(a, other)
+
+
+def assert_ssim_is_theirs(a, b):
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     options |= {"data_range": 1.0, "channel_axis": -1, "full": True}
+    a64, b64 = a.astype(np.float64), b.astype(np.float64)
     valid_map = skimage.metrics.structural_similarity(a64, b64, **options)[1][5:-5, 5:-5]
-    got = fast_ssim(a, b)
-    np.testing.assert_allclose(got, oracle.ssim(a64, b64), atol=1e-5)
-    np.testing.assert_allclose(got, valid_map.mean(), atol=1e-5)
-    np.testing.assert_allclose(got, dm_pix.ssim(a, b), atol=1e-5)
+    np.testing.assert_allclose(fast_ssim(a, b), valid_map.mean(), atol=1e-5)
+    with jax.enable_x64(True):  # in float32 its differences of squares are 3e-5 off on a white photograph
+        pix = float(dm_pix.ssim(a64, b64))
+    np.testing.assert_allclose(fast_ssim(a, b), pix, atol=1e-5)
+
+
+def assert_psnr_is_theirs(a, b):
+    theirs = skimage.metrics.peak_signal_noise_ratio(a.astype(np.float64), b.astype(np.float64), data_range=1)
+    np.testing.assert_allclose(psnr(a, b), theirs, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(psnr(a, b), dm_pix.psnr(a, b), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])

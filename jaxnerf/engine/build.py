@@ -34,7 +34,7 @@ class Experiment(NamedTuple):
     pixel_offset: float
     train: SimpleNamespace  # the fields of the configuration's section
     eval: SimpleNamespace
-    conventions: dict[str, Any]  # what makes a score comparable
+    conventions: dict[str, Any]  # how views are read, which a score's metric card repeats
 
 
 def build(config):
@@ -69,12 +69,11 @@ def build(config):
         train=SimpleNamespace(**config.train),
         eval=SimpleNamespace(**config.eval),
         conventions={
+            "format": config.data.format,
             "background": config.data.background,
             "pixel_offset": config.data.pixel_offset,
             "factor": config.data.factor,
-            "rounding": "8 bits, to nearest, both images",
-            "ssim": "11 x 11 Gaussian window, deviation 1.5, valid",
-            "mean": "of the images' PSNRs",
+            "hold_out": config.data.get("hold_out", 0),
         },
     )
 

@@ -15,7 +15,7 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits, ssim
 from jaxnerf.core.rendering import render_image
 from jaxnerf.data.batches import pixel_colors
-from jaxnerf.engine import pictures, records, workdir
+from jaxnerf.engine import card, pictures, records, workdir
 from jaxnerf.engine.load import newest_step, open_run
 
 
@@ -94,7 +94,7 @@ def _write_scores(run, folder, views, weights, *, split, step, chunk, partial):
         "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(weights[0])),
         "settings": {name: vars(run.experiment.eval).get(name) for name in ("samples", "stop", "skip_empty")},
-        "conventions": {**run.experiment.conventions, "split": split, "chunk": chunk},
+        **card.metric_card({**run.experiment.conventions, "chunk": chunk}, views, split=split),
         "images": rows,
     }
     workdir.write_text(partial / "results.json", json.dumps(results, indent=2) + "\n")
@@ -141,7 +141,13 @@ def _render_views(run, render, views, chunk, folder):
 @jax.jit
 def _pair_scores(image, truth):
     rounded, target = round_to_8_bits(image), round_to_8_bits(truth)
-    return {"psnr": psnr(rounded, target), "ssim": ssim(rounded, target), "psnr_float": psnr(image, truth)}
+    truncated = jnp.floor(jnp.clip(image, 0, 1) * 255) / 255  # colours of 8 bits stay as they are
+    return {
+        "psnr": psnr(rounded, target),
+        "ssim": ssim(rounded, target),
+        "psnr_float": psnr(image, truth),
+        "psnr_truncated": psnr(truncated, target),
+    }
 
 
 def scores(image, truth):
@@ -150,4 +156,5 @@ def scores(image, truth):
 
 def means(rows):
     """Returns the means of the rows' metrics, each over the images."""
-    return {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "ssim", "psnr_float")}
+    keys = ("psnr", "ssim", "psnr_float", "psnr_truncated")
+    return {key: float(np.mean([row[key] for row in rows])) for key in keys}

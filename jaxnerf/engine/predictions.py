@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxnerf.data.images import read_image
-from jaxnerf.engine import build, workdir
+from jaxnerf.engine import build, card, fit, workdir
 from jaxnerf.engine.evaluate import means, reference, scores
 
 
@@ -34,14 +34,14 @@ def score_folder(folder, *, config=None, split=None, overwrite=False):
     if config is None:
         truths = _images(folder / "gt-color")
         references = [_colors(path) for path in truths]
-        conventions = {"reference": "gt-color"}
+        about = card.card_of({"reference": "gt-color"}, [image.shape[:2] for image in references])
     else:
-        experiment = build.build(config)
+        experiment = build.build(fit.fit_data(config)[0])
         split = split or experiment.eval.split
         views = experiment.load_views(split)
         truths = views.names
         references = [np.asarray(reference(views, index)) for index in range(len(truths))]
-        conventions = {**experiment.conventions, "split": split}
+        about = card.metric_card(experiment.conventions, views, split=split)
     if len(paths) != len(truths):
         raise ValueError(
             f"{paths[0].parent}: has {len(paths)} images, the reference {len(truths)}; wanted one each"
@@ -50,7 +50,7 @@ def score_folder(folder, *, config=None, split=None, overwrite=False):
     if sorted(names) == sorted(path.stem for path in paths):
         paths.sort(key=lambda path: names.index(path.stem))
     results = score_predictions(map(_colors, paths), references, names=[path.name for path in paths])
-    results["conventions"] = conventions
+    results |= about
     workdir.write_text(target, json.dumps(results, indent=2) + "\n")
     return results
 
