@@ -24,6 +24,7 @@ def with_sizes(config):
     if config.space.skip_empty:
         sizes = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3, "resolution": 8, "step": 0.1}
         sizes["outside"] = "nothing"
+        config.data.background = config.data.background or "none"
         config.space.update({name: size for name, size in sizes.items() if not config.space[name]})
         config.features.resolutions = config.features.resolutions or (4, 8)
         config.fine.num_freqs = config.fine.num_freqs or 4

@@ -228,6 +228,32 @@ def test_what_is_settled_stays(tmp_path):
     assert scenes.settle(synthetic)[0].to_dict() == synthetic.to_dict()
 
 
+def test_ndc_wants_cameras_that_look_one_way(tmp_path):
+    captures.write_llff(tmp_path, captures.shoot(captures.orbit(8)))
+    with pytest.raises(ValueError, match="the cameras look all ways"):
+        scenes.load_views(a_data(tmp_path, ndc=True), "train")
+    with pytest.raises(ValueError, match="data.ndc is on in the world 'around'"):
+        scenes.load_views(a_data(tmp_path, ndc=True, world="around"), "train")
+
+
+def test_the_background_follows_from_alpha(tmp_path):
+    for name, rgba, wanted in (("a", True, "white"), ("b", False, "none")):
+        captures.write_transforms(tmp_path / name, captures.noise(captures.orbit(8)), rgba=rgba)
+        data, lines = scenes.settle(a_data(tmp_path / name))
+        assert data.background == wanted and f"background  {wanted}" in lines
+        assert (scenes.load_views(data, "train").background is None) == (not rgba)
+
+
+def test_near_and_far_may_be_given_in_the_files_units(tmp_path):
+    captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
+    views = scenes.load_views(a_data(tmp_path, near=2.5, far=5.5), "train")
+    scale = np.cbrt(np.linalg.det(np.asarray(views.to_file, np.float64)[:3, :3]))
+    np.testing.assert_allclose(views.near * scale, 2.5, rtol=1e-5)
+    np.testing.assert_allclose(views.far * scale, 5.5, rtol=1e-5)
+    with pytest.raises(ValueError, match="near 7 and far 5, wanted near < far"):
+        scenes.load_views(a_data(tmp_path, near=7.0, far=5.0), "train")
+
+
 def test_what_is_wrong_is_said(tmp_path):
     with pytest.raises(ValueError, match="holds no capture, wanted transforms_train.json"):
         scenes.settle(a_data(tmp_path))

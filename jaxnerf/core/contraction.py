@@ -15,8 +15,8 @@ def contract(x):
         x: [..., 3], in halves of the plain cube's side.
 
     Returns:
-        [..., 3]; m = max |x_i| > 1 becomes 2 - 1 / m, the direction stays. A component of more than 1e30 counts
-        as 1e30, so that infinity goes to 2.
+        [..., 3]; m = max |x_i| > 1 becomes 2 - 1 / m, the direction stays. A component beyond 1e30 counts as
+        1e30, so that infinity goes to 2.
     """
     check_shapes("contract", x=(x, "... 3"))
     x = jnp.clip(x, -1e30, 1e30)

@@ -12,7 +12,7 @@ from jaxnerf.data import batches
 from jaxnerf.engine.fit import OUTSIDE, SIZES
 from jaxnerf.engine.models import Model, hierarchical_model
 from jaxnerf.engine.packed import packed_model, skip_empty_afterwards
-from jaxnerf.engine.scenes import background_of, load_views
+from jaxnerf.engine.scenes import background_of, load_views, settle
 from jaxnerf.engine.space import contracted_field, make_space, survey
 from jaxnerf.fields.grid import grid_field
 from jaxnerf.fields.mlp import mlp_field
@@ -34,7 +34,7 @@ class Experiment(NamedTuple):
     pixel_offset: float
     train: SimpleNamespace  # the fields of the configuration's section
     eval: SimpleNamespace
-    conventions: dict[str, Any]  # how views are read, which a score's metric card repeats
+    conventions: dict[str, Any]  # see conventions
 
 
 def build(config):
@@ -68,14 +68,20 @@ def build(config):
         pixel_offset=config.data.pixel_offset,
         train=SimpleNamespace(**config.train),
         eval=SimpleNamespace(**config.eval),
-        conventions={
-            "format": config.data.format,
-            "background": config.data.background,
-            "pixel_offset": config.data.pixel_offset,
-            "factor": config.data.factor,
-            "hold_out": config.data.get("hold_out", 0),
-        },
+        conventions=conventions(config.data),
     )
+
+
+def photographs(config, split=None):
+    """Returns the Views of a split, its name (None: eval.split) and its conventions; this builds no model."""
+    data, split = settle(config.data)[0], split or config.eval.split
+    return load_views(data, split), split, conventions(data)
+
+
+def conventions(data):
+    """Returns how the views of a data section are read, which a score's metric card repeats."""
+    names = ("format", "background", "pixel_offset", "factor")
+    return {**{name: data[name] for name in names}, "hold_out": data.get("hold_out", 0)}
 
 
 def build_model(config):

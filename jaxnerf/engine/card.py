@@ -13,7 +13,7 @@ METRICS = {
     "ssim": "11 x 11 Gaussian window of deviation 1.5 where it fits, k1 0.01, k2 0.03, population variances, "
     "mean over windows and RGB",
     "data_range": 1.0,
-    "pixels": "whole images; masks leave pixels out of training, not out of the figures",
+    "pixels": "all; those that a mask leaves out are in no PSNR, and SSIM sees the photograph there",
     "mean": "of the images' figures",
     "lpips": "absent: its networks' weights come with no package",
 }

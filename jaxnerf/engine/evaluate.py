@@ -127,7 +127,8 @@ def _render_views(run, render, views, chunk, folder):
         image = jax.block_until_ready(render_image(render, rays, chunk=chunk))
         seconds = time.perf_counter() - started
         truth = reference(views, index)
-        rows.append({"name": name, **scores(image.rgb, truth), "seconds": seconds, "rays": height * width})
+        row = scores(image.rgb, truth, live_mask(views, index))
+        rows.append({"name": name, **row, "seconds": seconds, "rays": height * width})
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
         pictures.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
         if index % -(-len(views.names) // pictures.SHEET_ROWS) == 0:
@@ -138,20 +139,32 @@ def _render_views(run, render, views, chunk, folder):
     return rows
 
 
+def live_mask(views, index):
+    """Returns [H, W] bool of one of Views, which pixels count; None where all do."""
+    if views.mask is None:
+        return None
+    (height, width), first = views.size[index], int(views.offset[index])
+    return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
+
+
 @jax.jit
-def _pair_scores(image, truth):
+def _pair_scores(image, truth, mask):
+    if mask is not None:  # SSIM has windows, so it sees the photograph where nothing counts
+        image = jnp.where(mask[..., None], image, truth)
     rounded, target = round_to_8_bits(image), round_to_8_bits(truth)
     truncated = jnp.floor(jnp.clip(image, 0, 1) * 255) / 255  # colours of 8 bits stay as they are
     return {
-        "psnr": psnr(rounded, target),
+        "psnr": psnr(rounded, target, mask=mask),
         "ssim": ssim(rounded, target),
-        "psnr_float": psnr(image, truth),
-        "psnr_truncated": psnr(truncated, target),
+        "psnr_float": psnr(image, truth, mask=mask),
+        "psnr_truncated": psnr(truncated, target, mask=mask),
     }
 
 
-def scores(image, truth):
-    return {key: float(value) for key, value in _pair_scores(jnp.asarray(image), jnp.asarray(truth)).items()}
+def scores(image, truth, mask=None):
+    """Returns the metrics of an image [H, W, 3] against its photograph, of the pixels in mask [H, W]."""
+    found = _pair_scores(jnp.asarray(image), jnp.asarray(truth), mask)
+    return {key: float(value) for key, value in found.items()}
 
 
 def means(rows):

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxnerf.data.images import read_image
-from jaxnerf.engine import build, card, fit, workdir
-from jaxnerf.engine.evaluate import means, reference, scores
+from jaxnerf.engine import build, card, workdir
+from jaxnerf.engine.evaluate import live_mask, means, reference, scores
 
 
 def score_folder(folder, *, config=None, split=None, overwrite=False):
@@ -34,14 +34,14 @@ def score_folder(folder, *, config=None, split=None, overwrite=False):
     if config is None:
         truths = _images(folder / "gt-color")
         references = [_colors(path) for path in truths]
+        masks = None
         about = card.card_of({"reference": "gt-color"}, [image.shape[:2] for image in references])
     else:
-        experiment = build.build(fit.fit_data(config)[0])
-        split = split or experiment.eval.split
-        views = experiment.load_views(split)
+        views, split, conventions = build.photographs(config, split)
         truths = views.names
         references = [np.asarray(reference(views, index)) for index in range(len(truths))]
-        about = card.metric_card(experiment.conventions, views, split=split)
+        masks = [live_mask(views, index) for index in range(len(truths))]
+        about = card.metric_card(conventions, views, split=split)
     if len(paths) != len(truths):
         raise ValueError(
             f"{paths[0].parent}: has {len(paths)} images, the reference {len(truths)}; wanted one each"
@@ -49,27 +49,30 @@ def score_folder(folder, *, config=None, split=None, overwrite=False):
     names = [Path(str(truth)).stem for truth in truths]
     if sorted(names) == sorted(path.stem for path in paths):
         paths.sort(key=lambda path: names.index(path.stem))
-    results = score_predictions(map(_colors, paths), references, names=[path.name for path in paths])
+    names = [path.name for path in paths]
+    results = score_predictions(map(_colors, paths), references, names=names, masks=masks)
     results |= about
     workdir.write_text(target, json.dumps(results, indent=2) + "\n")
     return results
 
 
-def score_predictions(predictions, references, *, names):
+def score_predictions(predictions, references, *, names, masks=None):
     """Returns results for images made elsewhere: the same metrics on 8-bit images, row by row.
 
     Args:
         predictions, references: iterables of [H, W, 3] colours in [0, 1], in the same order.
         names: one a pair.
+        masks: one a pair, see scores; None for none.
 
     Raises:
         ValueError: if a pair's sizes differ; names it.
     """
     rows = []
-    for name, image, truth in zip(names, predictions, references, strict=True):
+    masks = [None] * len(names) if masks is None else masks
+    for name, image, truth, mask in zip(names, predictions, references, masks, strict=True):
         if image.shape != truth.shape:
             raise ValueError(f"{name}: is {image.shape}, its reference {truth.shape}; make both one size")
-        rows.append({"name": name, **scores(image, truth)})
+        rows.append({"name": name, **scores(image, truth, mask)})
     return {**means(rows), "views": len(rows), "images": rows}
 
 
