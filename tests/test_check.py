@@ -1,5 +1,6 @@
 """jaxnerf.check: what it finds planted in captures, what it says to change, and that this mends them."""
 
+import dataclasses
 import pathlib
 import subprocess
 import sys
@@ -315,3 +316,13 @@ def test_planted_in_real_scenes(scenes_dir, tmp_path, scene, monkeypatch):
         # A model's points, which stay where they were, tell of wrong poses, too.
         good = ("nothing ruins",) if wanted is None else ("found (ruins)", "found by the reader")
         assert verdict.removesuffix(", also points") in good, (name, verdict, lines)
+
+
+def test_cameras_in_one_place_are_said_and_not_called_turned(tmp_path):
+    stack = captures.orbit(6)
+    poses = np.array(stack.to_world)
+    poses[:, :, 3] = poses[0, :, 3]
+    captures.write_transforms(tmp_path, captures.noise(dataclasses.replace(stack, to_world=poses)))
+    report = inspection.inspect(tmp_path)
+    assert [finding.kind for finding in report.findings if finding.severity == "ruins"] == ["pose"]
+    assert "all 6 cameras stand in one place" in report.text()

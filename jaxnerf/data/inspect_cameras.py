@@ -71,6 +71,16 @@ def judge_axes(capture, evidence):
     return [], evidence
 
 
+def judge_places(capture):
+    """Returns Findings about cameras that all stand in one place."""
+    eyes = poses_of(capture)[:, :, 3]
+    if len(eyes) < 2 or np.ptp(eyes, axis=0).max() > 1e-6 * (1 + np.abs(eyes).max()):
+        return []
+    found = f"{capture.source}: all {len(eyes)} cameras stand in one place"
+    wanted = "places apart: only these tell how far off anything is"
+    return [Finding("ruins", "pose", found, wanted, "photograph while walking, or compute the poses anew")]
+
+
 def judge_focal(capture, evidence):
     """Returns Findings about the focal length, and the Evidence with the one that fits."""
     if len(evidence.tracks.shown) < _ENOUGH:

@@ -68,12 +68,15 @@ def inspect(folder, *, format="auto", near=None, far=None):
     findings += compare_photos.compare(capture, pictures, near_views)
     findings += inspect_points.judge_points(capture)
     evidence = inspect_cameras.gather(capture, pictures, near_views)
-    turned, evidence = inspect_cameras.judge_axes(capture, evidence)
-    focal, evidence = inspect_cameras.judge_focal(capture, evidence)
-    findings += turned + focal + inspect_cameras.judge_views(capture, evidence)
+    wrong = inspect_cameras.judge_places(capture)
+    if not wrong:  # from one place the rays of all poses meet, in the eye
+        wrong, evidence = inspect_cameras.judge_axes(capture, evidence)
+        focal, evidence = inspect_cameras.judge_focal(capture, evidence)
+        findings += focal + inspect_cameras.judge_views(capture, evidence)
+    findings += wrong
     found, followed = inspect_cameras.places(evidence)
     bounds, stated = inspect_depths.ranges(capture, near, far)
-    if stated or not turned:  # computed from poses that are wrong, they mean nothing
+    if stated or not wrong:  # computed from poses that are wrong, they mean nothing
         findings += inspect_depths.judge_bounds(capture, evidence, found, followed, bounds, stated)
     findings += inspect_depths.judge_box(capture, found)
     findings += [_noted(note) for note in whole.notes]
