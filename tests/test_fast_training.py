@@ -154,7 +154,7 @@ def test_hiding_too_eagerly_costs_little_because_cut_rays_do_not_see_the_backgro
     ours = tiny.scores(COMPARED, EAGERLY)
     untreated = tiny.scores(COMPARED, EAGERLY, False)
     assert (wanted - ours).mean() < 1.2
-    assert (wanted - untreated).mean() > 2.0
+    assert (wanted - untreated).mean() > 1.5
     assert (ours - untreated > 0.8).all()
 
 

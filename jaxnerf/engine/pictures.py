@@ -52,7 +52,7 @@ def depth_range(depths, share=0.98):
 def depth_picture(depth, near, far):
     """Returns uint8 [H, W]: white at near, black at far and beyond, even in 1 / depth as parallax is."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(depth > 0, 1 / depth, 0.0)  # NaN is far, too
+        inverse = np.where(depth >= 0, 1 / depth, 0.0)  # NaN is far
     return to_8_bits((inverse - 1 / far) / max(1 / near - 1 / far, 1e-30))
 
 

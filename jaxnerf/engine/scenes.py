@@ -40,24 +40,17 @@ def settle(data):
         data.format = found[0]
         others = f", of {', '.join(found)}: --format takes another" if len(found) > 1 else ""
         lines.append(f"format      {data.format}{others}")
-    if (
-        data.format == "blender" and data.factor and data.background
-    ):  # whose cameras stand where they should: nothing to look up
-        capture, chosen = None, "file"
-    else:
-        capture = formats.read_capture(folder, data.format)
+    # A Blender scene's cameras stand where they should: there may be nothing to look up.
+    known = data.format == "blender" and data.factor and data.background
+    capture = None if known else formats.read_capture(folder, data.format)
+    if capture is not None:
         lines += [f"left out    {note}" for note in capture.notes]
-        chosen = "forward" if data.ndc or world.looks_forward(capture) else "around"
-        if data.format == "blender":
-            chosen = "file"
-        elif data.get("world") is None and data.format == "llff":
-            chosen = "forward"  # as it was before there was a choice
     if not data.factor:
         data.factor, width = copies.factor_for(capture, data.width)
         lines.append(f"factor      {data.factor}, of images {width} px wide")
     if data.get("world", "auto") == "auto":
         with data.unlocked():  # runs from before there was a choice have no such field
-            data.world = chosen
+            data.world = _suited_world(data, capture)
         lines.append(f"world       {data.world}: {WORLDS[data.world]}")
     if data.get("background") == "":
         data.background = "white" if images.has_alpha(capture.frames[0].image) else "none"
@@ -66,6 +59,14 @@ def settle(data):
         data.ndc = data.world == "forward"
         lines.append(f"rays        {'in normalised device coordinates' if data.ndc else 'straight'}")
     return data, lines
+
+
+def _suited_world(data, capture):
+    if data.format == "blender":
+        return "file"
+    if data.get("world") is None and data.format == "llff":
+        return "forward"  # as it was before there was a choice
+    return "forward" if data.ndc or world.looks_forward(capture) else "around"
 
 
 def is_open(data):
