@@ -17,10 +17,6 @@ def read_npy(path, wanted):
     """
     try:
         with path.open("rb") as file:
-            version = np.lib.format.read_magic(file)
-            if version not in ((1, 0), (2, 0)):
-                raise ValueError(f"version {version}")
-            read_header = getattr(np.lib.format, f"read_array_header_{version[0]}_0")
             shape, fortran, dtype = read_header(file)
             if dtype.hasobject:
                 raise ValueError("Python objects, which are never unpickled")
@@ -37,3 +33,15 @@ def read_npy(path, wanted):
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path}: unreadable ({reason}), wanted {wanted}; make it again") from None
     return array
+
+
+def read_header(file):
+    """Returns shape, whether columns come first, and dtype; the open file then stands at the data.
+
+    Raises:
+        Exception: almost any, of a damaged header.
+    """
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version}")
+    return getattr(np.lib.format, f"read_array_header_{version[0]}_0")(file)

@@ -107,6 +107,22 @@ def build_model(config):
     return hierarchical_model(fields, background=background, view_samples=view_samples, **sampling)
 
 
+def check_released(config, origin):
+    """Raises a ValueError where a configuration's networks do what those of a released code do not."""
+    space = config.get("space")
+    if space and space.skip_empty:
+        raise ValueError(f"space.skip_empty is True, wanted False: {origin} trains along whole rays")
+    activations = ("relu", "softplus") if origin == "JaxNeRF" else ("relu",)
+    for name in ("coarse", "fine"):
+        if config[name].density_bias:
+            raise ValueError(f"{name}.density_bias is {config[name].density_bias}, wanted 0 as in {origin}")
+        if config[name].density_activation not in activations:
+            raise ValueError(
+                f"{name}.density_activation is {config[name].density_activation!r}, wanted "
+                f"{' or '.join(map(repr, activations))} as in {origin}"
+            )
+
+
 def skipping_model(config, model, look):
     """Returns what skip_empty_afterwards does, for a configuration whose space section has no open sizes."""
     return skip_empty_afterwards(model, _space(config, None), look, **_view_options(config))

@@ -73,10 +73,10 @@ def fit_config(config, views):
     return config, lines
 
 
-def fit_data(config):
+def fit_data(config, *, missing_ok=False):
     """Returns a copy of a configuration whose data section is settled, and lines that say what was found."""
     config = copy.deepcopy(config)
-    data, lines = scenes.settle(config.data)
+    data, lines = scenes.settle(config.data, missing_ok=missing_ok)
     config.data = data
     return config, lines
 

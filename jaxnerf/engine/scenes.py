@@ -25,16 +25,21 @@ OPEN = {
 }
 
 
-def settle(data):
+def settle(data, *, missing_ok=False):
     """Returns a copy of a data section without what is left to the capture, and lines that say what it is.
 
     See OPEN: the format, the factor that brings images to data.width, the world, what is behind alpha, and
-    whether to use NDC.
+    whether to use NDC. missing_ok: whether all of it stays open where there is no such folder.
     """
     data, lines = copy.deepcopy(data), []
     if data.format == "synthetic" or not is_open(data):
         return data, lines
-    folder = scene_folder(data.dir)
+    try:
+        folder = scene_folder(data.dir)
+    except ValueError:
+        if missing_ok:
+            return data, lines
+        raise
     if data.format == "auto":
         found = formats.formats_in(folder)
         data.format = found[0]
