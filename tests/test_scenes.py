@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ml_collections import ConfigDict
 
 import captures
 from configs import capture, default
@@ -282,3 +283,11 @@ def test_the_real_ones(scenes_dir, name, format, world, ndc):
     assert data.factor == {"fern": 20, "fox": 5, "can": 4, "lego": 4}[name]
     missing = [line for line in lines if "left out" in line]
     assert len(missing) == (1 if name == "fox" else 0)
+
+
+def test_runs_from_before_there_was_a_choice_keep_the_captures_bounds(tmp_path):
+    captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
+    data = a_data(tmp_path, near=2.5, far=5.5)
+    old = ConfigDict({key: value for key, value in data.to_dict().items() if key != "width"})
+    views = scenes.load_views(old, "train")
+    np.testing.assert_array_equal(views.near, scenes.load_views(a_data(tmp_path), "train").near)

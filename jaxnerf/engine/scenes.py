@@ -125,7 +125,9 @@ def _read_views(data, split):
         capture, to_file = world.recenter(capture)
     elif data.world == "around":
         capture, to_file = world.center(capture)
-    capture = bounds.given(capture, data.near, data.far, to_file)
+    # Runs from before data.width have near and far of Blender's scenes in every format.
+    near, far = (data.near, data.far) if "width" in data else (0.0, 0.0)
+    capture = bounds.given(capture, near, far, to_file)
     views = photos.load_views(capture, split=split, factor=data.factor, background=background_of(data))
     box = None if capture.box is None else np.float32(capture.box)
     return dataclasses.replace(views, to_file=np.float32(to_file), box=box)
