@@ -11,7 +11,8 @@ from jaxnerf import Rays, create_grid, render_packed, render_samples, restrict_s
 from jaxnerf.core.contraction import contract, expand
 from jaxnerf.core.occupancy import occupied_at
 from jaxnerf.engine.extraction import crop_grid, visible_grid
-from jaxnerf.engine.space import contracted_field, make_space, samples_in_box
+from jaxnerf.engine.marching import samples_in_box
+from jaxnerf.engine.space import contracted_field, make_space
 from jaxnerf.fields.mlp import Field
 
 ROOM, SIDE = 0.5, 32  # half the plain part's side, cells a side

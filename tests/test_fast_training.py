@@ -19,8 +19,9 @@ from jaxnerf.engine.build import build
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.evaluate import reference
 from jaxnerf.engine.fit import fit_config, is_open
+from jaxnerf.engine.marching import samples_in_box
 from jaxnerf.engine.packed import packed_model
-from jaxnerf.engine.space import make_space, samples_in_box
+from jaxnerf.engine.space import make_space
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
 from jaxnerf.engine.workdir import read_config

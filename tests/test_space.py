@@ -13,6 +13,7 @@ from helpers import compiled, full_grid, rays_past_origin
 from jaxnerf import Rays
 from jaxnerf.core import occupancy
 from jaxnerf.data import synthetic
+from jaxnerf.engine import marching
 from jaxnerf.engine import space as spaces
 from jaxnerf.engine.extraction import crop_grid
 from jaxnerf.fields import showcase
@@ -215,7 +216,7 @@ def test_samples_stand_for_all_of_the_way_through_the_box(step, random, stretch)
         origins=-2 * diagonal, directions=diagonal, viewdirs=diagonal, near=np.zeros(4), far=np.full(4, 9)
     ))  # fmt: skip
     keys = jax.random.split(jax.random.key(0), 64) if random else None
-    samples_in_box = compiled(spaces.samples_in_box, "step", "cell")
+    samples_in_box = compiled(marching.samples_in_box, "step", "cell")
     cell = tuple(1 / size for size in grid.possible.shape)
     samples = samples_in_box(keys, grid, rays, step=float(step), cell=cell, stretch=stretch)
     step = step * stretch

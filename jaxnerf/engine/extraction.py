@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxnerf.core import occupancy
 from jaxnerf.core.packing import needed_samples
-from jaxnerf.engine.space import samples_in_box
+from jaxnerf.engine.marching import samples_in_box
 
 _AT_ONCE = 2**11  # rays
 _INVISIBLE = 1 / 512  # half a step of 8 bits

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxnerf.core import occupancy
 from jaxnerf.core.packing import render_packed
 from jaxnerf.engine.extraction import crop_grid, rays_to_look, visible_grid
+from jaxnerf.engine.marching import samples_in_box
 from jaxnerf.engine.models import Model
-from jaxnerf.engine.space import samples_in_box
 
 _STEP_IN_FOG = 3.0  # times the step
 
