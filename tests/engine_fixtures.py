@@ -1,5 +1,7 @@
 """Fixtures that the tests of the engine share, by pytest_plugins = ["engine_fixtures"]."""
 
+import os
+
 import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
@@ -13,7 +15,10 @@ _OPTIONS = {"jax_persistent_cache_min_compile_time_secs": 0.5}
 @pytest.fixture(scope="session")
 def compiled_once(tmp_path_factory):
     """Keeps what takes long to compile on disk: many processes of these tests run the same step."""
-    options = {**_OPTIONS, "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled"))}
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:  # whose parent is what all of its workers share
+        folder = folder.parent
+    options = {**_OPTIONS, "jax_compilation_cache_dir": str(folder / "compiled")}
     old = {name: getattr(jax.config, name) for name in options}
     with pytest.MonkeyPatch.context() as patch:
         for name, value in options.items():

@@ -67,18 +67,17 @@ def test_ssim_is_that_of_the_oracle_scikit_image_and_dm_pix(noise):
     )
 
 
-@pytest.mark.parametrize("shape", [(16, 23, 3), (90, 70, 3)])
-def test_random_images_have_the_figures_of_scikit_image_and_dm_pix(shape):
-    a, b = np.random.default_rng(7).uniform(size=(2, *shape)).astype(np.float32)
+def test_random_images_have_the_figures_of_scikit_image_and_dm_pix():
+    a, b = np.random.default_rng(7).uniform(size=(2, 17, 20, 3)).astype(np.float32)
     assert_ssim_is_theirs(a, b)
     assert_psnr_is_theirs(a, b)
-    assert_psnr_is_theirs(*pair(8, 0.003, shape))
+    assert_psnr_is_theirs(*pair(8, 0.003))
 
 
 @pytest.mark.scenes("lego")
 def test_photographs_have_the_figures_of_scikit_image_and_dm_pix(scenes_dir):
-    """800 x 800 px, mostly white; a pair, and one beside itself with noise of 40 dB in 8 bits."""
-    views = blender.load_views(scenes_dir / "lego", split="test", factor=1)
+    """200 x 200 px, mostly white; a pair, and one beside itself with noise of 40 dB in 8 bits."""
+    views = blender.load_views(scenes_dir / "lego", split="test", factor=4)
     a, b = (np.asarray(reference(views, index)) for index in (0, 1))
     noise = np.random.default_rng(9).normal(scale=0.01, size=a.shape).astype(np.float32)
     for other in (b, np.asarray(round_to_8_bits(a + noise))):
@@ -93,7 +92,7 @@ def assert_ssim_is_theirs(a, b):
     valid_map = skimage.metrics.structural_similarity(a64, b64, **options)[1][5:-5, 5:-5]
     np.testing.assert_allclose(fast_ssim(a, b), valid_map.mean(), atol=1e-5)
     with jax.enable_x64(True):  # in float32 its differences of squares are 3e-5 off on a white photograph
-        pix = float(dm_pix.ssim(a64, b64))
+        pix = float(jax.jit(dm_pix.ssim)(a64, b64))
     np.testing.assert_allclose(fast_ssim(a, b), pix, atol=1e-5)
 
 
