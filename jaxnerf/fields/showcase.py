@@ -1,7 +1,8 @@
 """The scene that comes with the package: a still life in closed form, inside the box +-1.2.
 
 On a checked plinth stand a striped pillar, a banded ring, a block of blue glass and a polished ball. Above
-them floats a lamp, a dark core in amber glass. Only the ball looks different from different directions.
+them floats a lamp, a dark core in amber glass. Only the ball looks different from different directions; in
+the matt scene nothing does.
 
 A body is a signed distance d (negative inside), a peak density and a colour. Its density is
 peak * sigmoid(-d / width), thin enough for a crisp outline and smooth enough for a quadrature to converge.
@@ -28,6 +29,15 @@ def scene(x, viewdirs):
     Raises:
         ValueError: on other shapes.
     """
+    return _still_life(x, viewdirs, _ball)
+
+
+def matt_scene(x, viewdirs):
+    """Returns what scene does for the same still life with a matt ball: no colour depends on viewdirs."""
+    return _still_life(x, viewdirs, lambda x, y, z, look: _matt_ball(x, y, z))
+
+
+def _still_life(x, viewdirs, ball):
     pattern = "... 1 3" if jnp.shape(viewdirs)[-2:-1] == (1,) else "... S 3"
     check_shapes("showcase.scene", x=(x, "... S 3"), viewdirs=(viewdirs, pattern))
     place = x[..., 0], x[..., 1], x[..., 2]
@@ -39,7 +49,7 @@ def scene(x, viewdirs):
         _block(*place),
         _lamp_core(*place),
         _lamp_glass(*place),
-        _ball(*place, look),
+        ball(*place, look),
     )
     width = 0.015
     density, share, rgb = 0.0, 0.0, (0.0, 0.0, 0.0)
@@ -107,12 +117,21 @@ def _lamp_glass(x, y, z):
 
 def _ball(x, y, z, look):
     """Blinn and Phong's highlight: brightest where the normal halves the angle between light and camera."""
-    x, y, z = x + 0.38, y + 0.38, z + 0.18
+    distance, peak, base = _matt_ball(x, y, z)
+    x, y, z = _from_ball(x, y, z)
     halfway = tuple(towards - direction for towards, direction in zip(_light(), look, strict=True))
     aligned = (x * halfway[0] + y * halfway[1] + z * halfway[2]) / (_norm(x, y, z) * _norm(*halfway))
     highlight = 0.9 * jnp.maximum(aligned, 0.0) ** 24
-    base = _scale((0.70, 0.05, 0.08), _lambert(x, y, z))
-    return _norm(x, y, z) - 0.44, 50.0, tuple(value + highlight * (1 - value) for value in base)
+    return distance, peak, tuple(value + highlight * (1 - value) for value in base)
+
+
+def _matt_ball(x, y, z):
+    x, y, z = _from_ball(x, y, z)
+    return _norm(x, y, z) - 0.44, 50.0, _scale((0.70, 0.05, 0.08), _lambert(x, y, z))
+
+
+def _from_ball(x, y, z):
+    return x + 0.38, y + 0.38, z + 0.18
 
 
 def _light():
