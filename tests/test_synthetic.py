@@ -151,6 +151,18 @@ def test_only_the_ball_depends_on_the_direction():
     np.testing.assert_allclose(matt_bright[1:], bright[1:], atol=1e-6)
 
 
+def test_in_the_shiny_scene_all_that_is_round_and_opaque_has_highlights():
+    centers = {"pillar": (-0.40, 0.46, -0.02), "ring": (0.48, 0.36, -0.04), "ball": (-0.38, -0.38, -0.18)}
+    light = jnp.array([0.48, -0.36, 0.80])
+    around = jax.random.uniform(jax.random.key(0), (3, 8000, 3), minval=-0.9, maxval=0.9)
+    x = around + jnp.array(list(centers.values()))[:, None, :]
+    scenes = [jax.jit(scene) for scene in (showcase.shiny_scene, showcase.matt_scene)]
+    (density, shiny), (same, matt) = (scene(x, jnp.broadcast_to(-light, (3, 1, 3))) for scene in scenes)
+    np.testing.assert_array_equal(density, same)
+    assert (jnp.where(density[..., None] > 25, shiny - matt, 0).max(axis=(1, 2)) > 0.4).all()
+    assert (shiny >= matt - 1e-6).all() and (shiny <= 1).all()
+
+
 def test_field_is_bounded_with_finite_gradients():
     x = jax.random.uniform(jax.random.key(0), (500, 4, 3), minval=-2.0, maxval=2.0)
     special = jnp.array([0.0, -0.38, -0.71, 0.22, 1e3, -0.40, 0.46, 0.42])  # centres, and far away

@@ -21,10 +21,10 @@ _DISTANCE = 4.0  # of every camera from the origin, world units
 _DEPTH = 1.4  # of the scene before and behind the origin along any axis: the plinth's edge is 1.27 from it
 _CYLINDER = {"radius": 1.14, "ends": (-0.97, 1.1)}  # around the z axis, holds all density; world units
 _WHITE = (1.0, 1.0, 1.0)
-FINISHES = {"shiny": showcase.scene, "matt": showcase.matt_scene}
+FINISHES = {"usual": showcase.scene, "matt": showcase.matt_scene, "shiny": showcase.shiny_scene}
 
 
-def load_views(*, split="train", size=100, finish="shiny", cache=None):
+def load_views(*, split="train", size=100, finish="usual", cache=None):
     """Returns views of the built-in still life, with alpha, to be composited over white.
 
     This package's renderer makes them from a field in closed form. Each pixel is one ray through its centre:
@@ -33,7 +33,8 @@ def load_views(*, split="train", size=100, finish="shiny", cache=None):
     Args:
         split: "train" (60 views), "val" (8) or "test" (8). No two of the 76 have the same pose.
         size: H = W in px, >= 1. All 60 views take about ten seconds at 100, once.
-        finish: "shiny", or "matt" for the same without the highlight on the ball: no view direction matters.
+        finish: "usual", with a highlight on the ball; "matt", without, so that no view direction matters;
+            "shiny", with highlights on half of what is there.
         cache: folder for the rendered pixels; None for jaxnerf in $XDG_CACHE_HOME or ~/.cache. Where it
             cannot be used they are rendered again, with a warning in the log.
 

@@ -97,7 +97,7 @@ def load_views(data, split):
 
 def _read_views(data, split):
     if data.format == "synthetic":
-        finish = data.get("finish", "shiny")  # as it was before there was a choice
+        finish = data.get("finish", "usual")  # as it was before there was a choice
         return synthetic.load_views(split=split, size=data.size, finish=finish)
     data, _ = settle(data)
     folder = scene_folder(data.dir)
