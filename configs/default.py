@@ -34,6 +34,7 @@ def get_config():
                 "factor": 1,  # images are area-averaged down this many times; 0: to data.width
                 "width": 800,  # px, about
                 "size": 100,  # px, side of the embedded scene's images
+                "finish": "usual",  # of the embedded scene; "matt": the same from everywhere; "shiny"
                 "near": 0.0,  # along the camera's axis, in the file's units; 0: by the capture, 2 for Blender
                 "far": 0.0,  # the same; 0: by the capture, 6 for Blender
                 # behind alpha and behind the scene: "white", "black", "none"; "": white where there is alpha

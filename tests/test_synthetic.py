@@ -91,17 +91,17 @@ def test_the_frame_holds_the_whole_scene(test_images):
 def test_cache_returns_the_same_bits_without_rendering(tmp_path, monkeypatch):
     first = synthetic.load_views(split="val", size=8, cache=tmp_path).pixels
     (path,) = tmp_path.iterdir()
-    monkeypatch.setattr(synthetic, "render_views", lambda stack: pytest.fail("rendered again"))
+    monkeypatch.setattr(synthetic, "render_views", lambda *_: pytest.fail("rendered again"))
     np.testing.assert_array_equal(synthetic.load_views(split="val", size=8, cache=tmp_path).pixels, first)
     # A changed source has another name, and so have another size and split.
     monkeypatch.setattr(
-        synthetic, "render_views", lambda stack: np.zeros((8 * stack.height**2, 4), np.uint16)
+        synthetic, "render_views", lambda stack, scene: np.zeros((8 * stack.height**2, 4), np.uint16)
     )
-    for change in ({"size": 9}, {"split": "test"}):
+    for change in ({"size": 9}, {"split": "test"}, {"finish": "matt"}):
         synthetic.load_views(**{"split": "val", "size": 8, **change}, cache=tmp_path)
     monkeypatch.setattr(synthetic, "_fingerprint", lambda: "changed")
     assert not synthetic.load_views(split="val", size=8, cache=tmp_path).pixels.any()
-    assert len(list(tmp_path.iterdir())) == 4 and path.exists()
+    assert len(list(tmp_path.iterdir())) == 5 and path.exists()
 
 
 def test_broken_cache_is_rendered_again(tmp_path, caplog):
@@ -144,6 +144,23 @@ def test_only_the_ball_depends_on_the_direction():
     np.testing.assert_array_equal(density, same)
     changed = np.abs(bright - dark).max(axis=(1, 2))
     assert changed[0] > 0.3 and (changed[1:] < 1e-6).all() and (density > 1).all()
+    matt = jax.jit(showcase.matt_scene)
+    (matt_density, matt_bright), (_, matt_dark) = matt(x, down), matt(x, -down)
+    np.testing.assert_array_equal(matt_density, density)
+    np.testing.assert_array_equal(matt_bright, matt_dark)
+    np.testing.assert_allclose(matt_bright[1:], bright[1:], atol=1e-6)
+
+
+def test_in_the_shiny_scene_all_that_is_round_and_opaque_has_highlights():
+    centers = {"pillar": (-0.40, 0.46, -0.02), "ring": (0.48, 0.36, -0.04), "ball": (-0.38, -0.38, -0.18)}
+    light = jnp.array([0.48, -0.36, 0.80])
+    around = jax.random.uniform(jax.random.key(0), (3, 8000, 3), minval=-0.9, maxval=0.9)
+    x = around + jnp.array(list(centers.values()))[:, None, :]
+    scenes = [jax.jit(scene) for scene in (showcase.shiny_scene, showcase.matt_scene)]
+    (density, shiny), (same, matt) = (scene(x, jnp.broadcast_to(-light, (3, 1, 3))) for scene in scenes)
+    np.testing.assert_array_equal(density, same)
+    assert (jnp.where(density[..., None] > 25, shiny - matt, 0).max(axis=(1, 2)) > 0.4).all()
+    assert (shiny >= matt - 1e-6).all() and (shiny <= 1).all()
 
 
 def test_field_is_bounded_with_finite_gradients():
@@ -166,6 +183,8 @@ def test_field_is_bounded_with_finite_gradients():
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="split is 'all', .*train, val, test"):
         synthetic.load_views(split="all")
+    with pytest.raises(ValueError, match="finish is 'wet', wanted one of .*correct data.finish"):
+        synthetic.load_views(finish="wet")
     for size in (0, 2.5, True):
         with pytest.raises(ValueError, match="size is"):
             synthetic.load_views(size=size)

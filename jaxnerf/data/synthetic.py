@@ -21,9 +21,10 @@ _DISTANCE = 4.0  # of every camera from the origin, world units
 _DEPTH = 1.4  # of the scene before and behind the origin along any axis: the plinth's edge is 1.27 from it
 _CYLINDER = {"radius": 1.14, "ends": (-0.97, 1.1)}  # around the z axis, holds all density; world units
 _WHITE = (1.0, 1.0, 1.0)
+FINISHES = {"usual": showcase.scene, "matt": showcase.matt_scene, "shiny": showcase.shiny_scene}
 
 
-def load_views(*, split="train", size=100, cache=None):
+def load_views(*, split="train", size=100, finish="usual", cache=None):
     """Returns views of the built-in still life, with alpha, to be composited over white.
 
     This package's renderer makes them from a field in closed form. Each pixel is one ray through its centre:
@@ -32,6 +33,8 @@ def load_views(*, split="train", size=100, cache=None):
     Args:
         split: "train" (60 views), "val" (8) or "test" (8). No two of the 76 have the same pose.
         size: H = W in px, >= 1. All 60 views take about ten seconds at 100, once.
+        finish: "usual", with a highlight on the ball; "matt", without, so that no view direction matters;
+            "shiny", with highlights on half of what is there.
         cache: folder for the rendered pixels; None for jaxnerf in $XDG_CACHE_HOME or ~/.cache. Where it
             cannot be used they are rendered again, with a warning in the log.
 
@@ -39,18 +42,20 @@ def load_views(*, split="train", size=100, cache=None):
         Views: pixels [V * size * size, 4] uint16, rays through t in [2.6, 5.4].
 
     Raises:
-        ValueError: on another split or size.
+        ValueError: on another split, size or finish.
     """
     if split not in _COUNT:
         raise ValueError(f"split is {split!r}, the built-in scene has {', '.join(_COUNT)}; take one of these")
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= 4096:
         raise ValueError(f"size is {size!r}, wanted a whole number of pixels from 1 to 4096; 100 is usual")
+    if finish not in FINISHES:
+        raise ValueError(f"finish is {finish!r}, wanted one of {sorted(FINISHES)}; correct data.finish")
     count, size = _COUNT[split], int(size)
     stack = _cameras(split, size)
     pixels = load_or_make(
         cache,
-        f"showcase_{split}_{size}_{_fingerprint()}",
-        lambda: render_views(stack),
+        f"showcase_{finish}_{split}_{size}_{_fingerprint()}",
+        lambda: render_views(stack, FINISHES[finish]),
         shape=(count * size * size, 4),
         dtype=np.uint16,
     )
@@ -66,11 +71,12 @@ def load_views(*, split="train", size=100, cache=None):
     )
 
 
-def render_views(stack, *, num_segments=384, chunk=1024):
+def render_views(stack, scene=showcase.scene, *, num_segments=384, chunk=1024):
     """Returns the pixels of a stack of V cameras, [V * H * W, 4] uint16 with straight alpha.
 
     Args:
         stack: Camera [V], of one height and width.
+        scene: what they see, a SceneFn.
         num_segments: of the midpoint rule on the longest way through the scene, even. Ways of up to half
             that length take half as many, which saves a quarter of the work and keeps the segments short.
         chunk: rays at once. No pixel depends on it.
@@ -84,7 +90,9 @@ def render_views(stack, *, num_segments=384, chunk=1024):
         for start in range(0, indices.size, chunk):
             index = indices[np.minimum(np.arange(start, start + chunk), indices.size - 1)]  # one shape
             part = jax.tree.map(lambda leaf, index=index: leaf[index], rays)
-            parts.append(_render(part, num_segments // share))  # returns at once: the device stays busy
+            parts.append(
+                _render(part, scene, num_segments // share)
+            )  # returns at once: the device stays busy
         if parts:
             seen[indices] = np.concatenate(parts)[: indices.size]
     return images.to_straight(seen[:, :3], seen[:, 3], background=_WHITE)
@@ -129,9 +137,9 @@ def _all_rays(stack):
     return jax.vmap(lambda camera: cameras.rays_from_pixels(camera, grid, near=0.0, far=1.0))(stack)
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def _render(rays, num_segments):
-    result = rendering.render_rays(None, showcase.scene, rays, num_samples=num_segments)
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _render(rays, scene, num_segments):
+    result = rendering.render_rays(None, scene, rays, num_samples=num_segments)
     return jnp.concatenate([result.rgb, result.opacity[:, None]], axis=-1)
 
 

@@ -97,7 +97,8 @@ def load_views(data, split):
 
 def _read_views(data, split):
     if data.format == "synthetic":
-        return synthetic.load_views(split=split, size=data.size)
+        finish = data.get("finish", "usual")  # as it was before there was a choice
+        return synthetic.load_views(split=split, size=data.size, finish=finish)
     data, _ = settle(data)
     folder = scene_folder(data.dir)
     if data.world not in WORLDS or (data.format == "blender" and data.world != "file"):

@@ -18,7 +18,7 @@ FREE = (
 )
 FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "eval.")
 # Fields that runs may be older than, and what they were then; None: whatever it is now.
-SINCE = {"data.width": None, "data.world": None, "space.outside": "nothing"}
+SINCE = {"data.finish": "usual", "data.width": None, "data.world": None, "space.outside": "nothing"}
 SECTIONS = ("data", "coarse", "fine", "sampling", "train", "eval")
 
 

@@ -1,7 +1,8 @@
 """The scene that comes with the package: a still life in closed form, inside the box +-1.2.
 
 On a checked plinth stand a striped pillar, a banded ring, a block of blue glass and a polished ball. Above
-them floats a lamp, a dark core in amber glass. Only the ball looks different from different directions.
+them floats a lamp, a dark core in amber glass. Only the ball looks different from different directions; in
+the matt scene nothing does, in the shiny one the pillar, the ring and the lamp's core do, too.
 
 A body is a signed distance d (negative inside), a peak density and a colour. Its density is
 peak * sigmoid(-d / width), thin enough for a crisp outline and smooth enough for a quadrature to converge.
@@ -12,6 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxnerf.core.structs import check_shapes
+
+_POLISH, _SHEEN = 24, 6  # exponents of highlights: small and wide ones
 
 
 def scene(x, viewdirs):
@@ -28,18 +31,34 @@ def scene(x, viewdirs):
     Raises:
         ValueError: on other shapes.
     """
+    return _still_life(x, viewdirs, ball=True)
+
+
+def matt_scene(x, viewdirs):
+    """Returns what scene does for the same still life with a matt ball: no colour depends on viewdirs."""
+    return _still_life(x, viewdirs)
+
+
+def shiny_scene(x, viewdirs):
+    """Returns what scene does for the same still life with highlights on all that is round and opaque."""
+    return _still_life(x, viewdirs, ball=True, others=True)
+
+
+def _still_life(x, viewdirs, *, ball=False, others=False):
+    """ball, others: what has highlights."""
     pattern = "... 1 3" if jnp.shape(viewdirs)[-2:-1] == (1,) else "... S 3"
     check_shapes("showcase.scene", x=(x, "... S 3"), viewdirs=(viewdirs, pattern))
     place = x[..., 0], x[..., 1], x[..., 2]
     look = viewdirs[..., 0], viewdirs[..., 1], viewdirs[..., 2]
+    on_others, on_ball = look if others else None, look if ball else None
     bodies = (
         _plinth(*place),
-        _pillar(*place),
-        _ring(*place),
+        _pillar(*place, on_others),
+        _ring(*place, on_others),
         _block(*place),
-        _lamp_core(*place),
+        _lamp_core(*place, on_others),
         _lamp_glass(*place),
-        _ball(*place, look),
+        _ball(*place, on_ball),
     )
     width = 0.015
     density, share, rgb = 0.0, 0.0, (0.0, 0.0, 0.0)
@@ -66,17 +85,17 @@ def _plinth(x, y, z):
     return jnp.maximum(side, face), 50.0, _scale(_mix(rim, top, on_face), shade)
 
 
-def _pillar(x, y, z):
+def _pillar(x, y, z, look):
     x, y, z = x + 0.40, y - 0.46, z + 0.02
     radius = _norm(x, y)
     cap = z - jnp.clip(z, -0.4, 0.64)
     turn = z / 0.60  # one stripe winds round once in 0.6 units
     stripes = _step((x * _wave(turn + 0.25) + y * _wave(turn)) / radius, 0.12)
     colour = _mix((0.02, 0.36, 0.25), (0.95, 0.86, 0.25), stripes)
-    return _norm(x, y, cap) - 0.24, 50.0, _scale(colour, _lambert(x, y, cap))
+    return _norm(x, y, cap) - 0.24, 50.0, _shaded(colour, (x, y, cap), look, _SHEEN)
 
 
-def _ring(x, y, z):
+def _ring(x, y, z, look):
     x, y, z = x - 0.48, y - 0.36, z + 0.04
     along, across = 0.8 * x - 0.6 * y, 0.6 * x + 0.8 * y  # its axis is horizontal: across
     spoke = _norm(along, z)
@@ -86,7 +105,7 @@ def _ring(x, y, z):
     colour = _mix((0.32, 0.05, 0.42), (0.25, 0.78, 0.85), bands)
     outward = tube / spoke * along
     normal = 0.8 * outward + 0.6 * across, 0.8 * across - 0.6 * outward, tube / spoke * z
-    return _norm(tube, across) - 0.16, 50.0, _scale(colour, _lambert(*normal))
+    return _norm(tube, across) - 0.16, 50.0, _shaded(colour, normal, look, _SHEEN)
 
 
 def _block(x, y, z):
@@ -95,9 +114,9 @@ def _block(x, y, z):
     return rounded - 0.33, 3.5, (0.05, 0.25, 0.80)
 
 
-def _lamp_core(x, y, z):
+def _lamp_core(x, y, z, look):
     x, y, z = x - 0.22, y + 0.10, z - 0.62
-    return _norm(x, y, z) - 0.15, 50.0, _scale((0.45, 0.02, 0.10), _lambert(x, y, z))
+    return _norm(x, y, z) - 0.15, 50.0, _shaded((0.45, 0.02, 0.10), (x, y, z), look, _SHEEN)
 
 
 def _lamp_glass(x, y, z):
@@ -106,13 +125,20 @@ def _lamp_glass(x, y, z):
 
 
 def _ball(x, y, z, look):
-    """Blinn and Phong's highlight: brightest where the normal halves the angle between light and camera."""
     x, y, z = x + 0.38, y + 0.38, z + 0.18
+    return _norm(x, y, z) - 0.44, 50.0, _shaded((0.70, 0.05, 0.08), (x, y, z), look, _POLISH)
+
+
+def _shaded(colour, normal, look, exponent):
+    """Returns a surface's colour: matt where look is None, else with Blinn and Phong's highlight."""
+    base = _scale(colour, _lambert(*normal))
+    if look is None:
+        return base
+    # Brightest where the normal halves the angle between light and camera.
     halfway = tuple(towards - direction for towards, direction in zip(_light(), look, strict=True))
-    aligned = (x * halfway[0] + y * halfway[1] + z * halfway[2]) / (_norm(x, y, z) * _norm(*halfway))
-    highlight = 0.9 * jnp.maximum(aligned, 0.0) ** 24
-    base = _scale((0.70, 0.05, 0.08), _lambert(x, y, z))
-    return _norm(x, y, z) - 0.44, 50.0, tuple(value + highlight * (1 - value) for value in base)
+    aligned = sum(a * b for a, b in zip(normal, halfway, strict=True)) / (_norm(*normal) * _norm(*halfway))
+    highlight = 0.9 * jnp.maximum(aligned, 0.0) ** exponent
+    return tuple(value + highlight * (1 - value) for value in base)
 
 
 def _light():
