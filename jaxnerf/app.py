@@ -1,6 +1,7 @@
 """What the command line programs share: errors of a user's making take one line and no traceback."""
 
 import ctypes
+import signal
 import sys
 
 from absl import app, flags, logging
@@ -14,9 +15,10 @@ def run(
     """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line.
 
     positional: whether arguments without a flag are taken, as argv[1:].
-    stopped: what Ctrl-C left behind, and what to do.
+    stopped: what Ctrl-C or SIGTERM left behind, and what to do.
     """
     _keep_memory()
+    signal.signal(signal.SIGTERM, _interrupt)
     app.run(_without_traceback(main, positional, stopped), flags_parser=_parse)
 
 
@@ -73,10 +75,15 @@ def _without_traceback(main, positional, stopped):
             return main(argv)
         except (ValueError, OSError) as error:
             _leave(1, error)
-        except KeyboardInterrupt:
-            _leave(130, f"stopped {stopped}")
+        except KeyboardInterrupt as interrupt:
+            _leave(128 + (interrupt.args or (signal.SIGINT,))[0], f"stopped {stopped}")
 
     return wrapped
+
+
+def _interrupt(number, _):
+    """Lets SIGTERM clean up as Ctrl-C does."""
+    raise KeyboardInterrupt(number)
 
 
 def _leave(code, error):
