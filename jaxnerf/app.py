@@ -72,6 +72,9 @@ def _without_traceback(main, positional, stopped):
         try:
             if len(argv) > 1 and not positional:
                 raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
+            from jaxnerf.engine.compiled import keep_compiled  # after the flags: a wrong one is said at once
+
+            keep_compiled()
             return main(argv)
         except (ValueError, OSError) as error:
             _leave(1, error)
