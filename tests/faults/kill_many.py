@@ -51,6 +51,9 @@ def main(*, kills, seed, out, config="configs/smoke.py", flags=(), say=print):
         assert after >= before, f"checkpoint {before} is gone"
         redone = max(reached - after, 0)
         assert redone <= SAVE_EVERY, f"{redone} steps are lost, a checkpoint is written every {SAVE_EVERY}"
+        if phase == "steps":
+            with (killed / "metrics.jsonl").open("a") as file:
+                file.write('{"step": 12, "sec')  # as a kill within a write leaves it
         lost, phases[phase] = lost + redone, phases.get(phase, 0) + 1
         came = f"from {'-' if resumed is None else resumed:>4} to {reached:4d}, saved {after:4d}"
         say(f"kill {number:2d}  {seconds:5.1f} s  {phase:9}  {came}")
