@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+import types
 import zlib
 
 import jax
@@ -75,7 +76,9 @@ def test_programs_are_kept_by_default_and_mended_after_a_kill(tmp_path):
 def chosen(monkeypatch, tmp_path):
     """Returns a function: environment variables -> the folder that JAX was given, or None."""
     given = {}
-    monkeypatch.setattr(compiled.jax.config, "update", lambda name, value: given.update({name: value}))
+    config = types.SimpleNamespace(jax_compilation_cache_dir=None)
+    config.update = lambda name, value: given.update({name: value})
+    monkeypatch.setattr(compiled, "jax", types.SimpleNamespace(config=config))
 
     def choose(**variables):
         monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)

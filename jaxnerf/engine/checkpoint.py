@@ -1,8 +1,10 @@
 """Checkpoints: whole or not there, checked by a sum, the last few kept (orbax v1)."""
 
+import functools
 import json
 import os
 import pathlib
+import sys
 import zlib
 
 import jax
@@ -46,6 +48,7 @@ class Checkpoints:
             ValueError: if the checkpoint does not fit, or is not what was saved; names it.
         """
         abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
+        _hush()
         try:
             self._open().reload()  # another process may have written it since
             state = self._open().load(step, abstract)
@@ -117,6 +120,18 @@ def _sum(state):
     for leaf in jax.tree.leaves(state):
         value = zlib.crc32(np.asarray(leaf).tobytes(), value)
     return value
+
+
+@functools.cache
+def _hush():
+    """Leaves out what orbax's readers say that are still under way when another of them has failed."""
+    before = sys.unraisablehook
+
+    def hook(unraisable):
+        if str(unraisable.exc_value) != "Event loop is closed":
+            before(unraisable)
+
+    sys.unraisablehook = hook
 
 
 def _reason(error):

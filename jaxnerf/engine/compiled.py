@@ -17,7 +17,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 def keep_compiled():
     """Lets JAX keep what it compiles, unless JAX_COMPILATION_CACHE_DIR says where, or, if empty, nowhere."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir:
         return
     folder = None
     try:
