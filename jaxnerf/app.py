@@ -1,6 +1,7 @@
 """What the command line programs share: errors of a user's making take one line and no traceback."""
 
 import ctypes
+import signal
 import sys
 
 from absl import app, flags, logging
@@ -14,9 +15,10 @@ def run(
     """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line.
 
     positional: whether arguments without a flag are taken, as argv[1:].
-    stopped: what Ctrl-C left behind, and what to do.
+    stopped: what Ctrl-C or SIGTERM left behind, and what to do.
     """
     _keep_memory()
+    signal.signal(signal.SIGTERM, _interrupt)
     app.run(_without_traceback(main, positional, stopped), flags_parser=_parse)
 
 
@@ -70,13 +72,21 @@ def _without_traceback(main, positional, stopped):
         try:
             if len(argv) > 1 and not positional:
                 raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
+            from jaxnerf.engine.compiled import keep_compiled  # after the flags: a wrong one is said at once
+
+            keep_compiled()
             return main(argv)
         except (ValueError, OSError) as error:
             _leave(1, error)
-        except KeyboardInterrupt:
-            _leave(130, f"stopped {stopped}")
+        except KeyboardInterrupt as interrupt:
+            _leave(128 + (interrupt.args or (signal.SIGINT,))[0], f"stopped {stopped}")
 
     return wrapped
+
+
+def _interrupt(number, _):
+    """Lets SIGTERM clean up as Ctrl-C does."""
+    raise KeyboardInterrupt(number)
 
 
 def _leave(code, error):

@@ -22,4 +22,4 @@ def main(argv):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    app.run(main, stopped="before it could save; the same command goes on from the last checkpoint, if any")

@@ -1,9 +1,7 @@
-"""A run that was stopped, politely or not, ends where an uninterrupted one does."""
+"""A run that was stopped is whole, and its checkpoints give the model to others. Kills: test_faults.py."""
 
 import functools
-import itertools
 import json
-import os
 import shutil
 import signal
 import time
@@ -49,37 +47,6 @@ def long_run(folder):
     return start("train", f"--workdir={folder}", *flags)
 
 
-@pytest.fixture(scope="module")
-def killed(compiled_once, tmp_path_factory):
-    """The workdir of a run that was killed past its checkpoint of step 10."""
-    folder = tmp_path_factory.mktemp("killed") / "run"
-    process = long_run(folder)
-    wait_for_step(folder, process, 12)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    process.communicate()
-    return folder
-
-
-def test_a_killed_run_goes_on_bit_for_bit(killed, tmp_path):
-    assert not any(name.startswith("eval") for name in os.listdir(killed))
-    last = max(Checkpoints(killed).steps())
-    end = last + 10
-    assert last >= 10
-    with (killed / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 12, "sec')  # as a kill inside a write leaves it
-    options = {"log_every": 1, "max_steps": end}
-    assert train_and_evaluate(smoke_config(**options), killed)
-    assert train_and_evaluate(smoke_config(**options), tmp_path / "whole")
-    assert_equal(weights(killed, end), weights(tmp_path / "whole", end))
-    assert logged_steps(killed) == list(range(1, end + 1))
-    whole, parts = records.read_rows(tmp_path / "whole"), records.read_rows(killed)
-    for name in ("loss", "psnr_fine", "lr", "grad_norm", "rays"):
-        assert [row[name] for row in parts] == [row[name] for row in whole], name
-    seconds = [row["seconds"] for row in parts]
-    assert all(a < b for a, b in itertools.pairwise(seconds))
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_saves_and_leaves_in_peace(compiled_once, tmp_path, number):
     folder = tmp_path / "run"
@@ -114,20 +81,6 @@ def test_a_limit_of_seconds_is_not_passed_again_and_again(trained, tmp_path):
     for _ in range(2):
         assert train_and_evaluate(smoke_config(max_steps=100, max_seconds=1e-3), folder)
     assert Checkpoints(folder).steps()[-1] == 20
-
-
-def test_a_broken_checkpoint_is_named_and_nothing_is_lost(trained, tmp_path):
-    folder = shutil.copytree(trained, tmp_path / "run")
-    for path in (folder / "checkpoints" / "20" / "state").rglob("*"):
-        if path.is_file():
-            path.write_bytes(b"")
-    with pytest.raises(ValueError, match="checkpoints/20: cannot be read .*remove it"):
-        train_and_evaluate(smoke_config(max_steps=25), folder)
-    assert Checkpoints(folder).steps() == [10, 15, 20]
-    shutil.rmtree(folder / "checkpoints" / "20")
-    assert train_and_evaluate(smoke_config(), folder)
-    assert_equal(weights(folder, 20), weights(trained, 20))
-    assert logged_steps(folder) == [5, 10, 15, 20]
 
 
 def test_load_scene_gives_the_model_to_other_code(trained):

@@ -1,8 +1,14 @@
-"""Checkpoints: atomic, the last few kept (orbax v1)."""
+"""Checkpoints: whole or not there, checked by a sum, the last few kept (orbax v1)."""
 
+import functools
+import json
+import os
 import pathlib
+import sys
+import zlib
 
 import jax
+import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 
@@ -28,7 +34,7 @@ class Checkpoints:
         step = int(state.step)
         if step not in self.steps():
             try:
-                self._open().save(step, state, force=True)
+                self._open().save(step, state, force=True, custom_metadata={"crc32": _sum(state)})
             except Exception as error:  # orbax raises many kinds
                 raise ValueError(
                     f"{self._folder / str(step)}: cannot be written ({_reason(error)}); make room and start "
@@ -39,17 +45,41 @@ class Checkpoints:
         """Returns the state at a step, shaped and placed as like.
 
         Raises:
-            ValueError: if the checkpoint does not fit; names it.
+            ValueError: if the checkpoint does not fit, or is not what was saved; names it.
         """
         abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
+        _hush()
         try:
             self._open().reload()  # another process may have written it since
-            return self._open().load(step, abstract)
+            state = self._open().load(step, abstract)
+            self._check_sum(step, state)
         except Exception as error:  # orbax raises many kinds
             raise ValueError(
                 f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
                 "remove it to go on from the one before"
             ) from error
+        return state
+
+    def load_newest(self, like):
+        """Returns the state of the newest checkpoint that can be read, or like; and lines on the others.
+
+        Those that are newer and cannot be read are renamed, never removed. Where none can be read, the
+        fault is more likely ours than the disk's, and starting anew would waste the run.
+
+        Raises:
+            ValueError: if there are checkpoints and none can be read; names the newest.
+        """
+        failed = []
+        for step in reversed(self.steps()):
+            try:
+                state = self.load(step, like)
+            except ValueError as error:
+                failed.append((step, error))
+            else:
+                return state, [self._set_aside(*each) for each in failed]
+        if failed:
+            raise failed[0][1]
+        return like, []
 
     def close(self):
         if self._writer is not None:
@@ -57,10 +87,54 @@ class Checkpoints:
 
     def _open(self):
         if self._writer is None:
-            # Opened late: it makes the folder, and a reader should make none.
-            self._writer = ocp.training.Checkpointer(self._folder, preservation_policy=self._keep)
+            # Opened late: it makes the folder, and a reader should make none. Only the one that writes may
+            # take an unfinished checkpoint for the rest of a killed process.
+            self._writer = ocp.training.Checkpointer(
+                self._folder,
+                preservation_policy=self._keep,
+                cleanup_tmp_directories=self._keep is not None,
+                lightweight_initialize=True,  # else a damaged one would keep all from being read
+            )
         return self._writer
+
+    def _check_sum(self, step, state):
+        """Raises a ValueError where a state is not the one that was saved: orbax notices no wrong number."""
+        wanted = json.loads((self._folder / str(step) / "_CHECKPOINT_METADATA").read_text())
+        wanted = (wanted.get("custom_metadata") or {}).get("crc32")  # which older runs do not have
+        if wanted is not None and wanted != _sum(state):
+            raise ValueError("its numbers are not those that were saved")
+
+    def _set_aside(self, step, error):
+        path, number = self._folder / f"{step}.unreadable", 1
+        while path.exists():
+            path, number = self._folder / f"{step}.unreadable-{number + 1}", number + 1
+        os.replace(self._folder / str(step), path)
+        self._writer.reload()  # else it would still count as there
+        why = str(error).removesuffix("; remove it to go on from the one before")
+        return f"{why}; kept as {path.name}, going on from the one before"
+
+
+def _sum(state):
+    """Returns a checksum of all numbers of a state."""
+    value = 0
+    for leaf in jax.tree.leaves(state):
+        value = zlib.crc32(np.asarray(leaf).tobytes(), value)
+    return value
+
+
+@functools.cache
+def _hush():
+    """Leaves out what orbax's readers say that are still under way when another of them has failed."""
+    before = sys.unraisablehook
+
+    def hook(unraisable):
+        if str(unraisable.exc_value) != "Event loop is closed":
+            before(unraisable)
+
+    sys.unraisablehook = hook
 
 
 def _reason(error):
+    while error.__cause__ is not None:  # orbax says last what it tried, and first what went wrong
+        error = error.__cause__
     return (str(error).splitlines() or [type(error).__name__])[0][:400]

@@ -52,9 +52,10 @@ def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False
     partial = target.with_name(name + ".tmp")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        results = _write_scores(
-            run, folder, views, weights, split=split, step=step, chunk=chunk, partial=partial
-        )
+        with workdir.naming(partial):
+            results = _write_scores(
+                run, folder, views, weights, split=split, step=step, chunk=chunk, partial=partial
+            )
     except BaseException:  # a full disk, Ctrl-C
         shutil.rmtree(partial, ignore_errors=True)
         raise

@@ -1,6 +1,7 @@
 """The training loop: resume, step, log, save, stop cleanly."""
 
 import functools
+import pathlib
 import sys
 import time
 
@@ -13,6 +14,7 @@ from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
 from jaxnerf.engine.fit import fit_config, fit_data
+from jaxnerf.engine.lock import alone
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
 
@@ -25,10 +27,11 @@ def train_and_evaluate(config, folder):
         folder: the workdir; made if missing.
 
     Returns:
-        Whether training came to its end (False: stopped by Ctrl-C or SIGTERM, saved).
+        Whether training and its scores came to their end (False: stopped by Ctrl-C or SIGTERM, saved).
 
     Raises:
-        ValueError: on bad input, or when too many steps in a row were not finite.
+        ValueError: on bad input, when another process trains in folder, or when too many steps in a row
+            were not finite.
     """
     started = time.perf_counter()
     config, found = fit_data(config)
@@ -39,15 +42,14 @@ def train_and_evaluate(config, folder):
     options = experiment.train
     devices = parallel.devices_of(options.parallel)
     parallel.split_positions(options.batch_size, len(devices), options.block_size)
-    workdir.claim(folder, config)
-    print(
-        "\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *chosen]),
-        file=sys.stderr,
-    )
-    finished = train(experiment, views, folder)
-    if finished and experiment.eval.at_end:
-        evaluate(folder)
-    return finished
+    with alone(folder):
+        workdir.claim(folder, config)
+        print(
+            "\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *chosen]),
+            file=sys.stderr,
+        )
+        finished = train(experiment, views, folder)
+        return finished and (not experiment.eval.at_end or _score(folder))
 
 
 def train(experiment, views, folder):
@@ -55,8 +57,8 @@ def train(experiment, views, folder):
     options = experiment.train
     run, state, data, survey_seconds, compile_seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, keep=options.keep)
-    if checkpoints.steps():
-        state = checkpoints.load(checkpoints.steps()[-1], state)
+    state, unreadable = checkpoints.load_newest(state)
+    print(*unreadable, sep="\n", end="\n" if unreadable else "", file=sys.stderr)
     first = int(state.step)
     log = records.Records(folder, first_step=first)
     before = log.rows[-1]["seconds"] if log.rows else 0.0
@@ -72,13 +74,14 @@ def train(experiment, views, folder):
             jax.block_until_ready(recent[-2:][0])  # one step in flight, no more: a stop is prompt
             late = 0 < options.max_seconds <= clock.seconds()
             last = step == options.max_steps or late or interrupt.caught
-            if step % options.log_every == 0 or last:
+            save = step % options.save_every == 0 or last
+            if step % options.log_every == 0 or save:  # a checkpoint's row holds its clock
                 row = _row(experiment, step, recent, clock, compile_seconds)
                 log.append(row)
                 progress.show(step, _text(row, options, late))
                 recent = []
                 _check_finite(row, options, folder)
-            if step % options.save_every == 0 or last:
+            if save:
                 with clock.paused():
                     checkpoints.save(state)
             if last:
@@ -92,6 +95,18 @@ def train(experiment, views, folder):
             file=sys.stderr,
         )
     return not interrupt.caught
+
+
+def _score(folder):
+    """Scores the last checkpoint unless it is scored already; returns whether it is."""
+    if (pathlib.Path(folder) / "eval" / str(Checkpoints(folder).steps()[-1])).exists():
+        return True
+    try:
+        evaluate(folder)
+    except KeyboardInterrupt:
+        print("stopped while scoring; what was trained is saved, the same command scores it", file=sys.stderr)
+        return False
+    return True
 
 
 def _compile(experiment, views):

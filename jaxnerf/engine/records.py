@@ -3,18 +3,27 @@
 import json
 import logging
 import pathlib
+import shutil
 import sys
 
-from jaxnerf.engine.workdir import write_text
+from jaxnerf.engine.workdir import naming, write_text
 
 
 class Records:
     """The metrics of a run, a JSON object a line, ascending in step."""
 
     def __init__(self, workdir, *, first_step):
-        """Opens the file to append; what lies past first_step, or was cut mid-line, is dropped."""
+        """Opens the file to append; what lies past first_step, or is no row, is dropped, the latter aloud."""
         self._path = pathlib.Path(workdir) / "metrics.jsonl"
-        self.rows = [row for row in read_rows(workdir) if row["step"] <= first_step]
+        rows, damaged, cut = _parse(self._path)
+        self.rows = [row for row in rows if row["step"] <= first_step]
+        if damaged:
+            kept = self._path.with_name("metrics.jsonl.damaged")
+            shutil.copyfile(self._path, kept)
+            lines = f"{len(damaged)} lines from line {damaged[0]} on that are no rows"
+            print(f"{self._path}: left out {lines}; the file is kept as {kept.name}", file=sys.stderr)
+        if cut:
+            print(f"{self._path}: left out a last line that was cut short", file=sys.stderr)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self.rows))
         try:
             from tensorboardX import SummaryWriter
@@ -26,7 +35,7 @@ class Records:
     def append(self, row):
         """Adds a row: step and other numbers. NaN and infinity are written as JSON knows them in Python."""
         self.rows.append(row)
-        with self._path.open("a") as file:
+        with naming(self._path), self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
         if self._events is not None:
             for name, value in row.items():
@@ -38,15 +47,31 @@ class Records:
 
 
 def read_rows(workdir):
-    """Returns the whole rows of a workdir's metrics; a last line cut short is left out."""
+    """Returns the whole rows of a workdir's metrics; a last line may be in writing and is left out."""
     path = pathlib.Path(workdir) / "metrics.jsonl"
-    rows = []
-    for line in path.read_text().splitlines() if path.exists() else ():
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            logging.warning("%s: left out a line that was cut short", path)
+    rows, damaged, _ = _parse(path)
+    if damaged:
+        logging.warning("%s: left out %d lines from line %d on", path, len(damaged), damaged[0])
     return rows
+
+
+def _parse(path):
+    """Returns rows, the numbers of lines that are none, and whether the last line was cut short."""
+    *lines, last = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    found = [_row(line) for line in lines]
+    damaged = [number for number, row in enumerate(found, 1) if row is None]
+    if _row(last):
+        found.append(_row(last))
+    return [row for row in found if row], damaged, bool(last) and not _row(last)
+
+
+def _row(line):
+    """Returns the row that a line in bytes holds, or None."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    return row if isinstance(row, dict) and type(row.get("step")) is int and "seconds" in row else None
 
 
 class Progress:

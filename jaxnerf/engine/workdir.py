@@ -1,5 +1,6 @@
 """The folder of a run: which configuration it belongs to, files that are whole or not there."""
 
+import contextlib
 import json
 import os
 import pathlib
@@ -91,14 +92,28 @@ def read_config(workdir):
 
 
 def write_text(path, text):
-    """Writes a text file so that it is there whole or not at all."""
+    """Writes a text file so that it is there whole or not at all, after a loss of power too."""
     path = pathlib.Path(path)
     partial = path.with_name(path.name + ".tmp")
     try:
-        partial.write_text(text)
+        with naming(path), partial.open("w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError:
         partial.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def naming(path):
+    """Adds a path to errors of the system that name none, as while writing to a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
         raise
 
 
