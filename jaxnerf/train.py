@@ -14,13 +14,11 @@ _FORMAT = flags.DEFINE_enum(
 _MULTIHOST = flags.DEFINE_bool(
     "multihost",
     None,
-    "Train as one of several processes: with those that SLURM, Open MPI, Kubernetes or a TPU pod has started. "
-    "When not given: if srun or mpirun has started several.",
+    "Train as one of several processes, that SLURM, Open MPI, Kubernetes or a TPU pod has started. When not "
+    "given: if srun or mpirun has started several.",
 )
-_COORDINATOR = flags.DEFINE_string("coordinator", None, "HOST:PORT of process 0, to find the others by hand.")
-_NUM_PROCESSES = flags.DEFINE_integer(
-    "num_processes", None, "With --coordinator: all of them.", lower_bound=1
-)
+_COORDINATOR = flags.DEFINE_string("coordinator", None, "HOST:PORT of process 0, where all meet.")
+_NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "With --coordinator: of all.", lower_bound=1)
 _PROCESS_ID = flags.DEFINE_integer("process_id", None, "With --coordinator: this one, from 0.", lower_bound=0)
 _JOIN_SECONDS = flags.DEFINE_float(
     "join_seconds", 300.0, "How long to wait for the other processes.", lower_bound=1.0

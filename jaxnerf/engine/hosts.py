@@ -49,9 +49,7 @@ def cluster(*, multihost=None, coordinator=None, num_processes=None, process_id=
     place = launched()
     given = (coordinator, num_processes, process_id)
     if multihost is False and given != (None, None, None):
-        raise ValueError(
-            "--nomultihost keeps to one process, but there is --coordinator or a process; drop it"
-        )
+        raise ValueError("--nomultihost keeps to one process, not to those of --coordinator; drop one")
     if not multihost and coordinator is None and given[1:] != (None, None):
         raise ValueError(f"--num_processes and --process_id need a coordinator; give {_BY_HAND}")
     if multihost is False or (not multihost and coordinator is None and (place or (0, 1))[1] == 1):
@@ -74,8 +72,8 @@ def _check(coordinator, num_processes, process_id):
         raise ValueError(f"--coordinator is {coordinator!r}, wanted HOST:PORT of process 0")
     if num_processes is None or process_id is None or not 0 <= process_id < num_processes:
         raise ValueError(
-            f"--num_processes is {num_processes} and --process_id {process_id}, wanted an id from 0 below the "
-            f"number, a different one for each process; give {_BY_HAND}"
+            f"--num_processes is {num_processes} and --process_id {process_id}, wanted an id from 0 "
+            f"below the number, another for each process; give {_BY_HAND}"
         )
 
 
@@ -88,8 +86,10 @@ def _join(coordinator, num_processes, process_id, seconds):
         try:
             # JAX ends a process that has waited for long enough with a stack trace: that is left to us.
             options = {"initialization_timeout": int(seconds) + 3600}
-            if coordinator is not None and "CUDA_VISIBLE_DEVICES" in os.environ:
-                options["cluster_detection_method"] = "deactivate"  # the devices are chosen already
+            if (
+                coordinator is not None and launched() is None
+            ):  # else JAX gives each process on a machine a GPU
+                options["cluster_detection_method"] = "deactivate"
             jax.distributed.initialize(coordinator, num_processes, process_id, **options)
         except Exception as error:
             failed.append(error)
@@ -98,9 +98,7 @@ def _join(coordinator, num_processes, process_id, seconds):
     thread.start()
     thread.join(seconds)
     if failed and coordinator is None:
-        raise ValueError(
-            f"found no cluster to join ({_line(failed[0])}); start with srun, or give {_BY_HAND}"
-        )
+        raise ValueError(f"no cluster to join ({_line(failed[0])}); start with srun, or give {_BY_HAND}")
     if failed:
         raise ValueError(f"--coordinator={coordinator}: {_line(failed[0])}; give another port")
     if thread.is_alive():
@@ -127,9 +125,7 @@ def _leave(error):
     if isinstance(error, KeyboardInterrupt):
         code, line = 130, "stopped; the same command starts again"
     elif isinstance(error, jax.errors.JaxRuntimeError):
-        line = (
-            f"another process may be gone ({_line(error)}); start all again to go on from the last checkpoint"
-        )
+        line = f"another process may be gone; start all again to go on where it was saved ({_line(error)})"
     elif isinstance(error, ValueError | OSError):
         line = _line(error)
     else:
@@ -200,10 +196,10 @@ def first_does(action, path, seconds=30.0):
         time.sleep(0.1)
     if not os.path.exists(path):
         problem = ValueError(
-            f"{path}: not seen by process {jax.process_index()}; give one all machines share"
+            f"{path}: process {jax.process_index()} does not see it; give one that all share"
         )
     if any_of(problem is not None):
-        raise problem or ValueError(f"{path}: not seen by all processes; give one all machines share")
+        raise problem or ValueError(f"{path}: some process does not see it; give one that all share")
 
 
 def wait():

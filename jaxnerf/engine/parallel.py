@@ -1,9 +1,10 @@
 """The one place that knows about devices: the same step under jit, sharded jit and pmap.
 
-With several processes (see hosts.cluster) the devices are those of all of them. Each process reads all training
-views and keeps them on each of its devices, as it cannot read less: a ray of the batch may be of any pixel, and
-which one follows from its position in the whole batch, so that batches are the same on any number of devices. It
-draws, renders and differentiates the rays of its own devices only; gradients are summed over all devices.
+With several processes (see hosts.cluster) the devices are those of all of them. Each process reads all
+training views and keeps them on each of its devices. It cannot do with less: a ray may be of any pixel, and of
+which one follows from its position in the whole batch, so that batches are the same on any number of devices.
+It draws, renders and differentiates the rays of its own devices only; gradients are summed over all devices.
+The first process alone writes config.json, metrics.jsonl and what is printed; all take part in a checkpoint.
 """
 
 import functools
@@ -88,7 +89,7 @@ def _sharded(train_step, mesh):
 
 
 def _with_state_everywhere(run, everywhere):
-    """Returns the pmapped step with a state of all processes, where pmap gives one of this process's devices."""
+    """Returns the pmapped step with a state of all processes, where pmap gives one of its own devices."""
 
     def whole(leaf):
         parts = [shard.data for shard in leaf.addressable_shards]
@@ -102,7 +103,7 @@ def _with_state_everywhere(run, everywhere):
 
 
 def place(tree, sharding):
-    """Returns the arrays on the devices of a sharding, of which other processes may own some; all have the tree."""
+    """Returns arrays on the devices of a sharding; some may be other processes', which have the same tree."""
     if sharding.is_fully_addressable:
         return jax.device_put(tree, sharding)
 
@@ -118,9 +119,7 @@ def devices_of(mode):
     if mode not in MODES:
         raise ValueError(f"train.parallel is {mode!r}, wanted one of {MODES}")
     if mode == "jit" and jax.process_count() > 1:
-        raise ValueError(
-            f"train.parallel is 'jit', one device, in {jax.process_count()} processes; use 'auto'"
-        )
+        raise ValueError(f"train.parallel is 'jit' in {jax.process_count()} processes; set it to 'auto'")
     return jax.devices()[: 1 if mode == "jit" else None]
 
 

@@ -1,7 +1,7 @@
 """Frames that one call or many make: whose they are, which are finished, and files that no two calls spoil.
 
-Calls may run at the same time and on any machine that sees the folder; they need not know of each other. A frame
-is finished when its files are there, and they are there whole or not at all.
+Calls may run at the same time and on any machine that sees the folder; they need not know of each other. A
+frame is finished when its files are there, and they are there whole or not at all.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ def parse(text):
 
 
 def own(indices, shard):
-    """Returns those of the frames' indices that are a shard's, every count-th, so that all take about as long."""
+    """Returns those of the frames' indices that are a shard's: every count-th, so that all take as long."""
     return [index for index in indices if index % shard[1] == shard[0]]
 
 
