@@ -102,10 +102,11 @@ def _join(coordinator, num_processes, process_id, seconds):
     if failed:
         raise ValueError(f"--coordinator={coordinator}: {_line(failed[0])}; give another port")
     if thread.is_alive():
-        where = coordinator or jax._src.distributed.global_state.coordinator_address
-        who = f"process {jax._src.distributed.global_state.process_id}"
-        what = "not all processes came" if _listens(where) else "nothing answers there"
-        raise ValueError(f"{who} waited {seconds:g} s at {where}: {what}; check the address and the others")
+        what = "; start all of them, and give --coordinator if they do not find each other"
+        if coordinator is not None:
+            found = "not all of the others came" if _listens(coordinator) else "nothing answers there"
+            what = f" at {coordinator}: {found}; check the address and their output"
+        raise ValueError(f"waited {seconds:g} s for the other processes{what}")
 
 
 def _listens(address):

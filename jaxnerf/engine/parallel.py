@@ -1,8 +1,8 @@
 """The one place that knows about devices: the same step under jit, sharded jit and pmap.
 
 With several processes (see hosts.cluster) the devices are those of all of them. Each process reads all
-training views and keeps them on each of its devices. It cannot do with less: a ray may be of any pixel, and of
-which one follows from its position in the whole batch, so that batches are the same on any number of devices.
+training views and keeps them on each of its devices. It cannot do with less: a ray may be of any pixel, and
+of which follows from its position in the whole batch, so that batches are the same on any number of devices.
 It draws, renders and differentiates the rays of its own devices only; gradients are summed over all devices.
 The first process alone writes config.json, metrics.jsonl and what is printed; all take part in a checkpoint.
 """
