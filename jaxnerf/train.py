@@ -1,5 +1,7 @@
 """python -m jaxnerf.train --config=configs/quickstart.py --workdir=DIR: trains, or goes on with, a run."""
 
+import sys
+
 from absl import flags
 from ml_collections import config_flags
 
@@ -23,6 +25,9 @@ _PROCESS_ID = flags.DEFINE_integer("process_id", None, "With --coordinator: this
 _JOIN_SECONDS = flags.DEFINE_float(
     "join_seconds", 300.0, "How long to wait for the other processes.", lower_bound=1.0
 )
+_STOPPED_CODE = flags.DEFINE_integer(
+    "stopped_code", 0, "What to exit with after SIGTERM or Ctrl-C; Kubernetes starts again unless it is 0."
+)
 flags.mark_flags_as_required(["config", "workdir"])
 
 
@@ -39,7 +44,9 @@ def main(argv):
         process_id=_PROCESS_ID.value,
         seconds=_JOIN_SECONDS.value,
     ):
-        train_and_evaluate(config, _WORKDIR.value)
+        finished = train_and_evaluate(config, _WORKDIR.value)
+    if not finished:
+        sys.exit(_STOPPED_CODE.value)
 
 
 if __name__ == "__main__":

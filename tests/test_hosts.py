@@ -29,7 +29,7 @@ SLURM["SLURM_STEP_NUM_TASKS"] = "2"
 
 @pytest.fixture(scope="module")
 def together(compiled_once, tmp_path_factory):
-    """A workdir, and what was said by the two processes, of two devices each, that a faked srun has started."""
+    """A workdir, and what two processes of two devices each said that a faked srun has started."""
     folder = tmp_path_factory.mktemp("together") / "run"
     environment = {**SLURM, "JAX_COORDINATOR_PORT": str(free_port()), "JAX_NUM_CPU_DEVICES": "2"}
     started = [

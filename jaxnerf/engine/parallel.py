@@ -38,7 +38,8 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
             where there is one device, else sharded.
 
     Returns:
-        run, state, data: run(state, data) -> (state, metrics) consumes its state.
+        run, state, data: run(state, data) -> (state, metrics) consumes its state; run.compiled is what JAX
+        compiled, with its memory_analysis() and as_text(), but for pmap in several processes.
 
     Raises:
         ValueError: if the batch does not split evenly, the processes' data differ, or on an unknown mode.
@@ -50,15 +51,15 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     single = mode == "jit" or (mode == "auto" and len(devices) == 1)
     everywhere = SingleDeviceSharding(devices[0]) if single else NamedSharding(mesh, P())
     if single:
-        run, positions = jax.jit(train_step, donate_argnums=0), jnp.asarray(positions[0])
+        jitted, positions = jax.jit(train_step, donate_argnums=0), jnp.asarray(positions[0])
     elif mode == "pmap":
         axes = {"in_axes": (None, None, 0), "out_axes": None}
         step = functools.partial(train_step, axis_name="batch")
-        run = jax.pmap(step, "batch", devices=devices, donate_argnums=0, **axes)
+        jitted = jax.pmap(step, "batch", devices=devices, donate_argnums=0, **axes)
         own = [index for index, device in enumerate(devices) if device.process_index == jax.process_index()]
         positions = positions[own]
     else:
-        run = _sharded(train_step, mesh)
+        jitted = _sharded(train_step, mesh)
         positions = place(positions, NamedSharding(mesh, P("batch")))
     make = state if callable(state) else lambda: state
     shapes = jax.tree.map(
@@ -69,11 +70,16 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     with ThreadPoolExecutor(1) as pool:
         made = pool.submit(make)
         if mode == "pmap" and jax.process_count() > 1:  # whose pmap JAX compiles at its first call only
-            compiled = _with_state_everywhere(run, everywhere)
+            compiled = _with_state_everywhere(jitted, everywhere)
         else:
-            compiled = run.lower(shapes, data, positions).compile()
+            compiled = jitted.lower(shapes, data, positions).compile()
         state = place(hosts.from_first(made.result()), everywhere)
-    return lambda state, data: compiled(state, data, positions), state, data
+
+    def run(state, data):
+        return compiled(state, data, positions)
+
+    run.compiled = compiled
+    return run, state, data
 
 
 def _sharded(train_step, mesh):
