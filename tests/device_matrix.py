@@ -1,10 +1,11 @@
 """The same run on 1, 2, 4 and 8 devices and in 2 processes of 2: by hand, as it takes a quarter of an hour.
 
-    python tests/device_matrix.py [FOLDER]
+    python tests/device_matrix.py [FOLDER [dense|packed [float32|float64]]]
 
 Trains configs/smoke.py, and it as a packed model with a grid field, each in a process of its own with so
 many virtual CPU devices; scores it; and prints the largest differences from the run on one device: of
-parameters and grid, and of any view's PSNR. Ends with 1 if a bar is missed or a pool was full.
+parameters and grid, and of any view's PSNR. Ends with 1 if a bar is missed or a pool was full. The same
+folder again keeps the runs that are finished.
 """
 
 import json
@@ -25,13 +26,14 @@ PLACES = {"1 device": (1, 1), "2 devices": (1, 2), "4 devices": (1, 4), "8 devic
 PMAPPED = (("pmap", "4 devices"), ("pmap", "2 x 2"))
 
 
-def main(folder):
+def main(folder, models=("dense", "packed"), precisions=tuple(STEPS)):
     """Runs the matrix below a folder; returns whether all bars are met."""
     good = True
     print("| model | precision | steps | mode | on | parameters differ by | PSNR by, dB | left out |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for model in ("dense", "packed"):
-        for precision, steps in STEPS.items():
+    for model in models:
+        for precision in precisions:
+            steps = STEPS[precision]
             one = train(folder, model, precision, "auto", "1 device")
             for mode, place in [("sharded", name) for name in PLACES] + [
                 ("pmap", "4 devices"),
@@ -65,7 +67,9 @@ def train(folder, model, precision, mode, place):
     flags += [f"--config.{name}.compute_dtype={precision}" for name in ("coarse", "fine")]
     wide = str(int(precision == "float64"))
     environment = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": wide}
-    if processes > 1:
+    if (target / "eval" / str(STEPS[precision]) / "results.json").exists():
+        started = []
+    elif processes > 1:
         started = runs.start_together(processes, *flags, **environment)
     else:
         started = [runs.start("train", *flags, **environment)]
@@ -91,4 +95,4 @@ def difference(one, other):
 
 if __name__ == "__main__":
     place = pathlib.Path(sys.argv[1]) if len(sys.argv) > 1 else pathlib.Path(tempfile.mkdtemp())
-    sys.exit(0 if main(place) else 1)
+    sys.exit(0 if main(place, *([name] for name in sys.argv[2:4])) else 1)
