@@ -16,7 +16,7 @@ def mlp():
             "use_viewdirs": True,  # False: colour does not depend on the direction
             "density_activation": "relu",  # "relu" or "softplus"
             "density_bias": 0.0,  # added before the activation
-            "compute_dtype": "float32",  # of the layers: "float32" or "bfloat16"
+            "compute_dtype": "float32",  # or "bfloat16", or "float64" under JAX_ENABLE_X64=1
         }
     )
 

@@ -24,14 +24,26 @@ _ERROR_BUDGET = flags.DEFINE_float(
 _PREDICTIONS = flags.DEFINE_string(
     "predictions", None, "Score the images in this folder (or its color/) in place of a run's renderings."
 )
+_SHARD = flags.DEFINE_string(
+    "shard",
+    None,
+    "K/N: only each N-th view, from K on, where K counts from 0; auto: as srun or mpirun has started. Any "
+    "number of calls may run at once; the one that finishes last writes results.json.",
+)
 
 
 def main(argv):
     del argv
-    from jaxnerf.engine import budget, evaluate, predictions, watch, workdir
+    from jaxnerf.engine import budget, evaluate, predictions, shards, watch, workdir
 
     if not (_WORKDIR.value or _PREDICTIONS.value):
         raise ValueError("nothing to score: give --workdir=DIR of a run, or --predictions=DIR of images")
+    shard = shards.parse(_SHARD.value)
+    for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):
+        if shard != shards.WHOLE and value:
+            raise ValueError(f"--shard splits the views of one checkpoint, not --{name}; drop one of them")
+    if shard != shards.WHOLE and _ERROR_BUDGET.value is not None:
+        raise ValueError("--error_budget chooses by the clock, so shards would differ; drop --shard")
     config = _CONFIG.value
     if config is None and _WORKDIR.value and not _WATCH.value:
         config = workdir.read_config(_WORKDIR.value)
@@ -70,9 +82,13 @@ def main(argv):
             chunk=_CHUNK.value,
             settings=settings,
             overwrite=_OVERWRITE.value,
+            shard=shard,
         )
+    if results is None:
+        print(f"shard {_SHARD.value} is done; views of other shards are missing still")
+        return
     print(evaluate.summary(results))
 
 
 if __name__ == "__main__":
-    app.run(main)
+    app.run(main, stopped="between two views; the same command goes on from there")

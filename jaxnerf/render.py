@@ -25,10 +25,17 @@ _DEPTH = flags.DEFINE_bool("depth", False, "Make a video of the depth, too.")
 _RGBA = flags.DEFINE_bool("rgba", False, "Write rgba/0000.png, too: straight alpha, no background.")
 _NAME = flags.DEFINE_string("name", None, "Of the folder and video, in place of the path's.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Delete the frames of an earlier call first.")
+_SHARD = flags.DEFINE_string(
+    "shard",
+    None,
+    "K/N: only each N-th frame, from K on, where K counts from 0; auto: as srun or mpirun has started. Any "
+    "number of calls may run at once; the one that finishes last makes the video.",
+)
 
 
 def main(argv):
     del argv
+    from jaxnerf.engine import shards
     from jaxnerf.engine.frames import render_path
 
     written = render_path(
@@ -47,6 +54,7 @@ def main(argv):
         depth=_DEPTH.value,
         kind=_VIDEO.value,
         overwrite=_OVERWRITE.value,
+        shard=shards.parse(_SHARD.value),
     )
     print(*written, sep="\n")
     if _VIDEO.value == "auto" and written[-1].suffix == ".gif":

@@ -1,6 +1,8 @@
 """The run of seconds that the tests of the engine share, and the programs as processes."""
 
+import os
 import pathlib
+import socket
 import subprocess
 import sys
 
@@ -19,10 +21,46 @@ def smoke_config(**train):
     return config
 
 
-def start(program, *flags):
+def packed_flags():
+    """Returns the flags that make configs/smoke.py a grid field asked only where something is.
+
+    Its pool has room for all samples, so that nothing depends on how many devices share it.
+    """
+    fields = {
+        "field": "grid",
+        "space.skip_empty": True,
+        "space.step": 0.2,
+        "space.resolution": 16,
+        "space.update_every": 4,
+        "space.samples_per_ray": 32,
+        "space.fog_until": 3,
+        "features.resolutions": "(8,16)",
+        "features.table_size": 2048,
+        "features.width": 16,
+        "features.view_width": 16,
+        "fine.num_freqs": 4,
+    }
+    return [f"--config.{name}={value}" for name, value in fields.items()]
+
+
+def start(program, *flags, **environment):
     """Starts python -m jaxnerf.<program> with its output in pipes."""
     command = [sys.executable, "-m", f"jaxnerf.{program}", *map(str, flags)]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=ROOT, env={**os.environ, **environment}, **pipes)
+
+
+def free_port():
+    """Returns a port that nothing listens at."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+def start_together(count, *flags, **environment):
+    """Starts so many processes of one training."""
+    flags = (*flags, f"--coordinator=127.0.0.1:{free_port()}", f"--num_processes={count}")
+    return [start("train", *flags, f"--process_id={index}", **environment) for index in range(count)]
 
 
 def run(program, *flags):

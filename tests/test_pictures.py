@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxnerf import Rendering
-from jaxnerf.engine.pictures import write_sheet
+from jaxnerf.engine.pictures import sheet_row, write_sheet
 
 
 @pytest.mark.parametrize("far", [6.0, np.inf])
@@ -20,7 +20,7 @@ def test_sheet_shows_near_bright_and_no_end_black(tmp_path, far):
         dropped=np.zeros((2, 2), np.int32),
     )
     with np.errstate(all="raise"):
-        write_sheet(tmp_path / "sheet.png", [(np.ones((2, 2, 3)), image)])
+        write_sheet(tmp_path / "sheet.png", [sheet_row(np.ones((2, 2, 3)), image)])
     sheet = iio.imread(tmp_path / "sheet.png")
     assert sheet.shape == (2, 10, 3)
     shades = sheet[:, 8:, 0].ravel()
@@ -32,5 +32,5 @@ def test_sheet_of_nothing_but_infinity_is_black(tmp_path):
     image = Rendering(
         rgb=np.zeros((2, 2, 3)), opacity=flat, depth=flat + np.inf, disparity=flat, weights=None, dropped=flat
     )
-    write_sheet(tmp_path / "sheet.png", [(np.ones((2, 2, 3)), image)])
+    write_sheet(tmp_path / "sheet.png", [sheet_row(np.ones((2, 2, 3)), image)])
     assert iio.imread(tmp_path / "sheet.png")[:, 8:].max() == 0

@@ -11,6 +11,8 @@ import jax
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
+from jaxnerf.engine import hosts
+
 
 class Checkpoints:
     """The checkpoints under a workdir, step by step."""
@@ -70,16 +72,24 @@ class Checkpoints:
             ValueError: if there are checkpoints and none can be read; names the newest.
         """
         failed = []
-        for step in reversed(self.steps()):
+        for step in self._newest_steps():
+            state, problem = None, None
             try:
                 state = self.load(step, like)
             except ValueError as error:
-                failed.append((step, error))
-            else:
+                problem = error
+            if not hosts.any_of(problem is not None):
                 return state, [self._set_aside(*each) for each in failed]
+            failed.append((step, problem or ValueError("another process cannot read it")))
         if failed:
             raise failed[0][1]
         return like, []
+
+    def _newest_steps(self):
+        """Returns the steps of the newest 16 checkpoints, descending, as the first process sees them."""
+        steps = self.steps()[::-1][:16]
+        padded = hosts.from_first(np.int32(steps + [-1] * (16 - len(steps))))
+        return [int(step) for step in padded if step >= 0]
 
     def close(self):
         if self._writer is not None:
@@ -108,7 +118,10 @@ class Checkpoints:
         path, number = self._folder / f"{step}.unreadable", 1
         while path.exists():
             path, number = self._folder / f"{step}.unreadable-{number + 1}", number + 1
-        os.replace(self._folder / str(step), path)
+        hosts.wait()
+        if hosts.is_first():
+            os.replace(self._folder / str(step), path)
+        hosts.wait()
         self._writer.reload()  # else it would still count as there
         why = str(error).removesuffix("; remove it to go on from the one before")
         return f"{why}; kept as {path.name}, going on from the one before"

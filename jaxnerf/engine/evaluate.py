@@ -1,25 +1,40 @@
-"""Scores of a trained run on held-out views, and the pictures they were taken from."""
+"""Scores of a trained run on held-out views, and the pictures they were taken from.
+
+A view is finished when its pictures and its row of scores are in eval/<step>.tmp/. What is finished is kept
+and skipped, whoever made it: a call that was stopped, or another shard. The call after which none is missing
+makes results.json of them and moves the folder to eval/<step>/.
+"""
 
 import functools
 import json
-import os
 import pathlib
 import shutil
 import time
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits, ssim
 from jaxnerf.core.rendering import render_image
 from jaxnerf.data.batches import pixel_colors
-from jaxnerf.engine import card, pictures, records, workdir
+from jaxnerf.engine import hosts, merging, pictures, records, shards, workdir
 from jaxnerf.engine.load import newest_step, open_run
 
+_OTHER = "give --overwrite without --shard, or remove it"
 
-def evaluate(folder, *, config=None, split=None, step=None, chunk=None, settings=None, overwrite=False):
+
+def evaluate(
+    folder,
+    *,
+    config=None,
+    split=None,
+    step=None,
+    chunk=None,
+    settings=None,
+    overwrite=False,
+    shard=shards.WHOLE,
+):
     """Scores one checkpoint and writes <workdir>/eval/<step>/.
 
     Args:
@@ -31,75 +46,76 @@ def evaluate(folder, *, config=None, split=None, step=None, chunk=None, settings
         chunk: rays rendered at once; the configuration's eval.chunk when None.
         settings: see open_run.
         overwrite: whether an earlier result of the same step and split is replaced.
+        shard: (index, count): only every count-th view from that index on.
 
     Returns:
-        What results.json holds.
+        What results.json holds; None where views of other shards are missing still.
 
     Raises:
-        ValueError: if there is no such run, checkpoint or split, or the result is already there.
+        ValueError: if there is no such run, checkpoint or split, the result is already there, or what is
+            finished of it was scored with other settings.
     """
     run = open_run(folder, config, settings=settings)
-    return score_run(run, folder, split=split, step=step, chunk=chunk, overwrite=overwrite)
+    return score_run(run, folder, split=split, step=step, chunk=chunk, overwrite=overwrite, shard=shard)
 
 
-def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False, views=None):
+def score_run(
+    run, folder, *, split=None, step=None, chunk=None, overwrite=False, views=None, shard=shards.WHOLE
+):
     """As evaluate, for a run that is open already and views that may be read already."""
     step, chunk = newest_step(run, folder, step), chunk or run.experiment.eval.chunk
-    target = claim_target(run, folder, split=split, step=step, overwrite=overwrite)
-    split, name = split or run.experiment.eval.split, target.name
+    target = claim_target(run, folder, split=split, step=step, overwrite=overwrite, shard=shard)
+    split = split or run.experiment.eval.split
     views = run.experiment.load_views(split) if views is None else views
     weights = run.weights(step)
-    partial = target.with_name(name + ".tmp")
-    shutil.rmtree(partial, ignore_errors=True)
+    partial, origin = target.with_name(target.name + ".tmp"), _origin(run, weights, views, split, step)
+    rest = {"run": run, "folder": folder, "views": views, "weights": weights, "origin": origin}
+    if target.exists() and not overwrite:
+        return merging.read(target, origin, _OTHER)
+    shards.claim_folder(partial, origin, overwrite=overwrite, file=merging.ORIGIN, other=_OTHER)
     try:
         with workdir.naming(partial):
-            results = _write_scores(
-                run, folder, views, weights, split=split, step=step, chunk=chunk, partial=partial
-            )
-    except BaseException:  # a full disk, Ctrl-C
+            for name in merging.FOLDERS:
+                (partial / name).mkdir(exist_ok=True)
+            _score_views(run, functools.partial(run.render, weights), views, chunk, partial, shard)
+            return merging.merge(partial, target, chunk=chunk, **rest)
+    except FileNotFoundError:  # another call has finished and moved it all, perhaps while this one began
+        if partial.exists() and any((partial / "rows").glob("*")) or not target.exists():
+            raise
         shutil.rmtree(partial, ignore_errors=True)
-        raise
-    if target.exists():  # a kill between the two moves loses neither result
-        shutil.rmtree(target.with_name(name + ".old"), ignore_errors=True)  # of such a kill
-        os.replace(target, target.with_name(name + ".old"))
-    os.replace(partial, target)
-    shutil.rmtree(target.with_name(name + ".old"), ignore_errors=True)
-    return results
+        return merging.read(target, origin, _OTHER)
 
 
-def claim_target(run, folder, *, split=None, step=None, overwrite=False):
-    """Returns the folder that a score goes to; ValueError if it is there already and not to be replaced."""
+def claim_target(run, folder, *, split=None, step=None, overwrite=False, shard=shards.WHOLE):
+    """Returns the folder that a score goes to; ValueError if it is there already and not to be replaced.
+
+    To a shard it may be there: then all shards are finished, and this one has nothing to do.
+    """
     step, own = newest_step(run, folder, step), run.experiment.eval.split
     name = str(step) if split in (None, own) else f"{step}-{split}"
     target = pathlib.Path(folder) / "eval" / name
-    if target.exists() and not overwrite:
+    shards.refuse_overwrite(overwrite, shard, target)
+    if target.exists() and not overwrite and shard == shards.WHOLE:
         raise ValueError(f"{target}: is there already; give --overwrite to score again, or another --step")
     return target
 
 
-def _write_scores(run, folder, views, weights, *, split, step, chunk, partial):
-    rows = _render_views(run, functools.partial(run.render, weights), views, chunk, partial)
-    rays = sum(row.pop("rays") for row in rows)
-    # The first view's time would hold the compilation too.
-    timed = rows[1:] or rows
-    seconds = sum(row["seconds"] for row in timed) / len(timed)
-    trained = [row for row in records.read_rows(folder) if row["step"] <= step]
-    results = {
-        **means(rows),
-        "views": len(rows),
-        "rays_per_second": rays / len(rows) / seconds,
-        "seconds_per_frame": seconds,
+def _origin(run, weights, views, split, step):
+    """Returns all that the scores depend on, but for the chunk, which they do not show."""
+    settings = {name: vars(run.experiment.eval).get(name) for name in ("samples", "stop", "skip_empty")}
+    config = json.loads(run.config.to_json_best_effort())
+    for name in ("train", "eval"):
+        config.pop(name)
+    config["data"].pop("dir")
+    return {
+        "split": split,
         "step": step,
-        "rays_seen": trained[-1]["rays"] if trained else None,
-        "training_seconds": trained[-1]["seconds"] if trained else None,
-        "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(weights[0])),
-        "settings": {name: vars(run.experiment.eval).get(name) for name in ("samples", "stop", "skip_empty")},
-        **card.metric_card({**run.experiment.conventions, "chunk": chunk}, views, split=split),
-        "images": rows,
+        **settings,
+        "configuration": shards.digest(json.dumps(config, sort_keys=True)),
+        "parameters": shards.digest(weights[0]),
+        "cameras": shards.digest(views.cameras, views.near, views.far, "/".join(views.names)),
+        "photographs": shards.digest(views.pixels, sample=4096),
     }
-    workdir.write_text(partial / "results.json", json.dumps(results, indent=2) + "\n")
-    return results
 
 
 def summary(results):
@@ -118,26 +134,26 @@ def reference(views, index):
     return pixel_colors(pixels, views.background).reshape(height, width, 3)
 
 
-def _render_views(run, render, views, chunk, folder):
-    rows, shown, progress = [], [], records.Progress(len(views.names))
-    for index, name in enumerate(views.names):
-        height, width = (int(value) for value in views.size[index])
+def _score_views(run, render, views, chunk, folder, shard):
+    """Renders and scores those views that are a shard's and not finished yet."""
+    frames = shards.own(range(len(views.names)), shard)
+    todo = [index for index in frames if not merging.is_finished(folder, index)]
+    progress, first = records.Progress(len(frames), show=hosts.is_first()), True
+    for done, index in enumerate(todo, len(frames) - len(todo) + 1):
+        name, (height, width) = views.names[index], (int(value) for value in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
         started = time.perf_counter()
         rays = run.experiment.view_rays(views, index, pixels)
         image = jax.block_until_ready(render_image(render, rays, chunk=chunk))
         seconds = time.perf_counter() - started
         truth = reference(views, index)
-        row = scores(image.rgb, truth, live_mask(views, index))
-        rows.append({"name": name, **row, "seconds": seconds, "rays": height * width})
+        row = {"name": name, **scores(image.rgb, truth, live_mask(views, index)), "seconds": seconds}
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
         pictures.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
-        if index % -(-len(views.names) // pictures.SHEET_ROWS) == 0:
-            shown.append((truth, image))
-        progress.show(index + 1, f"{name}: {rows[-1]['psnr']:.2f} dB in {seconds:.2f} s")
+        merging.finish(folder, index, row, first, len(views.names), truth, image)
+        progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
+        first = False
     progress.close()
-    pictures.write_sheet(folder / "sheet.png", shown)
-    return rows
 
 
 def live_mask(views, index):
@@ -166,9 +182,3 @@ def scores(image, truth, mask=None):
     """Returns the metrics of an image [H, W, 3] against its photograph, of the pixels in mask [H, W]."""
     found = _pair_scores(jnp.asarray(image), jnp.asarray(truth), mask)
     return {key: float(value) for key, value in found.items()}
-
-
-def means(rows):
-    """Returns the means of the rows' metrics, each over the images."""
-    keys = ("psnr", "ssim", "psnr_float", "psnr_truncated")
-    return {key: float(np.mean([row[key] for row in rows])) for key in keys}

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxnerf.core.rendering import render_image
-from jaxnerf.engine import paths, pictures, scenes, video, workdir
+from jaxnerf.engine import paths, pictures, scenes, shards, video
 from jaxnerf.engine.load import newest_step, open_run
 from jaxnerf.engine.records import Progress
 
@@ -32,6 +32,7 @@ def render_path(
     depth=False,
     kind="auto",
     overwrite=False,
+    shard=shards.WHOLE,
 ):
     """Renders a camera path to <workdir>/renders/<path>-<step>/ and a video beside that folder.
 
@@ -55,6 +56,8 @@ def render_path(
         depth: whether there is a video of the depth too.
         kind: of video, see video.video_suffix.
         overwrite: whether frames of that name are deleted first.
+        shard: (index, count): only every count-th frame from that index on. The call after which no frame is
+            missing, of whatever shard, makes the pictures of depth and the videos.
 
     Returns:
         The paths written: the folder and the videos.
@@ -71,9 +74,13 @@ def render_path(
     path = paths.make_path(path or _said(views), views, num_frames=num_frames, closed=closed)
     path = paths.resize(path, *size)
     target = pathlib.Path(folder) / "renders" / f"{name or path.name}-{step}"
-    workdir.claim_folder(target, _origin(run, step, views, path, closed), overwrite=overwrite)
-    write_frames(target, run, step, views, path, chunk=chunk, rgba=rgba)
+    shards.refuse_overwrite(overwrite, shard, target)
+    shards.claim_folder(target, _origin(run, step, views, path, closed), overwrite=overwrite)
+    missing = write_frames(target, run, step, views, path, chunk=chunk, rgba=rgba, shard=shard)
     written = [target]
+    if missing:
+        print(f"shard {shard[0]}/{shard[1]} is done, {missing} frames of others are missing", file=sys.stderr)
+        return written
     for folder, end in (("color", ""), ("depth", "-depth")) if depth else (("color", ""),):
         if suffix:
             written.append(target.with_name(f"{target.name}{end}{suffix}"))
@@ -82,15 +89,24 @@ def render_path(
     return written
 
 
-def write_frames(target, run, step, views, path, *, chunk=None, rgba=False):
-    """Renders those frames of a CameraPath that are not in a folder yet; see render_path."""
+def write_frames(target, run, step, views, path, *, chunk=None, rgba=False, shard=shards.WHOLE):
+    """Renders those frames of a CameraPath that are a shard's and not in a folder yet; see render_path.
+
+    Returns:
+        How many frames of other shards are missing still; 0 when all that render_path says is there.
+    """
     kinds = ("depth/{:04d}.tiff", "color/{:04d}.png", *(("rgba/{:04d}.png",) if rgba else ()))
     files = [[target / kind.format(index) for kind in kinds] for index in range(len(path.poses))]
-    missing = [index for index, group in enumerate(files) if not all(file.is_file() for file in group)]
-    if missing:
+
+    def missing():
+        return [index for index, group in enumerate(files) if not all(file.is_file() for file in group)]
+
+    frames = shards.own(range(len(files)), shard)
+    todo = shards.own(missing(), shard)
+    if todo:
         render = functools.partial(run.render, run.weights(step))
-        posed, progress = paths.posed_views(views, path), Progress(len(files))
-        for done, index in enumerate(missing, len(files) - len(missing) + 1):
+        posed, progress = paths.posed_views(views, path), Progress(len(frames))
+        for done, index in enumerate(todo, len(frames) - len(todo) + 1):
             pixels = paths.path_pixels(posed, path, index, offset=run.experiment.pixel_offset)
             rays = run.experiment.view_rays(posed, index, pixels)
             image = render_image(render, rays, chunk=chunk or run.experiment.eval.chunk)
@@ -102,7 +118,10 @@ def write_frames(target, run, step, views, path, *, chunk=None, rgba=False):
                 pictures.write_whole(file, plane)
             progress.show(done, f"frames of {target}")
         progress.close()
-    _write_depth_pictures([group[0] for group in files])
+    if not missing():
+        _write_depth_pictures([group[0] for group in files])
+        shards.sweep(target)
+    return len(missing())
 
 
 def _said(views):

@@ -18,6 +18,7 @@ class Trained(NamedTuple):
     steps: Any  # () -> steps of the finished checkpoints, ascending
     weights: Any  # step -> (params, grid or None)
     render: Any  # (weights, Rays [...]) -> Rendering [...] without weights, jitted once for a grid's shape
+    config: Any  # ConfigDict, resolved
 
 
 def open_run(folder, config=None, *, data_dir=None, settings=None):
@@ -60,7 +61,7 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
         state = checkpoints.load(step, template())
         return state.params, extract(state.params) if extract else state.grid
 
-    return Trained(experiment, checkpoints.steps, weights, render)
+    return Trained(experiment, checkpoints.steps, weights, render, config)
 
 
 def newest_step(run, folder, step=None):

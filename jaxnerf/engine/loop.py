@@ -1,15 +1,15 @@
 """The training loop: resume, step, log, save, stop cleanly."""
 
+import contextlib
 import functools
 import pathlib
-import sys
 import time
 
 import jax
 import numpy as np
 
 from jaxnerf.core.metrics import decibels
-from jaxnerf.engine import build, parallel, records, workdir
+from jaxnerf.engine import build, hosts, parallel, records, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
@@ -35,19 +35,22 @@ def train_and_evaluate(config, folder):
     """
     started = time.perf_counter()
     config, found = fit_data(config)
-    print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
+    hosts.say(*found)
     views = build.load_views(config.data, "train")  # before the workdir is made: bad input leaves nothing
     config, chosen = fit_config(config, views)
     experiment = build.build(config)
     options = experiment.train
     devices = parallel.devices_of(options.parallel)
     parallel.split_positions(options.batch_size, len(devices), options.block_size)
-    with alone(folder):
-        workdir.claim(folder, config)
-        print(
-            "\n".join([f"views       read in {time.perf_counter() - started:.1f} s", *chosen]),
-            file=sys.stderr,
-        )
+    hosts.check_same("configuration", config.to_json_best_effort())
+    with contextlib.ExitStack() as stack:
+
+        def claim():
+            stack.enter_context(alone(folder))
+            workdir.claim(folder, config)
+
+        hosts.first_does(claim, pathlib.Path(folder) / "config.json")
+        hosts.say(f"views       read in {time.perf_counter() - started:.1f} s", *chosen)
         finished = train(experiment, views, folder)
         return finished and (not experiment.eval.at_end or _score(folder))
 
@@ -58,22 +61,23 @@ def train(experiment, views, folder):
     run, state, data, survey_seconds, compile_seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, keep=options.keep)
     state, unreadable = checkpoints.load_newest(state)
-    print(*unreadable, sep="\n", end="\n" if unreadable else "", file=sys.stderr)
+    hosts.say(*unreadable)
     first = int(state.step)
-    log = records.Records(folder, first_step=first)
+    log = records.Records(folder, first_step=first, write=hosts.is_first())
     before = log.rows[-1]["seconds"] if log.rows else 0.0
-    print(_header(experiment, views, state, survey_seconds, compile_seconds), file=sys.stderr)
-    progress = records.Progress(options.max_steps)
+    hosts.say(_header(experiment, views, state, survey_seconds, compile_seconds))
+    progress = records.Progress(options.max_steps, show=hosts.is_first())
     clock = Clock(before, first * options.batch_size - int(state.counters.get("left_out", 0)))
     recent = []
-    done = first >= options.max_steps or 0 < options.max_seconds <= before
+    done = hosts.any_of(first >= options.max_steps or 0 < options.max_seconds <= before)
     with Interrupt() as interrupt:
         for step in range(first + 1, first + 1 if done else options.max_steps + 1):
             state, metrics = run(state, data)
             recent.append(metrics)
             jax.block_until_ready(recent[-2:][0])  # one step in flight, no more: a stop is prompt
             late = 0 < options.max_seconds <= clock.seconds()
-            last = step == options.max_steps or late or interrupt.caught
+            stopped = hosts.any_of(late or interrupt.caught, step)
+            last = step == options.max_steps or stopped
             save = step % options.save_every == 0 or last
             if step % options.log_every == 0 or save:  # a checkpoint's row holds its clock
                 row = _row(experiment, step, recent, clock, compile_seconds)
@@ -89,12 +93,10 @@ def train(experiment, views, folder):
     progress.close()
     checkpoints.close()
     log.close()
-    if interrupt.caught:
-        print(
-            f"stopped at step {int(state.step)} and saved; the same command goes on from there",
-            file=sys.stderr,
-        )
-    return not interrupt.caught
+    caught = hosts.any_of(interrupt.caught)
+    if caught:
+        hosts.say(f"stopped at step {int(state.step)} and saved; the same command goes on from there")
+    return not caught
 
 
 def _score(folder):
@@ -102,9 +104,9 @@ def _score(folder):
     if (pathlib.Path(folder) / "eval" / str(Checkpoints(folder).steps()[-1])).exists():
         return True
     try:
-        evaluate(folder)
+        evaluate(folder, shard=(jax.process_index(), jax.process_count()))
     except KeyboardInterrupt:
-        print("stopped while scoring; what was trained is saved, the same command scores it", file=sys.stderr)
+        hosts.say("stopped while scoring; what was trained is saved, the same command goes on scoring")
         return False
     return True
 
@@ -180,7 +182,8 @@ def _check_finite(row, options, folder):
 
 def _header(experiment, views, state, survey_seconds, compile_seconds):
     """Returns the lines that say once what runs on what."""
-    device = jax.local_devices()[0]
+    devices = parallel.devices_of(experiment.train.parallel)
+    machines = f", in {jax.process_count()} processes" if jax.process_count() > 1 else ""
     counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
     eyes = np.asarray(views.cameras.to_world)[:, :, 3]
     near, far = np.min(views.near), np.max(views.far)
@@ -193,7 +196,7 @@ def _header(experiment, views, state, survey_seconds, compile_seconds):
         space = [f"space       {share:.1%} of {cells} cells possible, found in {survey_seconds:.1f} s"]
     return "\n".join(
         [
-            f"device      {jax.local_device_count()} x {device.device_kind} ({device.platform})",
+            f"device      {len(devices)} x {devices[0].device_kind} ({devices[0].platform}){machines}",
             f"precision   parameters {dtype}; compiled in {compile_seconds:.1f} s",
             f"parameters  {sum(counts.values()):,} ({shares})",
             f"views       {len(views.offset)}, {views.pixels.shape[0]:,} pixels, t from {near:g} to {far:g}",

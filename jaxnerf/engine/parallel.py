@@ -1,4 +1,11 @@
-"""The one place that knows about devices: the same step under jit, sharded jit and pmap."""
+"""The one place that knows about devices: the same step under jit, sharded jit and pmap.
+
+With several processes (see hosts.cluster) the devices are those of all of them. Each process reads all
+training views and keeps them on each of its devices. It cannot do with less: a ray may be of any pixel, and
+of which follows from its position in the whole batch, so that batches are the same on any number of devices.
+It draws, renders and differentiates the rays of its own devices only; gradients are summed over all devices.
+The first process alone writes config.json, metrics.jsonl and what is printed; all take part in a checkpoint.
+"""
 
 import functools
 from concurrent.futures import ThreadPoolExecutor
@@ -9,18 +16,21 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, SingleDeviceSharding
 from jax.sharding import PartitionSpec as P
 
+from jaxnerf.engine import hosts
+
 MODES = ("auto", "jit", "sharded", "pmap")
 CPU_BLOCK_SAMPLES = 12_288
 
 
 def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_per_ray=1, mode="auto"):
-    """Returns the step compiled for the local devices, and the state and data placed for it.
+    """Returns the step compiled for the devices, and the state and data placed for it.
 
     Args:
         train_step: see step.make_train_step.
-        state: TrainState, or a function that makes one, which then runs while the step compiles.
-        data: what the step's draw takes; copied to every device.
-        batch_size: rays a step, over all devices.
+        state: TrainState, or a function that makes one, which then runs while the step compiles. That of
+            the first process counts.
+        data: what the step's draw takes; copied to every device. The same in all processes.
+        batch_size: rays a step, over all devices of all processes.
         block_size: rays whose gradient is taken at once. 0: all that a device has, or on a CPU as
             many as its cache holds the activations of.
         samples_per_ray: of the largest network, for that choice.
@@ -28,10 +38,11 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
             where there is one device, else sharded.
 
     Returns:
-        run, state, data: run(state, data) -> (state, metrics) consumes its state.
+        run, state, data: run(state, data) -> (state, metrics) consumes its state; run.compiled is what JAX
+        compiled, with its memory_analysis() and as_text(), but for pmap in several processes.
 
     Raises:
-        ValueError: if the batch does not split evenly, or on an unknown mode.
+        ValueError: if the batch does not split evenly, the processes' data differ, or on an unknown mode.
     """
     devices = devices_of(mode)
     block_size = block_size or default_block(batch_size // len(devices), samples_per_ray, devices[0].platform)
@@ -39,40 +50,83 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     mesh = Mesh(np.array(devices), ("batch",))
     single = mode == "jit" or (mode == "auto" and len(devices) == 1)
     everywhere = SingleDeviceSharding(devices[0]) if single else NamedSharding(mesh, P())
-    step = functools.partial(train_step, axis_name="batch")
     if single:
-        run, positions = jax.jit(train_step, donate_argnums=0), jnp.asarray(positions[0])
+        jitted, positions = jax.jit(train_step, donate_argnums=0), jnp.asarray(positions[0])
     elif mode == "pmap":
         axes = {"in_axes": (None, None, 0), "out_axes": None}
-        run = jax.pmap(step, "batch", devices=devices, donate_argnums=0, **axes)
+        step = functools.partial(train_step, axis_name="batch")
+        jitted = jax.pmap(step, "batch", devices=devices, donate_argnums=0, **axes)
+        own = [index for index, device in enumerate(devices) if device.process_index == jax.process_index()]
+        positions = positions[own]
     else:
-        # With check_vma the gradient of replicated parameters would be summed once more.
-        sharded = jax.shard_map(
-            lambda state, data, positions: step(state, data, positions[0]),
-            mesh=mesh,
-            in_specs=(P(), P(), P("batch")),
-            out_specs=P(),
-            check_vma=False,
-        )
-        run = jax.jit(sharded, donate_argnums=0)
-        positions = jax.device_put(positions, NamedSharding(mesh, P("batch")))
+        jitted = _sharded(train_step, mesh)
+        positions = place(positions, NamedSharding(mesh, P("batch")))
     make = state if callable(state) else lambda: state
     shapes = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=everywhere), jax.eval_shape(make)
     )
-    data = jax.device_put(data, everywhere)
+    hosts.check_same("data or configuration", data)
+    data = place(data, everywhere)
     with ThreadPoolExecutor(1) as pool:
         made = pool.submit(make)
-        compiled = run.lower(shapes, data, positions).compile()
-        state = jax.device_put(made.result(), everywhere)
-    return lambda state, data: compiled(state, data, positions), state, data
+        if mode == "pmap" and jax.process_count() > 1:  # whose pmap JAX compiles at its first call only
+            compiled = _with_state_everywhere(jitted, everywhere)
+        else:
+            compiled = jitted.lower(shapes, data, positions).compile()
+        state = place(hosts.from_first(made.result()), everywhere)
+
+    def run(state, data):
+        return compiled(state, data, positions)
+
+    run.compiled = compiled
+    return run, state, data
+
+
+def _sharded(train_step, mesh):
+    # With check_vma the gradient of replicated parameters would be summed once more.
+    sharded = jax.shard_map(
+        lambda state, data, positions: train_step(state, data, positions[0], axis_name="batch"),
+        mesh=mesh,
+        in_specs=(P(), P(), P("batch")),
+        out_specs=P(),
+        check_vma=False,
+    )
+    return jax.jit(sharded, donate_argnums=0)
+
+
+def _with_state_everywhere(run, everywhere):
+    """Returns the pmapped step with a state of all processes, where pmap gives one of its own devices."""
+
+    def whole(leaf):
+        parts = [shard.data for shard in leaf.addressable_shards]
+        return jax.make_array_from_single_device_arrays(leaf.shape, everywhere, parts)
+
+    def compiled(state, data, positions):
+        state, metrics = run(state, data, positions)
+        return jax.tree.map(whole, state), metrics
+
+    return compiled
+
+
+def place(tree, sharding):
+    """Returns arrays on the devices of a sharding; some may be other processes', which have the same tree."""
+    if sharding.is_fully_addressable:
+        return jax.device_put(tree, sharding)
+
+    def put(leaf):
+        whole = np.asarray(leaf)
+        return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
+
+    return jax.tree.map(put, tree)
 
 
 def devices_of(mode):
-    """Returns the local devices that a mode uses; ValueError if there is no such mode."""
+    """Returns the devices, of all processes, that a mode uses; ValueError if there is no such mode."""
     if mode not in MODES:
         raise ValueError(f"train.parallel is {mode!r}, wanted one of {MODES}")
-    return jax.local_devices()[: 1 if mode == "jit" else None]
+    if mode == "jit" and jax.process_count() > 1:
+        raise ValueError(f"train.parallel is 'jit' in {jax.process_count()} processes; set it to 'auto'")
+    return jax.devices()[: 1 if mode == "jit" else None]
 
 
 def default_block(share, samples_per_ray, platform):

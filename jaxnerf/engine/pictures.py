@@ -1,10 +1,11 @@
 """The files that evaluation writes: colours, depths, a sheet to look at."""
 
-import os
 import pathlib
 
 import imageio.v3 as iio
 import numpy as np
+
+from jaxnerf.engine import shards
 
 SHEET_ROWS = 4
 
@@ -16,19 +17,23 @@ def to_8_bits(image):
 
 def write_view(folder, name, rgb, truth, depth):
     """Writes color/<name>.png, gt-color/<name>.png and depth/<name>.tiff (float32, the capture's units)."""
-    folder = pathlib.Path(folder)
     files = {"color": to_8_bits(rgb), "gt-color": to_8_bits(truth), "depth": np.asarray(depth, np.float32)}
-    for kind, pixels in files.items():
-        (folder / kind).mkdir(parents=True, exist_ok=True)
-        iio.imwrite(folder / kind / f"{name}.{'tiff' if kind == 'depth' else 'png'}", pixels)
+    for path, pixels in zip(view_files(folder, name), files.values(), strict=True):
+        write_whole(path, pixels, make_folder=False)
 
 
-def write_whole(path, pixels):
+def view_files(folder, name):
+    """Returns the paths that write_view writes, in folders that are there."""
+    kinds = {"color": "png", "gt-color": "png", "depth": "tiff"}
+    return [pathlib.Path(folder) / kind / f"{name}.{suffix}" for kind, suffix in kinds.items()]
+
+
+def write_whole(path, pixels, *, make_folder=True):
     """Writes an image so that it is there whole or not at all; the suffix of its path names the format."""
-    partial = path.with_name(path.name + ".tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(partial, pixels, extension=path.suffix)
-    os.replace(partial, path)
+    if make_folder:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with shards.partial_of(path) as partial:
+        iio.imwrite(partial, pixels, extension=path.suffix)
 
 
 def cut_out(rgb, opacity, background):
@@ -56,25 +61,26 @@ def depth_picture(depth, near, far):
     return to_8_bits((inverse - 1 / far) / max(1 / near - 1 / far, 1e-30))
 
 
-def write_sheet(path, pairs):
-    """Writes a sheet, a row a view: photograph, rendering, error times 4, opacity, depth (near is bright).
+def write_sheet(path, rows):
+    """Writes a sheet of rows, uint8 [H, W, 3], that may differ in width; see sheet_row."""
+    width = max(row.shape[1] for row in rows)
+    rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    write_whole(path, np.concatenate(rows), make_folder=False)
+
+
+def sheet_row(truth, image):
+    """Returns uint8: photograph, rendering, error times 4, opacity, depth (near is bright), side by side.
 
     Args:
-        path: of the PNG.
-        pairs: list of (truth [H, W, 3], Rendering [H, W]).
+        truth: [H, W, 3].
+        image: Rendering [H, W].
     """
-    rows = [_sheet_row(np.asarray(truth), image) for truth, image in pairs]
-    width = max(row.shape[1] for row in rows)
-    rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=1) for row in rows]
-    iio.imwrite(path, to_8_bits(np.concatenate(rows)))
-
-
-def _sheet_row(truth, image):
+    truth = np.asarray(truth)
     step = -(-max(truth.shape) // 400)  # a sheet is to be looked at, not measured
     rgb, opacity, depth = (np.asarray(x) for x in (image.rgb, image.opacity, image.depth))
     grey = [np.repeat(plane[..., None], 3, axis=-1) for plane in (opacity, _near_is_bright(depth))]
     panels = [truth, rgb, np.abs(rgb - truth) * 4, *grey]
-    return np.concatenate([panel[::step, ::step] for panel in panels], axis=1)
+    return to_8_bits(np.concatenate([panel[::step, ::step] for panel in panels], axis=1))
 
 
 def _near_is_bright(depth):

@@ -7,7 +7,8 @@ import numpy as np
 
 from jaxnerf.data.images import read_image
 from jaxnerf.engine import build, card, workdir
-from jaxnerf.engine.evaluate import live_mask, means, reference, scores
+from jaxnerf.engine.evaluate import live_mask, reference, scores
+from jaxnerf.engine.merging import means
 
 
 def score_folder(folder, *, config=None, split=None, overwrite=False):

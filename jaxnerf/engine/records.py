@@ -12,11 +12,17 @@ from jaxnerf.engine.workdir import naming, write_text
 class Records:
     """The metrics of a run, a JSON object a line, ascending in step."""
 
-    def __init__(self, workdir, *, first_step):
-        """Opens the file to append; what lies past first_step, or is no row, is dropped, the latter aloud."""
+    def __init__(self, workdir, *, first_step, write=True):
+        """Opens the file to append; what lies past first_step, or is no row, is dropped, the latter aloud.
+
+        write: False keeps rows in memory only, as of several processes one writes.
+        """
         self._path = pathlib.Path(workdir) / "metrics.jsonl"
         rows, damaged, cut = _parse(self._path)
         self.rows = [row for row in rows if row["step"] <= first_step]
+        self._write, self._events = write, None
+        if not write:
+            return
         if damaged:
             kept = self._path.with_name("metrics.jsonl.damaged")
             shutil.copyfile(self._path, kept)
@@ -28,13 +34,15 @@ class Records:
         try:
             from tensorboardX import SummaryWriter
         except ImportError:
-            self._events = None
+            pass
         else:
             self._events = SummaryWriter(str(pathlib.Path(workdir) / "tensorboard"), purge_step=first_step)
 
     def append(self, row):
         """Adds a row: step and other numbers. NaN and infinity are written as JSON knows them in Python."""
         self.rows.append(row)
+        if not self._write:
+            return
         with naming(self._path), self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
         if self._events is not None:
@@ -77,11 +85,14 @@ def _row(line):
 class Progress:
     """A bar that stays in place on a terminal, and plain lines in a log file."""
 
-    def __init__(self, total, stream=sys.stderr):
-        self._total, self._stream, self._terminal = total, stream, stream.isatty()
+    def __init__(self, total, stream=sys.stderr, show=True):
+        self._total, self._stream, self._shown = total, stream, show
+        self._terminal = show and stream.isatty()
 
     def show(self, done, text):
         """Shows how many of the total steps are done, and a text of the moment."""
+        if not self._shown:
+            return
         share = min(done / self._total, 1.0)
         if self._terminal:
             bar = "#" * int(24 * share)

@@ -1,12 +1,14 @@
 """Videos of pictures that lie on disk: MP4 with the video extra, GIF without."""
 
+import glob
 import importlib.util
-import os
 import warnings
 
 import imageio.v2
 import imageio.v3 as iio
 import numpy as np
+
+from jaxnerf.engine import shards
 
 KINDS = ("auto", "mp4", "gif", "none")
 
@@ -35,8 +37,8 @@ def write_video(path, pictures, fps):
         pictures: paths of PNGs of one size, grey or RGB; read one at a time.
         fps: frames a second. A GIF holds it in hundredths of a second a frame.
     """
-    partial = path.with_name(f"{path.stem}.tmp{path.suffix}")
-    with warnings.catch_warnings():
+    unfinished = f".tmp{path.suffix}"  # by whose end ffmpeg knows the format
+    with shards.partial_of(path, unfinished) as partial, warnings.catch_warnings():
         # JAX warns of forks; this one becomes ffmpeg at once and runs nothing of ours.
         warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
         with imageio.v2.get_writer(partial, **_options(path.suffix, fps)) as writer:
@@ -44,7 +46,7 @@ def write_video(path, pictures, fps):
                 pixels = iio.imread(picture)
                 pixels = np.repeat(pixels[..., None], 3, axis=-1) if pixels.ndim == 2 else pixels
                 writer.append_data(_even(pixels) if path.suffix == ".mp4" else pixels)
-    os.replace(partial, path)
+    shards.sweep(path.parent, f"{glob.escape(path.name)}.*{unfinished}")
 
 
 def _options(suffix, fps):

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import pathlib
-import shutil
 
 from ml_collections import ConfigDict
 
@@ -47,30 +46,6 @@ def claim(workdir, config):
         raise ValueError(f"{workdir}: has checkpoints but no config.json; give another --workdir")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, config.to_json_best_effort(indent=2) + "\n")
-
-
-def claim_folder(folder, origin, *, overwrite=False):
-    """Makes a folder with path.json, the origin of what is in it, or checks that it has the same.
-
-    Raises:
-        ValueError: if it holds anything of another origin; names what differs.
-    """
-    file = folder / "path.json"
-    if overwrite and folder.exists():
-        shutil.rmtree(folder)
-    if folder.exists() and any(folder.iterdir()):
-        try:
-            found = json.loads(file.read_text())
-            differ = [key for key in origin | found if found.get(key) != origin.get(key)]
-        except (OSError, ValueError, TypeError, AttributeError):
-            raise ValueError(f"{file}: cannot be read; give --overwrite, or another --name") from None
-        if differ:
-            shown = ", ".join(f"{key} {found.get(key)!r}, not {origin.get(key)!r}" for key in differ[:2])
-            raise ValueError(
-                f"{folder}: holds frames rendered with {shown}; give --overwrite, or another --name"
-            )
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(file, json.dumps(origin, indent=2) + "\n")
 
 
 def read_config(workdir):
