@@ -132,6 +132,8 @@ def _packed_model(config):
     space = config.space
     if config.sampling.density_noise:
         raise ValueError("sampling.density_noise has no effect with space.skip_empty; set one of them to 0")
+    if not config.sampling.get("stratified", True):
+        raise ValueError("sampling.stratified is False with space.skip_empty, which draws; turn one of them")
     if config.field == "grid":
         field = grid_field(lower=space.lower, upper=space.upper, **config.features)
     elif config.field == "mlp":

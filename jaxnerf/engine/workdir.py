@@ -18,7 +18,8 @@ FREE = (
 )
 FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "eval.")
 # Fields that runs may be older than, and what they were then; None: whatever it is now.
-SINCE = {"data.width": None, "data.world": None, "space.outside": "nothing"}
+SINCE = {"data.width": None, "data.world": None, "space.outside": "nothing", "data.num_views": 0}
+SINCE |= {"coarse.encode": True, "fine.encode": True, "sampling.stratified": True}
 SECTIONS = ("data", "coarse", "fine", "sampling", "train", "eval")
 
 
