@@ -39,6 +39,7 @@ _ONLY = flags.DEFINE_list("only", None, "Names of variants; all when not given."
 def main(argv):
     """Runs what is asked for and is not there yet, then reports all that is there."""
     del argv
+    import ablation_plot
     import ablation_report
 
     out = pathlib.Path(_OUT.value)
@@ -53,8 +54,8 @@ def main(argv):
     print("\n".join(lines))
     if flags.FLAGS.readme:
         table.replace(pathlib.Path(flags.FLAGS.readme), lines, MARKS)
-    ablation_report.draw_pictures(kept, out, out / "pictures.png")
-    ablation_report.plot(kept, out / "ablation.png")
+    ablation_plot.draw_pictures(kept, out, out / "pictures.png")
+    ablation_plot.plot(kept, out / "ablation.png")
 
 
 def _asked():
@@ -70,7 +71,7 @@ def _asked():
         raise ValueError(f"--seeds is {','.join(_SEEDS.value)!r}, wanted whole numbers as 0,1,2")
     if _MINUTES.value < 0 or (_MINUTES.value and _STEPS.value):
         raise ValueError(f"--minutes is {_MINUTES.value} with --steps {_STEPS.value}; give one of them")
-    return chosen, [int(seed) for seed in _SEEDS.value]
+    return chosen, sorted({int(seed) for seed in _SEEDS.value})
 
 
 def _measure(scene, kept, save, out, wanted):
@@ -117,7 +118,7 @@ def _steps(kept, count, base):
 
 def workdir_name(scene, name, seed):
     """Returns where in --out a run lies."""
-    return f"{scene}/{name.replace(',', '').replace(' ', '_')}-{seed}"
+    return f"{scene}/{name.replace(' ', '_')}-{seed}"
 
 
 def _save(path, kept):

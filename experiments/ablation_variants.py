@@ -20,10 +20,10 @@ def variants(config, num_views):
     no_hierarchy = {"sampling.num_coarse": 2 * counts[0] + counts[1], "sampling.num_fine": 0}
     return {
         COMPLETE: {},
-        "no encoding, directions, hierarchy": no_encoding | no_viewdirs | no_hierarchy,
         "no positional encoding": no_encoding,
         "no view dependence": no_viewdirs,
         "no hierarchy": no_hierarchy,
+        "none of the three": no_encoding | no_viewdirs | no_hierarchy,
         "no stratification": {"sampling.stratified": False},
         "a quarter of the images": {"data.num_views": num_views // 4},
         "half of the images": {"data.num_views": num_views // 2},

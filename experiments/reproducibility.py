@@ -28,18 +28,18 @@ _DEVICES = "--xla_force_host_platform_device_count="
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs.", required=True)
 _STEPS = flags.DEFINE_integer("steps", 600, "Of every run.", lower_bound=DRIFT)
 _SEEDS = flags.DEFINE_list("seeds", ["0", "1", "2", "3", "4"], "Two or more.")
-_ONE = flags.DEFINE_list("one", None, "Internal: workdir, seed and steps of the run that this process makes.")
+_ONE = flags.DEFINE_string("one", None, "Internal: workdir,seed,steps of the run that this process makes.")
 
 
 def main(argv):
     """Makes the runs, each in a process, then compares them."""
     del argv
     if _ONE.value:
-        folder, seed, steps = _ONE.value
+        folder, seed, steps = _ONE.value.rsplit(",", 2)
         return train(folder, int(seed), int(steps))
-    if len(_SEEDS.value) < 2 or not all(seed.strip().isdigit() for seed in _SEEDS.value):
+    if len(set(_SEEDS.value)) < 2 or not all(seed.strip().isdigit() for seed in _SEEDS.value):
         raise ValueError(f"--seeds is {','.join(_SEEDS.value)!r}, wanted two or more whole numbers as 0,1,2")
-    out, seeds = pathlib.Path(_OUT.value), [int(seed) for seed in _SEEDS.value]
+    out, seeds = pathlib.Path(_OUT.value), list(dict.fromkeys(int(seed) for seed in _SEEDS.value))
     first = seeds[0]
     for seed in seeds:
         _start(out / f"seed-{seed}", seed)
@@ -126,4 +126,4 @@ def _difference(one, other, step):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    app.run(main, stopped="and kept what was finished; the same command goes on from there")

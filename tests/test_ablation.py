@@ -184,6 +184,9 @@ def test_the_table_pairs_seeds_and_says_what_they_agree_on():
     assert "| no hierarchy | 19.75 +- 1.06 | -1.00, -0.50 | worse | 0.500 +- 0.000 | 1,234 | - | - |" in lines
     assert "| +0.50, -0.10 | undecided |" in lines[6]
     assert "| 30.00 | - | - | 0.500 |" in lines[7]
+    assert lines[-1].endswith("Here worse: no hierarchy; undecided: 5 octaves.")
+    verdicts = {(-1.0,): "worse (one seed)", (0.1, 0.2): "better", (0.0, 0.0): "undecided", (): "-"}
+    assert {differences: ablation_report.verdict(differences) for differences in verdicts} == verdicts
 
 
 @pytest.mark.parametrize(
