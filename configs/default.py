@@ -13,6 +13,7 @@ def mlp():
             "view_width": 128,  # features of the layer that sees the direction
             "num_freqs": 10,  # octaves of the position; 0, with space.skip_empty, fits the images
             "num_view_freqs": 4,  # octaves of the direction
+            "encode": True,  # False: no octaves at all, the network gets both as they are
             "use_viewdirs": True,  # False: colour does not depend on the direction
             "density_activation": "relu",  # "relu" or "softplus"
             "density_bias": 0.0,  # added before the activation
@@ -40,6 +41,7 @@ def get_config():
                 # behind alpha and behind the scene: "white", "black", "none"; "": white where there is alpha
                 "background": "white",
                 "hold_out": 0,  # every n-th training view is in the split "held_out" instead
+                "num_views": 0,  # of what is left, to train on, evenly spread; 0: all
                 "pixel_offset": 0.5,  # px; 0.5 looks through pixel centres, 0 is what the 2020 code did
                 # "file": as cameras stand there; "forward": recentred for NDC; "around": what they look at in
                 # the middle; "auto": by the cameras
@@ -54,6 +56,7 @@ def get_config():
                 "num_fine": 128,  # points more for the fine network
                 "rule": "segments",  # "segments", "gauss" (pairs, fourth order) or "points" (the paper)
                 "in_disparity": False,  # coarse samples in equal steps of 1 / t
+                "stratified": True,  # False: training too has its samples in the same places every time
                 "importance_floor": 0.0,  # added to the weights before they guide samples
                 "density_noise": 0.0,  # 1 / world unit, deviation of noise on the density in training
             },

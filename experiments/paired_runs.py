@@ -1,5 +1,6 @@
 """Short runs that differ in a few fields of one configuration: trained, scored, and never done twice."""
 
+import functools
 import importlib
 import json
 import math
@@ -44,13 +45,15 @@ def run(config, folder, *, split=None):
         return done
     import jax
 
-    from jaxnerf.engine.evaluate import evaluate
+    from jaxnerf.engine.evaluate import score_run
+    from jaxnerf.engine.load import open_run
     from jaxnerf.engine.loop import train_and_evaluate
     from jaxnerf.engine.workdir import write_text
 
-    if not train_and_evaluate(config, folder):
+    if not train_and_evaluate(config, folder, views=read_views(config, "train")):
         return None
-    results = evaluate(folder, split=split, overwrite=True)
+    views = read_views(config, split or config.eval.split)
+    results = score_run(open_run(folder), folder, split=split, overwrite=True, views=views)
     asked = {"config": _plain(config), "split": split}
     write_text(pathlib.Path(folder) / _FILE, json.dumps({"asked": asked, "results": results}) + "\n")
     jax.clear_caches()  # of a step and a renderer that no other run has
@@ -72,6 +75,20 @@ def finished(config, folder, *, split=None):
             "give another folder, or the old settings"
         )
     return kept["results"]
+
+
+def read_views(config, split):
+    """Returns the Views of a split, read once for all runs on them."""
+    return _read_views(json.dumps(config.data.to_dict(), sort_keys=True), split)
+
+
+@functools.lru_cache(maxsize=6)
+def _read_views(data, split):
+    from ml_collections import ConfigDict
+
+    from jaxnerf.engine import build
+
+    return build.load_views(ConfigDict(json.loads(data)), split)
 
 
 def spread(values):

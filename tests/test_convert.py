@@ -194,6 +194,7 @@ def test_what_does_not_fit_is_named_with_the_field_to_change(tmp_path):
         sampling={"num_fine": 0}
     )
     assert said(density_bias=1.0) == "coarse.density_bias is 1.0, wanted 0 as in JaxNeRF"
+    assert said(encode=False) == "coarse.encode is False, wanted True as in JaxNeRF"
     assert said(density_activation="elu").startswith("coarse.density_activation is 'elu', wanted 'relu' or")
 
 

@@ -11,6 +11,7 @@ from jaxnerf.engine import card
 from jaxnerf.engine.build import build
 from jaxnerf.engine.evaluate import scores
 
+_PART = "trained without some of the training views"
 READ = {"format": "blender", "background": "white", "pixel_offset": 0.5, "factor": 1, "hold_out": 0}
 
 
@@ -42,6 +43,8 @@ def test_the_papers_images_stand_beside_its_tables_and_say_what_differs():
         (25, (800, 800), {}, ("views is 25, there 200",)),
         (200, (800, 800), {"background": "black"}, ("background is black, there white",)),
         (200, (800, 800), {"split": "val"}, ("split is val, there test",)),
+        (200, (800, 800), {"num_views": 25}, (f"{_PART} (num_views 25), there with all",)),
+        (200, (800, 800), {"hold_out": 8}, (f"{_PART} (hold_out 8), there with all",)),
         (200, (800, 800), {"format": "transforms"}, ("format is transforms, there blender",)),
         (8, (100, 100), {"format": "synthetic"}, ("format is synthetic, there blender",)),
     ],

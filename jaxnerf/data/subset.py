@@ -13,6 +13,17 @@ def held_out(count, every):
     return np.arange(min(_PHASE, every - 1), count, every)
 
 
+def evenly(name, count, number):
+    """Returns the indices of so many views of count, evenly spread from the first; ascending, int.
+
+    Raises:
+        ValueError: if there are not so many; names the field.
+    """
+    if not 1 <= number <= count:
+        raise ValueError(f"{name} is {number} of {count} views, wanted 1 to {count}, or 0 for all")
+    return np.arange(number) * count // number
+
+
 def select_views(views, indices):
     """Returns the Views of the given indices [N], in that order; pixels are copied."""
     indices = np.asarray(indices)

@@ -81,7 +81,9 @@ def photographs(config, split=None):
 def conventions(data):
     """Returns how the views of a data section are read, which a score's metric card repeats."""
     names = ("format", "background", "pixel_offset", "factor")
-    return {**{name: data[name] for name in names}, "hold_out": data.get("hold_out", 0)}
+    return {name: data[name] for name in names} | {
+        name: data.get(name, 0) for name in ("hold_out", "num_views")
+    }
 
 
 def build_model(config):
@@ -114,6 +116,8 @@ def check_released(config, origin):
         raise ValueError(f"space.skip_empty is True, wanted False: {origin} trains along whole rays")
     activations = ("relu", "softplus") if origin == "JaxNeRF" else ("relu",)
     for name in ("coarse", "fine"):
+        if not config[name].get("encode", True):
+            raise ValueError(f"{name}.encode is False, wanted True as in {origin}")
         if config[name].density_bias:
             raise ValueError(f"{name}.density_bias is {config[name].density_bias}, wanted 0 as in {origin}")
         if config[name].density_activation not in activations:
@@ -132,6 +136,10 @@ def _packed_model(config):
     space = config.space
     if config.sampling.density_noise:
         raise ValueError("sampling.density_noise has no effect with space.skip_empty; set one of them to 0")
+    if not config.sampling.get("stratified", True):
+        raise ValueError(
+            "sampling.stratified is False with space.skip_empty, which draws; change one of them"
+        )
     if config.field == "grid":
         field = grid_field(lower=space.lower, upper=space.upper, **config.features)
     elif config.field == "mlp":

@@ -79,6 +79,11 @@ def comparable_with(found):
             for name, value in wanted.items()
             if found.get(name) != value
         ]
+        unlike += [
+            f"trained without some of the training views ({name} {found[name]}), there with all"
+            for name in ("hold_out", "num_views")
+            if found.get(name)
+        ]
         why = ["if the scene is the same", _WHY[figure]]
         if pixel_offset not in (None, found.get("pixel_offset")):
             worth = (

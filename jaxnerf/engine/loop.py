@@ -19,12 +19,13 @@ from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
 
 
-def train_and_evaluate(config, folder):
+def train_and_evaluate(config, folder, *, views=None):
     """Trains as a configuration says, from the last checkpoint under folder if there is one.
 
     Args:
         config: ConfigDict, see configs/default.py.
         folder: the workdir; made if missing.
+        views: of the split "train" where they were read already.
 
     Returns:
         Whether training and its scores came to their end (False: stopped by Ctrl-C or SIGTERM, saved).
@@ -36,7 +37,8 @@ def train_and_evaluate(config, folder):
     started = time.perf_counter()
     config, found = fit_data(config)
     hosts.say(*found)
-    views = build.load_views(config.data, "train")  # before the workdir is made: bad input leaves nothing
+    if views is None:  # before the workdir is made: bad input leaves nothing
+        views = build.load_views(config.data, "train")
     config, chosen = fit_config(config, views)
     experiment = build.build(config)
     options = experiment.train

@@ -31,6 +31,7 @@ def hierarchical_model(
     importance_floor,
     density_noise,
     background,
+    stratified=True,
     view_samples=1.0,
 ):
     """Returns the paper's Model: fields "coarse" and "fine", or "fine" alone for num_fine 0.
@@ -38,6 +39,7 @@ def hierarchical_model(
     Args:
         fields: name -> Field.
         density_noise: 1 / world unit, its deviation while there are keys.
+        stratified: whether samples are drawn while there are keys; else they stay where they are without.
         view_samples: of pictures, times those of training.
         num_coarse, num_fine, rule, in_disparity, importance_floor, background: see render_hierarchical.
     """
@@ -55,6 +57,7 @@ def hierarchical_model(
             functools.partial(field.apply, params[name], key=noise_key, density_noise=noise)
             for (name, field), noise_key in zip(fields.items(), noise_keys, strict=True)
         ]
+        keys = keys if stratified else None
         first, more = (
             max(2, 2 * round(number * share / 2)) if share != 1 else number
             for number in (num_coarse, num_fine)

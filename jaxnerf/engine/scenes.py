@@ -82,8 +82,16 @@ def is_open(data):
 def load_views(data, split):
     """Returns the Views of a split, as the data section of a configuration describes them.
 
-    With data.hold_out a part of the training views is the split "held_out", and not in "train".
+    With data.hold_out a part of the training views is the split "held_out", and not in "train". With
+    data.num_views only so many of those in "train" are.
     """
+    if split == "train" and data.get("num_views", 0):
+        views = _without_held_out(data, split)
+        return subset.select_views(views, subset.evenly("data.num_views", len(views.offset), data.num_views))
+    return _without_held_out(data, split)
+
+
+def _without_held_out(data, split):
     every = data.get("hold_out", 0)
     if not every or split not in ("train", "held_out"):
         return _read_views(data, split)

@@ -18,7 +18,16 @@ FREE = (
 )
 FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "eval.")
 # Fields that runs may be older than, and what they were then; None: whatever it is now.
-SINCE = {"data.finish": "usual", "data.width": None, "data.world": None, "space.outside": "nothing"}
+SINCE = {
+    "data.finish": "usual",
+    "data.width": None,
+    "data.world": None,
+    "data.num_views": 0,
+    "space.outside": "nothing",
+    "coarse.encode": True,
+    "fine.encode": True,
+    "sampling.stratified": True,
+}
 SECTIONS = ("data", "coarse", "fine", "sampling", "train", "eval")
 
 

@@ -64,6 +64,7 @@ class MLP(linen.Module):
     view_width: int = 128
     num_freqs: int = 10
     num_view_freqs: int = 4
+    encode: bool = True  # False: position and direction as they are, without octaves
     use_viewdirs: bool = True  # False: colour from position alone, no bottleneck and no view layer
     density_activation: str = "relu"
     density_bias: float = 0.0  # added before the activation
@@ -77,7 +78,7 @@ class MLP(linen.Module):
         backward pass then run along memory, which on a CPU a small network gains most from.
         """
         shape = x.shape[:-1]
-        encoded = encode_planes(planes(x), num_freqs=self.num_freqs).astype(self.compute_dtype)
+        encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode).astype(self.compute_dtype)
         hidden = ()
         for layer in range(self.depth):
             joins = layer == 0 or layer == self.skip_layer + 1
@@ -87,7 +88,7 @@ class MLP(linen.Module):
         density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
         if self.use_viewdirs:
             # The direction is encoded and multiplied once a ray, and broadcast over its samples.
-            directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs)
+            directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
             directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
             bottleneck = Dense(self.width, name="bottleneck")(*hidden).reshape(-1, *shape)
             view = Dense(self.view_width, name="view")(bottleneck, directions)

@@ -1,0 +1,129 @@
+"""Whether a run can be had again: the same seed twice, other seeds, and other numbers of devices.
+
+    python experiments/reproducibility.py --out=DIR [--steps=600] [--seeds=0,1,2,3,4] [--readme=README.md]
+
+Trains configs/quickstart.py (the embedded scene) for so many steps: each seed in a process of its own, the
+first twice, and the first on four devices, which one CPU can play. Compares parameters bit for bit, gives the
+spread of PSNR over the seeds, and the drift of the parameters between one device and four after DRIFT steps.
+What is in DIR is not run again. With --readme the lines replace what lies between <!-- reproducibility -->
+and <!-- end of reproducibility --> in that file.
+"""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import paired_runs
+import table  # which defines --readme
+from absl import flags
+
+from jaxnerf import app
+
+DRIFT = 50  # steps
+MARKS = ("<!-- reproducibility -->", "<!-- end of reproducibility -->")
+_DEVICES = "--xla_force_host_platform_device_count="
+_OUT = flags.DEFINE_string("out", None, "Folder of the runs.", required=True)
+_STEPS = flags.DEFINE_integer("steps", 600, "Of every run.", lower_bound=DRIFT)
+_SEEDS = flags.DEFINE_list("seeds", ["0", "1", "2", "3", "4"], "Two or more.")
+_ONE = flags.DEFINE_string("one", None, "Internal: workdir,seed,steps of the run that this process makes.")
+
+
+def main(argv):
+    """Makes the runs, each in a process, then compares them."""
+    del argv
+    if _ONE.value:
+        folder, seed, steps = _ONE.value.rsplit(",", 2)
+        return train(folder, int(seed), int(steps))
+    if len(set(_SEEDS.value)) < 2 or not all(seed.strip().isdigit() for seed in _SEEDS.value):
+        raise ValueError(f"--seeds is {','.join(_SEEDS.value)!r}, wanted two or more whole numbers as 0,1,2")
+    out, seeds = pathlib.Path(_OUT.value), list(dict.fromkeys(int(seed) for seed in _SEEDS.value))
+    first = seeds[0]
+    for seed in seeds:
+        _start(out / f"seed-{seed}", seed)
+    _start(out / "again", first)
+    _start(out / "four_devices", first, devices=4)
+    scores = {seed: _score(out / f"seed-{seed}") for seed in seeds}
+    lines = report(
+        scores,
+        again=_difference(out / f"seed-{first}", out / "again", _STEPS.value),
+        four=_score(out / "four_devices"),
+        drift=_difference(out / f"seed-{first}", out / "four_devices", DRIFT),
+        steps=_STEPS.value,
+    )
+    print("\n".join(lines))
+    if flags.FLAGS.readme:
+        table.replace(pathlib.Path(flags.FLAGS.readme), lines, MARKS)
+
+
+def report(scores, *, again, four, drift, steps):
+    """Returns the lines that say it.
+
+    Args:
+        scores: {seed: PSNR}; the first seed's run is the one that was repeated.
+        again, drift: (largest difference of a parameter, how many differ, how many there are).
+        four: PSNR on four devices.
+        steps: of every run.
+    """
+    mean, deviation = paired_runs.spread(list(scores.values()))
+    low, high = min(scores.values()), max(scores.values())
+    first = next(iter(scores.values()))
+    inside = "within" if abs(four - first) <= high - low else "OUTSIDE"
+    same = (
+        "equal bit for bit"
+        if not again[1]
+        else f"{again[1]:,} of {again[2]:,} differ, by up to {again[0]:.1e}"
+    )
+    listed = ", ".join(f"{value:.2f}" for value in scores.values())
+    return [
+        f"`quickstart.py` for {steps:,} steps:",
+        "",
+        f"- the same seed in two processes: all {again[2]:,} parameters {same};",
+        f"- {len(scores)} seeds: {mean:.2f} +- {deviation:.2f} dB ({listed});",
+        f"- one device and four: {first:.2f} and {four:.2f} dB, {inside} the seeds' spread of "
+        f"{high - low:.2f} dB; after {DRIFT} steps of Adam their parameters differ by up to {drift[0]:.1e}, "
+        "as float32 adds up in another order.",
+    ]
+
+
+def train(folder, seed, steps):
+    """Trains and scores a run, with a checkpoint at DRIFT."""
+    changes = {
+        "train.max_steps": steps,
+        "train.lr_steps": steps,
+        "train.save_every": DRIFT,
+        "train.keep": 10**6,
+    }
+    if paired_runs.run(paired_runs.configuration("quickstart", changes, seed=seed), folder) is None:
+        raise ValueError(f"{folder}: stopped; the same command goes on from there")
+
+
+def _start(folder, seed, devices=1):
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    others = [flag for flag in environment.get("XLA_FLAGS", "").split() if not flag.startswith(_DEVICES)]
+    environment["XLA_FLAGS"] = " ".join([*others, f"{_DEVICES}{devices}"])
+    command = [sys.executable, __file__, f"--out={folder.parent}", f"--one={folder},{seed},{_STEPS.value}"]
+    code = subprocess.run(command, env=environment).returncode
+    if code:
+        raise ValueError(f"{folder}: its process ended with {code}, see above; the same command goes on")
+
+
+def _score(folder):
+    return json.loads((folder / "scored.json").read_text())["results"]["psnr"]
+
+
+def _difference(one, other, step):
+    """Returns the largest difference of a parameter at a step, how many differ, how many there are."""
+    import jax
+
+    from jaxnerf.engine.load import open_run
+
+    a, b = (jax.tree.leaves(jax.device_get(open_run(folder).weights(step)[0])) for folder in (one, other))
+    a, b = (np.concatenate([leaf.ravel() for leaf in leaves]) for leaves in (a, b))
+    return float(np.abs(a - b).max()), int((a.view(np.uint32) != b.view(np.uint32)).sum()), a.size
+
+
+if __name__ == "__main__":
+    app.run(main, stopped="and kept what was finished; the same command goes on from there")
