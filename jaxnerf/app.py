@@ -1,6 +1,7 @@
 """What the command line programs share: errors of a user's making take one line and no traceback."""
 
 import ctypes
+import gc
 import signal
 import sys
 
@@ -18,6 +19,9 @@ def run(
     stopped: what Ctrl-C or SIGTERM left behind, and what to do.
     """
     _keep_memory()
+    # Tracing a step makes hundreds of thousands of objects, hardly any in cycles: looking for those every 700
+    # objects, as Python does, takes a good part of its time.
+    gc.set_threshold(50_000)
     signal.signal(signal.SIGTERM, _interrupt)
     app.run(_without_traceback(main, positional, stopped), flags_parser=_parse)
 
