@@ -55,7 +55,7 @@ def test_two_processes_of_two_devices_train_as_one_of_four_does(together, tmp_pa
     assert_same(many, one, rtol=0, atol=1e-6)
     start = create_state(experiment.model, experiment.optimizer, 0)
     assert np.abs(one.params["fine"]["w"] - start.params["fine"]["w"]).max() > 1e-3, "nothing was learned"
-    assert np.unique(one.grid["occupied"]).size == 2 and one.counters["left_out"] > 0
+    assert np.unique(one.grid.peak).size > 8 and one.counters["left_out"] > 0
     rows, others = records.read_rows(folder), records.read_rows(tmp_path / "run")
     for row, other in zip(rows, others, strict=True):
         for name in ("step", "rays", "left_out", "loss", "grad_norm", "lr"):

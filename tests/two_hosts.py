@@ -13,6 +13,8 @@ from helpers import random_rays
 from jaxnerf.engine import hosts, loop, shards
 from jaxnerf.engine.build import build
 from jaxnerf.engine.checkpoint import Checkpoints
+from jaxnerf.engine.space import make_space
+from jaxnerf.fields.mlp import Field
 from runs import smoke_config
 from test_step import toy_draw, toy_model
 
@@ -29,19 +31,25 @@ def toy_experiment():
         full = (rays.origins[:, 0] > 1.0).astype(jnp.int32)
         return tuple(types.SimpleNamespace(rgb=one.rgb, dropped=full) for one in seen)
 
-    def update(step, params, grid, cells):
-        noise = jax.random.normal(jax.random.fold_in(jax.random.key(7), step), grid["peak"].shape)
-        peak = grid["peak"].at[cells].add((params["fine"]["w"].sum() + noise)[cells])
-        return {"peak": peak, "occupied": peak > 0}
+    def density(params, x, viewdirs):
+        return jax.nn.relu(x @ params["w"])[..., 0], x
 
-    def create(possible):
-        return {"peak": jnp.zeros(8), "occupied": possible}
-
-    space = types.SimpleNamespace(shape=(8,), create=create, update=update)
+    space = make_space(
+        (-1.0, -1.0, -1.0),
+        (1.0, 1.0, 1.0),
+        resolution=4,
+        step=0.1,
+        seed=0,
+        field=Field(None, density),
+        threshold=0.02,
+        update_every=2,
+        look_at_once=64,
+        passes_from_start=0,
+    )
     return experiment._replace(
         model=types.SimpleNamespace(init=plain.init, render=render, space=space),
         draw=lambda step, positions, data: toy_draw(step, positions, (rays, jnp.array([-1]))),
-        survey=lambda views: (None, None, np.arange(0, 8, 2, dtype=np.int32)),
+        survey=lambda views: (None, None, np.arange(0, 64, 2, dtype=np.int32)),
     )
 
 
