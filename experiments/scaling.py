@@ -75,9 +75,7 @@ def measured_table(kept):
     first, cells = kept["rows"][0], []
     for row in kept["rows"]:
         sent = f"{row['collective_bytes']:,} in {row['collectives']}"
-        formula = (
-            scaling_model.gradient_bytes(row["parameters"]) if row["processes"] * row["devices"] > 1 else 0
-        )
+        formula = scaling_model.gradient_bytes(row["parameters"])
         cells.append((f"{row['processes']} x {row['devices']}", f"{row['rays_per_second']:,.0f}",
                       f"{row['rays_per_second'] / first['rays_per_second']:.2f}",
                       f"{row['device_bytes'] / 1e6:.1f}", sent, f"{formula:,}",
@@ -85,7 +83,8 @@ def measured_table(kept):
     heads = ("processes x devices", "rays/s", "ratio", "MB a device", "bytes summed, in HLO", "by formula")
     return [
         f"A step of {kept['config']}, {first['rays']} rays over all devices, {first['parameters']:,} "
-        f"parameters; virtual CPU devices on {kept['cores']} core(s), which may have been shared.",
+        f"parameters; virtual CPU devices on {kept['cores']} core(s), which may have been shared. On one "
+        "device the sum is there, and sends nothing.",
         "",
         *table.markdown((*heads, "compiling, s"), cells),
     ]

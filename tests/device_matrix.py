@@ -63,7 +63,7 @@ def train(folder, model, precision, mode, place):
     processes, devices = PLACES[place]
     flags = ["--config=configs/smoke.py", f"--workdir={target}", "--config.eval.at_end=True"]
     flags += [f"--config.train.max_steps={STEPS[precision]}", f"--config.train.parallel={mode}"]
-    flags += runs.packed_flags() if model == "packed" else []
+    flags += runs.as_flags(runs.PACKED if model == "packed" else {})
     flags += [f"--config.{name}.compute_dtype={precision}" for name in ("coarse", "fine")]
     wide = str(int(precision == "float64"))
     environment = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": wide}

@@ -21,25 +21,25 @@ def smoke_config(**train):
     return config
 
 
-def packed_flags():
-    """Returns the flags that make configs/smoke.py a grid field asked only where something is.
+# What makes configs/smoke.py a grid field asked only where something is. Its pool has room for all samples,
+# so that nothing depends on how many devices share it.
+PACKED = {
+    "field": "grid",
+    "space.skip_empty": True,
+    "space.step": 0.2,
+    "space.resolution": 16,
+    "space.update_every": 4,
+    "space.samples_per_ray": 32,
+    "space.fog_until": 3,
+    "features.resolutions": (8, 16),
+    "features.table_size": 2048,
+    "features.width": 16,
+    "features.view_width": 16,
+}
 
-    Its pool has room for all samples, so that nothing depends on how many devices share it.
-    """
-    fields = {
-        "field": "grid",
-        "space.skip_empty": True,
-        "space.step": 0.2,
-        "space.resolution": 16,
-        "space.update_every": 4,
-        "space.samples_per_ray": 32,
-        "space.fog_until": 3,
-        "features.resolutions": "(8,16)",
-        "features.table_size": 2048,
-        "features.width": 16,
-        "features.view_width": 16,
-        "fine.num_freqs": 4,
-    }
+
+def as_flags(fields):
+    """Returns the flags that set fields of a configuration, by name."""
     return [f"--config.{name}={value}" for name, value in fields.items()]
 
 

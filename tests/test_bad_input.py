@@ -160,6 +160,9 @@ def test_a_disk_full_of_pictures_keeps_the_old_scores(trained, tmp_path, monkeyp
     for options in ({"step": 15}, {"overwrite": True}):
         with pytest.raises(OSError, match="No space left"):
             evaluate(folder, **options)
+    for step in ("15.tmp", "20.tmp"):  # the views that are finished stay for the next call
+        assert len(list((folder / "eval" / step / "rows").iterdir())) == 8
+        shutil.rmtree(folder / "eval" / step)
     assert files(folder) == before
 
 

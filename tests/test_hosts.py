@@ -1,39 +1,39 @@
 """Several processes train as one; how they find each other, and what is said when they do not."""
 
-import json
-import threading
+import os
+import subprocess
+import sys
 
 import jax
 import numpy as np
 import pytest
 
-from device_matrix import difference
-from jaxnerf.engine import hosts, parallel
+import two_hosts
+from helpers import assert_same
+from jaxnerf.engine import hosts, parallel, records
 from jaxnerf.engine.checkpoint import Checkpoints
-from jaxnerf.engine.load import open_run
-from runs import free_port, packed_flags, run, start
+from jaxnerf.engine.state import create_state
+from runs import ROOT, free_port, run
 
-pytest_plugins = ["engine_fixtures"]
-
-STEPS = 6
-FLAGS = [
-    "--config=configs/smoke.py",
-    *packed_flags(),
-    "--config.train.save_every=3",
-    "--config.eval.at_end=True",
-]
-FLAGS += [f"--config.train.max_steps={STEPS}", "--config.train.lr_steps=20", "--config.train.log_every=3"]
 SLURM = {"SLURM_JOB_ID": "4711", "SLURM_STEP_NODELIST": "127.0.0.1", "SLURM_NTASKS": "2"}
 SLURM["SLURM_STEP_NUM_TASKS"] = "2"
 
 
 @pytest.fixture(scope="module")
-def together(compiled_once, tmp_path_factory):
-    """A workdir, and what two processes of two devices each said that a faked srun has started."""
+def together(tmp_path_factory):
+    """A workdir, and what its two processes of two devices each said, which a faked srun has started."""
     folder = tmp_path_factory.mktemp("together") / "run"
-    environment = {**SLURM, "JAX_COORDINATOR_PORT": str(free_port()), "JAX_NUM_CPU_DEVICES": "2"}
+    folder.mkdir()
+    environment = {
+        **os.environ,
+        **SLURM,
+        "JAX_COORDINATOR_PORT": str(free_port()),
+        "JAX_NUM_CPU_DEVICES": "2",
+    }
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    command, pipes = [sys.executable, two_hosts.__file__, folder], {"stderr": subprocess.PIPE, "text": True}
     started = [
-        start("train", *FLAGS, f"--workdir={folder}", **environment, SLURM_PROCID=index, SLURM_LOCALID=index)
+        subprocess.Popen(command, env={**environment, "SLURM_PROCID": index, "SLURM_LOCALID": index}, **pipes)
         for index in "01"
     ]
     said = [process.communicate(timeout=300)[1] for process in started]
@@ -41,44 +41,34 @@ def together(compiled_once, tmp_path_factory):
     return folder, said
 
 
-@pytest.fixture(scope="module")
-def alone(compiled_once, tmp_path_factory):
-    """The workdir of one process with one device."""
-    folder = tmp_path_factory.mktemp("alone") / "run"
-    result = start("train", *FLAGS, f"--workdir={folder}", JAX_NUM_CPU_DEVICES="1")
-    _, err = result.communicate(timeout=300)
-    assert result.returncode == 0, err
-    return folder
+def last_state(folder):
+    experiment = two_hosts.toy_experiment()
+    like = create_state(experiment.model, experiment.optimizer, 0)
+    return jax.device_get(Checkpoints(folder).load(two_hosts.STEPS, like))
 
 
-def outcome(folder):
-    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    results = json.loads((folder / "eval" / str(STEPS) / "results.json").read_text())
-    weights = jax.device_get(open_run(folder).weights(STEPS))
-    return {"weights": weights, "rows": results["images"], "metrics": rows, "results": results}
+def test_two_processes_of_two_devices_train_as_one_of_four_does(together, tmp_path):
+    folder, said = together
+    experiment = two_hosts.toy_experiment()
+    assert two_hosts.train(tmp_path / "run", experiment.load_views("train"))
+    one, many = last_state(tmp_path / "run"), last_state(folder)
+    assert_same(many, one, rtol=0, atol=1e-6)
+    start = create_state(experiment.model, experiment.optimizer, 0)
+    assert np.abs(one.params["fine"]["w"] - start.params["fine"]["w"]).max() > 1e-3, "nothing was learned"
+    assert np.unique(one.grid.peak).size > 8 and one.counters["left_out"] > 0
+    rows, others = records.read_rows(folder), records.read_rows(tmp_path / "run")
+    for row, other in zip(rows, others, strict=True):
+        for name in ("step", "rays", "left_out", "loss", "grad_norm", "lr"):
+            assert row[name] == pytest.approx(other[name], rel=1e-5), name
 
 
-def test_two_processes_of_two_devices_train_and_score_as_one_device_does(together, alone):
-    one, many = outcome(alone), outcome(together[0])
-    assert [row["left_out"] for row in many["metrics"]] == [0, 0], "a full pool would be another run"
-    params, grid = many["weights"]
-    assert 0.05 < grid.occupied.mean() < 0.95, "the grid found nothing out, so nothing is proved"
-    apart, scores = difference(one, many)
-    assert apart <= 1e-6 and scores <= 1e-5
-    for row, other in zip(many["metrics"], one["metrics"], strict=True):
-        for name in ("step", "rays", "loss", "grad_norm", "lr"):
-            assert row[name] == pytest.approx(other[name], rel=1e-4), name
-    for name in ("psnr", "ssim", "psnr_float", "psnr_truncated"):
-        assert many["results"][name] == pytest.approx(one["results"][name], abs=1e-5), name
-    assert [row["name"] for row in many["rows"]] == [row["name"] for row in one["rows"]]
-
-
-def test_the_first_process_speaks_and_all_take_part(together):
+def test_one_process_speaks_all_save_and_all_have_the_same_state(together):
     folder, (first, second) = together
     assert "device      4 x cpu (cpu), in 2 processes" in first and "6/6" in first
     assert "device" not in second and "6/6" not in second
+    states = [[line for line in text.splitlines() if line.startswith("state")] for text in (first, second)]
+    assert len(states[0]) == 2 and states[0] == states[1]
     assert Checkpoints(folder).steps() == [3, 6]
-    assert sorted(path.name for path in (folder / "eval").iterdir()) == [str(STEPS)]
 
 
 @pytest.mark.parametrize(
@@ -125,20 +115,11 @@ def test_alone_nothing_is_joined_and_everything_agrees(monkeypatch, tmp_path):
 
 
 def test_a_coordinator_that_is_not_there_takes_one_line(tmp_path):
-    """Both at once: to the first the second is missing, which has another port."""
-    found, options = {}, (*FLAGS, f"--workdir={tmp_path / 'run'}", "--num_processes=2", "--join_seconds=1")
-
-    def join(index):
-        address = f"--coordinator=127.0.0.1:{free_port()}"
-        found[index] = run("train", *options, address, f"--process_id={index}")
-
-    threads = [threading.Thread(target=join, args=[index]) for index in (0, 1)]
-    [thread.start() for thread in threads]
-    [thread.join() for thread in threads]
-    for index, what in enumerate(("not all of the others came", "nothing answers there")):
-        code, out, err = found[index]
-        assert code == 1 and len(err.splitlines()) == 1, err
-        assert err.startswith("error: waited 1 s for the other processes at 127.0.0.1:") and what in err
+    address = f"127.0.0.1:{free_port()}"
+    by_hand = (f"--coordinator={address}", "--num_processes=2", "--process_id=1", "--join_seconds=1")
+    code, _, err = run("train", "--config=configs/smoke.py", f"--workdir={tmp_path / 'run'}", *by_hand)
+    assert code == 1 and len(err.splitlines()) == 1, err
+    assert err.startswith(f"error: waited 1 s for the other processes at {address}: nothing answers there")
     assert not (tmp_path / "run").exists()
 
 

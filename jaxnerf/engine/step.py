@@ -33,7 +33,7 @@ def make_train_step(model, optimizer, draw):
         renderings = model.render(keys, params, grid, batch.rays, step)
         whole = renderings[-1].dropped == 0
         errors = [_sum_where(whole, (rendering.rgb - batch.rgb) ** 2) for rendering in renderings]
-        return sum(errors), {"mse_coarse": errors[0], "mse": errors[-1], "rays": whole.sum()}
+        return sum(errors), {"mse_coarse": errors[0], "mse": errors[-1], "rays": whole.sum(dtype=jnp.int32)}
 
     def block(state, data, positions):
         keys, batch = draw(state.step, positions, data)
