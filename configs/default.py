@@ -101,6 +101,8 @@ def get_config():
                 "save_every": 5000,  # steps
                 "keep": 3,  # checkpoints
                 "max_nonfinite": 20,  # steps in a row without a finite gradient before the run stops
+                # times that a network which no gradient reaches is begun anew before the run stops; 0: it is let be
+                "revive": 10,
             },
             "eval": {
                 "split": "test",

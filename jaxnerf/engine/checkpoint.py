@@ -1,5 +1,6 @@
 """Checkpoints: atomic, the last few kept (orbax v1)."""
 
+import dataclasses
 import pathlib
 
 import jax
@@ -36,7 +37,7 @@ class Checkpoints:
                 ) from error
 
     def load(self, step, like):
-        """Returns the state at a step, shaped and placed as like.
+        """Returns the state at a step, shaped and placed as like; counters newer than it are those of like.
 
         Raises:
             ValueError: if the checkpoint does not fit; names it.
@@ -44,7 +45,10 @@ class Checkpoints:
         abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
         try:
             self._open().reload()  # another process may have written it since
-            return self._open().load(step, abstract)
+            saved = self._open().metadata(step).metadata["counters"]
+            known = {name: counter for name, counter in abstract.counters.items() if name in saved}
+            state = self._open().load(step, dataclasses.replace(abstract, counters=known))
+            return dataclasses.replace(state, counters={**like.counters, **state.counters})
         except Exception as error:  # orbax raises many kinds
             raise ValueError(
                 f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
