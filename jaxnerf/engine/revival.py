@@ -1,4 +1,4 @@
-"""Networks that have died: found by the gradient that no longer reaches them, and begun anew."""
+"""Networks that have died: found by the gradient that no longer goes through them, and begun anew."""
 
 import dataclasses
 
@@ -8,26 +8,33 @@ import optax
 
 LOOK_EVERY = 50  # steps
 PATIENCE = 100  # steps: momentum alone can bring a network back, which takes it a dozen at most
-_ERROR = 1e-4  # mean square (40 dB): below it a batch shows nothing that a network could miss
+_ERROR = 1e-3  # mean square (30 dB): below it there is next to nothing that a network could miss
 _GRADIENT = 1e-5  # its norm over the root of that error; healthy: 1e-2 and more, 1e-4 in the first steps
 
 
-def count_dead(counters, grads, errors):
+def count_dead(counters, grads, errors, entrances):
     """Returns for how many steps in a row each network has been dead, as counters "dead_<name>".
 
-    A network is dead when the rays show an error and no gradient reaches it: its density is 0 wherever it
-    is asked (a ReLU's bias has fallen below all that the layers give: an empty image), or it is a wall
-    before the camera whose colour is saturated. Adam's momentum can still bring it back for a dozen steps;
-    later nothing can. A batch without an error, of a scene that is empty there, says nothing and does not count.
+    A network is dead when its rays show an error and no gradient reaches what the position enters. Either
+    its density is 0 wherever it is asked, as a ReLU's input is negative everywhere (an empty image); or it
+    is a wall before the camera whose colour is saturated; or a layer of ReLUs is 0 everywhere, and what is
+    left is the same fog at all places. Adam's momentum can still bring it back for a dozen steps; later
+    nothing can. A batch without an error, of a scene that is empty there, says nothing and leaves the
+    count as it was.
+
+    The gradient tells more than opacity and density do, and is at hand: an image of one colour from which
+    training is still on its way out is not dead, and what is dead is so whatever it looks like.
 
     Args:
         counters: those of before; int32 [].
         grads: network name -> gradient, over the whole batch.
         errors: [networks], in the order of grads, the mean squared error of each network's rendering.
+        entrances: network name -> names of the parameters that the position enters; none: all.
     """
     dead = {}
     for (name, grad), error in zip(grads.items(), errors, strict=True):
-        still = optax.tree.norm(grad) <= _GRADIENT * jnp.sqrt(error)
+        seeing = [grad[entrance] for entrance in entrances.get(name) or grad]
+        still = optax.tree.norm(seeing) <= _GRADIENT * jnp.sqrt(error)
         before = counters[f"dead_{name}"]
         dead[f"dead_{name}"] = jnp.where(error > _ERROR, (before + 1) * still.astype(jnp.int32), before)
     return dead
@@ -42,7 +49,8 @@ def dead_networks(metrics):
 def make_look(experiment, folder):
     """Returns look(step, state, metrics) -> (state, metrics), which begins dead networks anew now and then.
 
-    It decides by what the state holds, at steps that no setting of a log moves, so that a resumed run does the same.
+    It decides by what the state holds, at steps that do not depend on what is logged or saved when, so that
+    a resumed run does the same.
 
     Raises:
         ValueError: from look, where more networks have died than train.revive allows to begin anew.
@@ -56,10 +64,10 @@ def make_look(experiment, folder):
             return state, metrics
         if int(metrics["revived"]) + len(names) > allowed:
             raise ValueError(
-                f"{folder}: no gradient has reached the {' and the '.join(names)} network for {PATIENCE} steps "
-                f"up to {step}, after {int(metrics['revived'])} new beginnings (learning rate "
-                f"{float(experiment.schedule(step - 1)):.2g}): its density is 0 wherever it is asked, or it "
-                "hides all behind one colour; lower train.lr_init, raise train.warmup_steps, or set "
+                f"{folder}: no gradient has gone through the {' and the '.join(names)} network for "
+                f"{PATIENCE} steps up to {step}, after {int(metrics['revived'])} new beginnings (learning "
+                f"rate {float(experiment.schedule(step - 1)):.2g}): what it shows is empty or of one "
+                "colour; lower train.lr_init, raise train.warmup_steps, or set "
                 "density_activation to 'softplus' and density_bias to -1; train.revive=0 lets it be"
             )
         state = revive(state, names)
@@ -73,7 +81,7 @@ def make_revive(model, optimizer, seed):
     """Returns revive(state, names) -> TrainState, where the networks of these names begin anew.
 
     Their parameters are drawn again, from the seed and the step, and the optimiser forgets them; a model's
-    grid holds all that is possible. The others stay as they are, and so does the schedule of the learning rate.
+    grid holds all that is possible. The others stay as they are, and so does the learning rate's schedule.
     """
 
     def revive(state, names):

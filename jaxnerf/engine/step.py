@@ -59,7 +59,7 @@ def make_train_step(model, optimizer, draw):
         missed = (~finite).astype(jnp.int32)
         errors = (metrics["mse_coarse"], metrics["mse"])[-len(grads) :]
         counters = {
-            **count_dead(state.counters, grads, errors),
+            **count_dead(state.counters, grads, errors, model.entrances),
             "revived": state.counters["revived"],
             "nonfinite": state.counters["nonfinite"] + missed,
             "nonfinite_in_a_row": (state.counters["nonfinite_in_a_row"] + 1) * missed,
