@@ -105,6 +105,8 @@ def get_config():
                 "save_every": 5000,  # steps
                 "keep": 3,  # checkpoints
                 "max_nonfinite": 20,  # steps in a row without a finite gradient before the run stops
+                # times that a network is begun anew which no gradient reaches, before the run stops; 0: never
+                "revive": 10,
             },
             "eval": {
                 "split": "test",

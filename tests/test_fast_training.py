@@ -168,7 +168,7 @@ def test_without_a_space_there_is_nothing_for_it():
     experiment = build(smoke_config())
     state = jax.eval_shape(functools.partial(create_state, experiment.model, experiment.optimizer, 0))
     assert experiment.model.space is None and state.grid is None
-    assert set(state.counters) == {"nonfinite", "nonfinite_in_a_row"}
+    assert set(state.counters) == {"nonfinite", "nonfinite_in_a_row", "revived", "dead_coarse", "dead_fine"}
     views = experiment.load_views("train")
     possible, live, cells = experiment.survey(views)
     assert possible is None and live is None and cells is None

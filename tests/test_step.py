@@ -31,7 +31,7 @@ def toy_model(trouble=lambda params: 0.0):
     def init(key):
         return {name: {"w": jax.random.normal(key, (3, 3))} for name in ("coarse", "fine")}
 
-    return types.SimpleNamespace(init=init, render=render, space=None)
+    return types.SimpleNamespace(init=init, render=render, space=None, entrances={})
 
 
 def toy_draw(step, positions, data):

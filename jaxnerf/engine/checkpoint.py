@@ -1,5 +1,6 @@
 """Checkpoints: whole or not there, checked by a sum, the last few kept (orbax v1)."""
 
+import dataclasses
 import functools
 import json
 import os
@@ -44,7 +45,7 @@ class Checkpoints:
                 ) from error
 
     def load(self, step, like):
-        """Returns the state at a step, shaped and placed as like.
+        """Returns the state at a step, shaped and placed as like; counters newer than it are those of like.
 
         Raises:
             ValueError: if the checkpoint does not fit, or is not what was saved; names it.
@@ -53,14 +54,16 @@ class Checkpoints:
         _hush()
         try:
             self._open().reload()  # another process may have written it since
-            state = self._open().load(step, abstract)
+            saved = self._open().metadata(step).metadata["counters"]
+            known = {name: counter for name, counter in abstract.counters.items() if name in saved}
+            state = self._open().load(step, dataclasses.replace(abstract, counters=known))
             self._check_sum(step, state)
+            return dataclasses.replace(state, counters={**like.counters, **state.counters})
         except Exception as error:  # orbax raises many kinds
             raise ValueError(
                 f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
                 "remove it to go on from the one before"
             ) from error
-        return state
 
     def load_newest(self, like):
         """Returns the state of the newest checkpoint that can be read, or like; and lines on the others.

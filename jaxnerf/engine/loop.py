@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxnerf.core.metrics import decibels
-from jaxnerf.engine import build, hosts, parallel, records, workdir
+from jaxnerf.engine import build, hosts, parallel, records, revival, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
@@ -70,11 +70,12 @@ def train(experiment, views, folder):
     hosts.say(_header(experiment, views, state, survey_seconds, compile_seconds))
     progress = records.Progress(options.max_steps, show=hosts.is_first())
     clock = Clock(before, first * options.batch_size - int(state.counters.get("left_out", 0)))
+    look = revival.make_look(experiment, folder)
     recent = []
     done = hosts.any_of(first >= options.max_steps or 0 < options.max_seconds <= before)
     with Interrupt() as interrupt:
         for step in range(first + 1, first + 1 if done else options.max_steps + 1):
-            state, metrics = run(state, data)
+            state, metrics = look(step, *run(state, data))
             recent.append(metrics)
             jax.block_until_ready(recent[-2:][0])  # one step in flight, no more: a stop is prompt
             late = 0 < options.max_seconds <= clock.seconds()
@@ -150,6 +151,7 @@ def _row(experiment, step, recent, clock, compile_seconds):
         "nonfinite": int(values["nonfinite"][-1]),
         "nonfinite_in_a_row": int(values["nonfinite_in_a_row"][-1]),
         "left_out": left_out,
+        **{name: int(values[name][-1]) for name in values if name == "revived" or name.startswith("dead_")},
     }
 
 
@@ -161,6 +163,8 @@ def _text(row, options, late):
     if row["left_out"]:
         drawn = row["rays"] + row["left_out"]
         missed += f"  {row['left_out'] / drawn:.0%} of rays found the pool full"
+    missed += "".join(f"  {name} network dead" for name in revival.dead_networks(row))
+    missed += f"  {row['revived']} networks begun anew" if row["revived"] else ""
     return (
         f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{_minutes(row['seconds'])} done, {_minutes(0.0 if late else left)} left{missed}"

@@ -19,6 +19,7 @@ class Model(NamedTuple):
     view: Callable[..., Any]  # (params, grid, Rays [...]) -> Rendering [...] without weights, for pictures
     scene: Callable[..., Callable]  # (params, grid) -> the scene that counts
     space: Any = None  # Space; None where all of it is asked
+    entrances: dict[str, tuple[str, ...]] = {}  # of the networks, see Field
 
 
 def hierarchical_model(
@@ -74,4 +75,4 @@ def hierarchical_model(
         del grid
         return functools.partial(fields["fine"].apply, params["fine"])
 
-    return Model(init, render, view, scene)
+    return Model(init, render, view, scene, None, {name: field.entrances for name, field in fields.items()})

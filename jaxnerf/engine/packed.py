@@ -61,7 +61,8 @@ def packed_model(
     def restricted(params, grid):
         return occupancy.restrict_scene(scene(params), grid)
 
-    return Model(lambda key: {"fine": field.init(key)}, render, view, restricted, space)
+    entrances = {"fine": field.entrances}
+    return Model(lambda key: {"fine": field.init(key)}, render, view, restricted, space, entrances)
 
 
 def skip_empty_afterwards(model, space, look, *, stop, view_samples, samples_at_once, background):

@@ -31,7 +31,8 @@ def create_state(model, optimizer, seed, possible=None):
     def create(possible):
         params = model.init(jax.random.key(seed))
         zero = jnp.zeros((), jnp.int32)
-        counters = {"nonfinite": zero, "nonfinite_in_a_row": zero}
+        names = ("nonfinite", "nonfinite_in_a_row", "revived", *(f"dead_{name}" for name in params))
+        counters = dict.fromkeys(names, zero)
         if model.space is not None:
             counters["left_out"] = zero
         grid = None if model.space is None else model.space.create(possible)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxnerf.engine.revival import count_dead
 from jaxnerf.engine.state import TrainState
 
 
@@ -25,8 +26,9 @@ def make_train_step(model, optimizer, draw):
         "mse_coarse" (first), "grad_norm", "rays" that counted, and the counters.
 
         The counters: "nonfinite" steps, whose loss or gradient was not finite; they leave parameters,
-        optimiser and grid as they were. "nonfinite_in_a_row". And, of a model with a space, "left_out"
-        rays: a full pool had no room for some of their samples, so they count for nothing.
+        optimiser and grid as they were. "nonfinite_in_a_row". "dead_<name>" of each network, see
+        revival.count_dead, and "revived", which revival alone changes. And, of a model with a space,
+        "left_out" rays: a full pool had no room for some of their samples, so they count for nothing.
     """
 
     def loss_fn(params, grid, step, keys, batch):
@@ -55,7 +57,10 @@ def make_train_step(model, optimizer, draw):
         keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)  # noqa: E731
         params = keep(params, state.params)
         missed = (~finite).astype(jnp.int32)
+        errors = (metrics["mse_coarse"], metrics["mse"])[-len(grads) :]
         counters = {
+            **count_dead(state.counters, grads, errors, model.entrances),
+            "revived": state.counters["revived"],
             "nonfinite": state.counters["nonfinite"] + missed,
             "nonfinite_in_a_row": (state.counters["nonfinite_in_a_row"] + 1) * missed,
         }

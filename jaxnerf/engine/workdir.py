@@ -16,7 +16,7 @@ FREE = (
     "train.save_every",
     "train.keep",
 )
-FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "eval.")
+FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "train.revive", "eval.")
 # Fields that runs may be older than, and what they were then; None: whatever it is now.
 SINCE = {
     "data.finish": "usual",

@@ -18,6 +18,7 @@ class Field(NamedTuple):
 
     init: Callable[[jax.Array], Any]
     apply: Callable[..., tuple[jax.Array, jax.Array]]
+    entrances: tuple[str, ...] = ()  # names in params of what the position enters; (): all of them
 
 
 def mlp_field(**options):
@@ -52,7 +53,8 @@ def mlp_field(**options):
             density = density + density_noise * normal(key, density.shape)
         return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
 
-    return Field(init, apply)
+    entrances = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
+    return Field(init, apply, tuple(f"trunk_{layer}" for layer in entrances))
 
 
 class MLP(linen.Module):
