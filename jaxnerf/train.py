@@ -11,6 +11,9 @@ _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place 
 _FORMAT = flags.DEFINE_enum(
     "format", None, ["auto", *app.FORMATS], "Of the scene, in place of config.data.format."
 )
+_BATCH = app.define_count(
+    "batch", "Rays of the batch at once, or auto: what fits; config.train.block_size when not given."
+)
 flags.mark_flags_as_required(["config", "workdir"])
 
 
@@ -18,7 +21,10 @@ def main(argv):
     del argv
     from jaxnerf.engine.loop import train_and_evaluate  # after the flags: a wrong one is said at once
 
-    train_and_evaluate(app.use_data(_CONFIG.value, _DATA_DIR.value, _FORMAT.value), _WORKDIR.value)
+    config = app.use_data(_CONFIG.value, _DATA_DIR.value, _FORMAT.value)
+    if _BATCH.value is not None:
+        config.train.block_size = _BATCH.value
+    train_and_evaluate(config, _WORKDIR.value)
 
 
 if __name__ == "__main__":

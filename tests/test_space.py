@@ -16,6 +16,7 @@ from jaxnerf.data import synthetic
 from jaxnerf.engine import marching
 from jaxnerf.engine import space as spaces
 from jaxnerf.engine.extraction import crop_grid
+from jaxnerf.engine.live import pixels_that_meet
 from jaxnerf.fields import showcase
 from jaxnerf.fields.mlp import Field
 
@@ -169,12 +170,13 @@ def test_every_pixel_that_shows_something_is_live(views, step):
     space = a_space(resolution=32, step=step)
     possible, live, cells = spaces.survey(views, space, masks=True)
     np.testing.assert_array_equal(cells, np.flatnonzero(possible))
+    live = live.all_ids()
     assert live.dtype == cells.dtype == np.int32 and (np.diff(live) > 0).all()
     shown = np.flatnonzero(views.pixels[:, 3] > 0)
     assert np.isin(shown, live).all()
     assert live.size < 0.98 * len(views.pixels)
     # Their rays are not followed; all others are.
-    np.testing.assert_array_equal(live, spaces.pixels_that_meet(views, space, possible))
+    np.testing.assert_array_equal(live, pixels_that_meet(views, space, possible).all_ids())
 
 
 def test_pixels_outside_their_mask_are_not_live(views):
@@ -182,10 +184,12 @@ def test_pixels_outside_their_mask_are_not_live(views):
     masked = dataclasses.replace(views, mask=mask)
     space = a_space()
     possible = np.ones(space.shape, bool)
-    wanted = spaces.pixels_that_meet(views, space, possible)
-    got = spaces.pixels_that_meet(masked, space, possible, chunk=1000)  # a chunk is no matter
+    wanted = pixels_that_meet(views, space, possible).all_ids()
+    got = pixels_that_meet(masked, space, possible, chunk=1000).all_ids()  # a chunk is no matter
     np.testing.assert_array_equal(got, wanted[mask[wanted]])
-    got = spaces.pixels_that_meet(masked, space, ~possible, np.arange(mask.size) % 4 == 0)
+    fourth = np.where(np.arange(mask.size)[:, None] % 4 == 0, np.uint16(9), np.uint16(0)).repeat(4, axis=1)
+    masked = dataclasses.replace(masked, pixels=fourth)
+    got = pixels_that_meet(masked, space, ~possible, masks=True).all_ids()
     np.testing.assert_array_equal(got, np.arange(0, mask.size, 12))
 
 

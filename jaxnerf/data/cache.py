@@ -22,7 +22,7 @@ def load_or_make(folder, name, make, *, shape, dtype):
     """
     path = None
     try:
-        path = (_default_folder() if folder is None else Path(folder)) / f"{name}.npz"
+        path = (default_folder() if folder is None else Path(folder)) / f"{name}.npz"
         with np.load(path) as content:
             array = content["array"]
         if array.dtype == dtype and array.shape == shape:
@@ -38,7 +38,8 @@ def load_or_make(folder, name, make, *, shape, dtype):
     return array
 
 
-def _default_folder():
+def default_folder():
+    """Returns jaxnerf in $XDG_CACHE_HOME or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxnerf"
 
 

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.core.metrics import psnr, round_to_8_bits, ssim
-from jaxnerf.core.rendering import render_image
 from jaxnerf.data.batches import pixel_colors
 from jaxnerf.engine import card, pictures, records, workdir
 from jaxnerf.engine.load import newest_step, open_run
+from jaxnerf.engine.scores import scores
 
 
 def evaluate(folder, *, config=None, split=None, step=None, chunk=None, settings=None, overwrite=False):
@@ -28,7 +27,7 @@ def evaluate(folder, *, config=None, split=None, step=None, chunk=None, settings
         split: of the data; the configuration's eval.split when None. Another split than that one
             is written to eval/<step>-<split>.
         step: of the checkpoint; the newest when None.
-        chunk: rays rendered at once; the configuration's eval.chunk when None.
+        chunk: rays rendered at once; the configuration's eval.chunk when None; 0: see image_renderer.
         settings: see open_run.
         overwrite: whether an earlier result of the same step and split is replaced.
 
@@ -44,7 +43,7 @@ def evaluate(folder, *, config=None, split=None, step=None, chunk=None, settings
 
 def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False, views=None):
     """As evaluate, for a run that is open already and views that may be read already."""
-    step, chunk = newest_step(run, folder, step), chunk or run.experiment.eval.chunk
+    step, chunk = newest_step(run, folder, step), run.experiment.eval.chunk if chunk is None else chunk
     target = claim_target(run, folder, split=split, step=step, overwrite=overwrite)
     split, name = split or run.experiment.eval.split, target.name
     views = run.experiment.load_views(split) if views is None else views
@@ -77,7 +76,7 @@ def claim_target(run, folder, *, split=None, step=None, overwrite=False):
 
 
 def _write_scores(run, folder, views, weights, *, split, step, chunk, partial):
-    rows = _render_views(run, functools.partial(run.render, weights), views, chunk, partial)
+    rows = _render_views(run, functools.partial(run.image, weights), views, chunk, partial)
     rays = sum(row.pop("rays") for row in rows)
     # The first view's time would hold the compilation too.
     timed = rows[1:] or rows
@@ -94,7 +93,7 @@ def _write_scores(run, folder, views, weights, *, split, step, chunk, partial):
         "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(weights[0])),
         "settings": {name: vars(run.experiment.eval).get(name) for name in ("samples", "stop", "skip_empty")},
-        **card.metric_card({**run.experiment.conventions, "chunk": chunk}, views, split=split),
+        **card.metric_card({**run.experiment.conventions, "chunk": chunk or "auto"}, views, split=split),
         "images": rows,
     }
     workdir.write_text(partial / "results.json", json.dumps(results, indent=2) + "\n")
@@ -124,7 +123,7 @@ def _render_views(run, render, views, chunk, folder):
         pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
         started = time.perf_counter()
         rays = run.experiment.view_rays(views, index, pixels)
-        image = jax.block_until_ready(render_image(render, rays, chunk=chunk))
+        image = jax.block_until_ready(render(rays, chunk=chunk))
         seconds = time.perf_counter() - started
         truth = reference(views, index)
         row = scores(image.rgb, truth, live_mask(views, index))
@@ -145,26 +144,6 @@ def live_mask(views, index):
         return None
     (height, width), first = views.size[index], int(views.offset[index])
     return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
-
-
-@jax.jit
-def _pair_scores(image, truth, mask):
-    if mask is not None:  # SSIM has windows, so it sees the photograph where nothing counts
-        image = jnp.where(mask[..., None], image, truth)
-    rounded, target = round_to_8_bits(image), round_to_8_bits(truth)
-    truncated = jnp.floor(jnp.clip(image, 0, 1) * 255) / 255  # colours of 8 bits stay as they are
-    return {
-        "psnr": psnr(rounded, target, mask=mask),
-        "ssim": ssim(rounded, target),
-        "psnr_float": psnr(image, truth, mask=mask),
-        "psnr_truncated": psnr(truncated, target, mask=mask),
-    }
-
-
-def scores(image, truth, mask=None):
-    """Returns the metrics of an image [H, W, 3] against its photograph, of the pixels in mask [H, W]."""
-    found = _pair_scores(jnp.asarray(image), jnp.asarray(truth), mask)
-    return {key: float(value) for key, value in found.items()}
 
 
 def means(rows):

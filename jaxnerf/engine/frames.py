@@ -9,7 +9,6 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 
-from jaxnerf.core.rendering import render_image
 from jaxnerf.engine import paths, pictures, scenes, video, workdir
 from jaxnerf.engine.load import newest_step, open_run
 from jaxnerf.engine.records import Progress
@@ -49,7 +48,7 @@ def render_path(
         size: (width, height) px, see paths.resize.
         num_frames, closed: see paths.make_path.
         fps: frames a second; the path file's, or 24, when None.
-        chunk: rays at once; the configuration's eval.chunk when None.
+        chunk: rays at once; the configuration's eval.chunk when None; 0: see image_renderer.
         name: in place of the path's in the names of what is written.
         rgba: whether rgba/0000.png is written too: straight alpha, without the background.
         depth: whether there is a video of the depth too.
@@ -88,12 +87,12 @@ def write_frames(target, run, step, views, path, *, chunk=None, rgba=False):
     files = [[target / kind.format(index) for kind in kinds] for index in range(len(path.poses))]
     missing = [index for index, group in enumerate(files) if not all(file.is_file() for file in group)]
     if missing:
-        render = functools.partial(run.render, run.weights(step))
+        render = functools.partial(run.image, run.weights(step))
         posed, progress = paths.posed_views(views, path), Progress(len(files))
         for done, index in enumerate(missing, len(files) - len(missing) + 1):
             pixels = paths.path_pixels(posed, path, index, offset=run.experiment.pixel_offset)
             rays = run.experiment.view_rays(posed, index, pixels)
-            image = render_image(render, rays, chunk=chunk or run.experiment.eval.chunk)
+            image = render(rays, chunk=chunk)
             distance = run.experiment.world_depth(posed, index, pixels, image.depth)
             planes = [np.asarray(distance, np.float32), pictures.to_8_bits(image.rgb)]
             if rgba:

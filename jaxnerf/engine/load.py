@@ -8,6 +8,7 @@ import jax
 from jaxnerf.data.batches import random_rays
 from jaxnerf.engine import build, fit, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
+from jaxnerf.engine.fitting import image_renderer
 from jaxnerf.engine.state import create_state
 
 
@@ -18,6 +19,7 @@ class Trained(NamedTuple):
     steps: Any  # () -> steps of the finished checkpoints, ascending
     weights: Any  # step -> (params, grid or None)
     render: Any  # (weights, Rays [...]) -> Rendering [...] without weights, jitted once for a grid's shape
+    image: Any  # (weights, Rays [...], chunk=None) -> the same in chunks, see image_renderer
 
 
 def open_run(folder, config=None, *, data_dir=None, settings=None):
@@ -60,7 +62,8 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
         state = checkpoints.load(step, template())
         return state.params, extract(state.params) if extract else state.grid
 
-    return Trained(experiment, checkpoints.steps, weights, render)
+    image = image_renderer(render, experiment.eval.chunk)
+    return Trained(experiment, checkpoints.steps, weights, render, image)
 
 
 def newest_step(run, folder, step=None):
