@@ -115,7 +115,7 @@ def test_a_train_batch_that_does_not_fit_is_taken_in_smaller_blocks(when, capsys
     assert sizes == [16, 8, 4]
     assert_same(state, wanted, rtol=0, atol=0)
     err = capsys.readouterr().err.splitlines()
-    assert len(err) == 2 and "train batch: 8 rays at once (train.block_size)" in err[1]
+    assert len(err) == 2 and "train batch: 8 rays at once (--batch)" in err[1]
 
 
 def test_a_chunk_that_does_not_fit_is_halved_and_the_picture_is_the_same(monkeypatch, capsys):
@@ -145,6 +145,7 @@ def test_a_chunk_that_does_not_fit_is_halved_and_the_picture_is_the_same(monkeyp
     image(jnp.float32(3), rays)
     assert set(tried[2:]) == {10} and not capsys.readouterr().err, "found once"
     np.testing.assert_allclose(image(jnp.float32(2), rays, chunk=0).rgb, wanted, rtol=1e-6)
+    fitting.image_renderer(render, 0)(jnp.float32(2), rays)
     assert 64 in tried  # auto: all of them, in one padded shape
     monkeypatch.setattr(memory, "left", lambda: 12 * 16 + 100)
     tried.clear()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxnerf.core.rendering import render_image
 from jaxnerf.engine import memory
 
-_CHUNK = {"cpu": 2**12}  # rays that are rendered at once where there is room for them
+_CPU_CHUNK = 2**12  # rays that are rendered at once where there is room for them
 _LARGEST_CHUNK = 2**16  # of an accelerator
 
 
@@ -16,9 +16,12 @@ def fit_step(compile_step, state, data, block):
     """Returns run, state, data of compile_step(state, data, block), with less where block has no room.
 
     Room is looked for when the step is compiled, and where that was wrong by the first step, which is then
-    taken once more. Later steps need no more than the first.
+    taken once more. Later steps need no more than the first. The batch stays what it was, and but for
+    rounding what a step does.
     """
-    options = {"cause": "train batch", "unit": "rays at once (train.block_size)", "whole": True}
+    options = {"cause": "train batch", "unit": "rays at once (--batch)", "whole": True}
+    if jax.process_count() > 1:
+        options["least"] = block  # all processes run one program: none can take less by itself
     (run, state, data), block = memory.back_off(
         lambda size: compile_step(state, data, size), block, **options
     )
@@ -80,13 +83,15 @@ def image_renderer(render, default):
 
     Args:
         render: (weights, Rays [N]) -> Rendering [N], jitted.
-        default: the chunk where none is given. 0, here and there: as large as suits the device.
+        default: the chunk where none is given. 0, here and there: as large as suits the device, which for a
+            CPU is the default.
     """
     fitting = {}  # by what was asked for: what there was room for
 
     def image(weights, rays, chunk=None):
-        chunk = default if chunk is None else chunk
-        asked = min(chunk or auto_chunk(), 1 << (rays.near.size - 1).bit_length()) if not chunk else chunk
+        asked = default if chunk is None else chunk
+        if not asked:
+            asked = min(_auto_chunk(default), 1 << (rays.near.size - 1).bit_length())
         key = asked, _shapes(weights)
 
         def attempt(size):
@@ -103,9 +108,9 @@ def image_renderer(render, default):
     return image
 
 
-def auto_chunk():
-    """Returns how many rays to render at once where there is the room."""
-    return _CHUNK.get(jax.local_devices()[0].platform, _LARGEST_CHUNK)
+def _auto_chunk(default):
+    """Returns how many rays to render at once where there is the room; configurations suit CPUs."""
+    return default or _CPU_CHUNK if jax.local_devices()[0].platform == "cpu" else _LARGEST_CHUNK
 
 
 def _first(leaf, axes, size):
