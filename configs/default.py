@@ -89,7 +89,7 @@ def get_config():
             },
             "train": {
                 "batch_size": 1024,  # rays a step, over all devices
-                "block_size": 0,  # rays whose gradient is taken at once; 0: what the device is fastest with
+                "block_size": 0,  # rays whose gradient is taken at once; 0: what is fastest and fits
                 "batching": "all_images",  # "all_images", or "single_image": a view a step
                 "parallel": "auto",  # "jit", "sharded", "pmap"; auto: jit on one device, else sharded
                 "max_steps": 200_000,  # 0, with space.skip_empty, fits the images
@@ -110,7 +110,7 @@ def get_config():
             },
             "eval": {
                 "split": "test",
-                "chunk": 4096,  # rays rendered at once
+                "chunk": 4096,  # rays rendered at once; 0: what suits the device and fits
                 "samples": 1.0,  # along a ray, times those of training
                 "skip_empty": False,  # of a network trained along whole rays: leave out what is not seen
                 "stop": 1e-3,  # where empty space is skipped: a ray ends where no more than this passes

@@ -37,6 +37,22 @@ def use_data(config, data_dir, format=None):
     return config
 
 
+def define_count(name, help):
+    """Defines a flag that is "auto", which gives 0, or a whole number of at least 1; None when not given."""
+    return flags.DEFINE(_Count(), name, None, help)
+
+
+class _Count(flags.ArgumentParser):
+    syntactic_help = "auto, or a whole number of at least 1"
+
+    def parse(self, argument):
+        if argument == "auto":
+            return 0
+        if not str(argument).isdecimal() or int(argument) < 1:
+            raise ValueError(f"wanted {self.syntactic_help}")
+        return int(argument)
+
+
 def _keep_memory():
     """Lets freed memory stay with the process, where the C library is glibc.
 

@@ -10,7 +10,7 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.")
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
 _SPLIT = flags.DEFINE_string("split", None, "Of the scene; config.eval.split when not given.")
 _STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
-_CHUNK = flags.DEFINE_integer("chunk", None, "Rays at once; config.eval.chunk when not given.", lower_bound=1)
+_CHUNK = app.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
 _WATCH = flags.DEFINE_bool("watch", False, "Score new checkpoints as they come, until training's last step.")
 _POLL = flags.DEFINE_float("poll_seconds", 10.0, "How often --watch looks.", lower_bound=0.01)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier result.")
@@ -72,6 +72,7 @@ def main(argv):
                 config=config,
                 split=_SPLIT.value,
                 step=_STEP.value,
+                chunk=_CHUNK.value,
                 overwrite=_OVERWRITE.value,
             )
         results = evaluate.evaluate(

@@ -10,7 +10,7 @@ _SIDE = {"lower_bound": 1, "upper_bound": 16384}
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
-_CHUNK = flags.DEFINE_integer("chunk", None, "Rays at once; config.eval.chunk when not given.", lower_bound=1)
+_CHUNK = app.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
 _SKIP_EMPTY = flags.DEFINE_bool("skip_empty", None, "Leave out what is not seen of a dense model.")
 _PATH = flags.DEFINE_string(
     "path", None, "turntable, spiral, ellipse, interpolate or FILE.json; chosen by the views when not given."

@@ -28,6 +28,9 @@ _JOIN_SECONDS = flags.DEFINE_float(
 _STOPPED_CODE = flags.DEFINE_integer(
     "stopped_code", 0, "What to exit with after SIGTERM or Ctrl-C; Kubernetes starts again unless it is 0."
 )
+_BATCH = app.define_count(
+    "batch", "Rays of the batch at once, or auto: what fits; config.train.block_size when not given."
+)
 flags.mark_flags_as_required(["config", "workdir"])
 
 
@@ -37,6 +40,8 @@ def main(argv):
     from jaxnerf.engine.loop import train_and_evaluate
 
     config = app.use_data(_CONFIG.value, _DATA_DIR.value, _FORMAT.value)
+    if _BATCH.value is not None:
+        config.train.block_size = _BATCH.value
     with hosts.cluster(
         multihost=_MULTIHOST.value,
         coordinator=_COORDINATOR.value,

@@ -16,6 +16,7 @@ from jaxnerf.engine import evaluate as evaluation
 from jaxnerf.engine import predictions
 from jaxnerf.engine.build import build
 from jaxnerf.engine.evaluate import evaluate
+from jaxnerf.engine.fitting import image_renderer
 from jaxnerf.engine.load import open_run
 from jaxnerf.engine.watch import watch
 from runs import smoke_config, start
@@ -114,7 +115,9 @@ def test_a_last_smaller_chunk_and_other_views_compile_nothing(run):
     opened, sizes = open_run(run), []
     render = opened.render
     counted = lambda params, rays: sizes.append(rays.near.shape) or render(params, rays)  # noqa: E731
-    evaluation.score_run(opened._replace(render=counted), run, step=10, chunk=250)
+    counted.lower = render.lower
+    image = image_renderer(counted, 4096)
+    evaluation.score_run(opened._replace(image=image), run, step=10, chunk=250)
     assert sizes == [(250,)] * (3 * 8)  # 576 rays a view
     assert render._cache_size() == 1
 

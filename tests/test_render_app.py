@@ -11,7 +11,7 @@ import pytest
 
 from jaxnerf import Camera, load_scene, rays_from_pixels, render_image
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.engine import frames, pictures, video
+from jaxnerf.engine import fitting, pictures, video
 from jaxnerf.engine.frames import render_path
 from runs import run as run_program
 
@@ -106,8 +106,8 @@ def test_only_what_is_missing_is_rendered(rendered, run, path_file, monkeypatch)
     os.remove(folder / "color" / "0001.png")
     (folder / "color" / "0001.png.tmp").write_bytes(pixels[:40])  # as a kill leaves it
     asked = []
-    render_image = frames.render_image
-    monkeypatch.setattr(frames, "render_image", lambda *a, **k: asked.append(1) or render_image(*a, **k))
+    render_image = fitting.render_image
+    monkeypatch.setattr(fitting, "render_image", lambda *a, **k: asked.append(1) or render_image(*a, **k))
     options = {"path": str(path_file), "rgba": True, "kind": "none", "chunk": 100}
     assert render_path(run, **options) == [folder]
     assert len(asked) == 1 and (folder / "color" / "0001.png").read_bytes() == pixels

@@ -45,7 +45,7 @@ def errors(views, *, sky=False):
     """Returns |colour of the pixel - colour of the scene along its ray| [N, 3] at random live pixels."""
     rng, found = np.random.default_rng(0), []
     live = live_pixels(views)
-    live = np.arange(len(views.pixels)) if live is None else live
+    live = np.arange(len(views.pixels)) if live is None else live.all_ids()
     back = np.asarray(views.to_file, np.float64)
     unit = np.cbrt(np.linalg.det(back[:3, :3]))
     for index, (height, width) in enumerate(views.size):

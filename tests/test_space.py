@@ -13,9 +13,10 @@ from helpers import compiled, full_grid, rays_past_origin
 from jaxnerf import Rays
 from jaxnerf.core import occupancy
 from jaxnerf.data import synthetic
-from jaxnerf.engine import marching
+from jaxnerf.engine import live, marching
 from jaxnerf.engine import space as spaces
 from jaxnerf.engine.extraction import crop_grid
+from jaxnerf.engine.live import pixels_that_meet
 from jaxnerf.fields import showcase
 from jaxnerf.fields.mlp import Field
 
@@ -167,14 +168,15 @@ def test_possible_cells_hold_all_matter_of_the_embedded_scene(views, resolution)
 @pytest.mark.parametrize("step", [0.05, 0.3])
 def test_every_pixel_that_shows_something_is_live(views, step):
     space = a_space(resolution=32, step=step)
-    possible, live, cells = spaces.survey(views, space, masks=True)
+    possible, met, cells = spaces.survey(views, space, masks=True)
     np.testing.assert_array_equal(cells, np.flatnonzero(possible))
-    assert live.dtype == cells.dtype == np.int32 and (np.diff(live) > 0).all()
+    met = met.all_ids()
+    assert met.dtype == cells.dtype == np.int32 and (np.diff(met) > 0).all()
     shown = np.flatnonzero(views.pixels[:, 3] > 0)
-    assert np.isin(shown, live).all()
-    assert live.size < 0.98 * len(views.pixels)
+    assert np.isin(shown, met).all()
+    assert met.size < 0.98 * len(views.pixels)
     # Their rays are not followed; all others are.
-    np.testing.assert_array_equal(live, spaces.pixels_that_meet(views, space, possible))
+    np.testing.assert_array_equal(met, pixels_that_meet(views, space, possible).all_ids())
 
 
 def test_pixels_outside_their_mask_are_not_live(views):
@@ -182,11 +184,29 @@ def test_pixels_outside_their_mask_are_not_live(views):
     masked = dataclasses.replace(views, mask=mask)
     space = a_space()
     possible = np.ones(space.shape, bool)
-    wanted = spaces.pixels_that_meet(views, space, possible)
-    got = spaces.pixels_that_meet(masked, space, possible, chunk=1000)  # a chunk is no matter
+    wanted = pixels_that_meet(views, space, possible).all_ids()
+    got = pixels_that_meet(masked, space, possible, chunk=1000).all_ids()  # a chunk is no matter
     np.testing.assert_array_equal(got, wanted[mask[wanted]])
-    got = spaces.pixels_that_meet(masked, space, ~possible, np.arange(mask.size) % 4 == 0)
+    fourth = np.where(np.arange(mask.size)[:, None] % 4 == 0, np.uint16(9), np.uint16(0)).repeat(4, axis=1)
+    masked = dataclasses.replace(masked, pixels=fourth)
+    got = pixels_that_meet(masked, space, ~possible, masks=True).all_ids()
     np.testing.assert_array_equal(got, np.arange(0, mask.size, 12))
+
+
+@pytest.mark.parametrize("masks", [False, True])
+def test_of_very_many_pixels_tiles_are_asked_and_none_is_lost(views, monkeypatch, masks):
+    mask = np.random.default_rng(0).random(len(views.pixels)) < 0.9
+    views = dataclasses.replace(views, mask=mask)
+    space = a_space(resolution=32)
+    possible = spaces.possible_cells(views, space, masks=True)
+    wanted = pixels_that_meet(views, space, possible, masks=masks).all_ids()
+    monkeypatch.setattr(live, "_EACH", 0)
+    monkeypatch.setattr(
+        live, "_TILES", len(views.pixels) / 2.5**2
+    )  # 3 x 3 px, which the size is no multiple of
+    got = pixels_that_meet(views, space, possible, masks=masks).all_ids()
+    assert np.isin(wanted, got).all() and mask[got].all()
+    assert wanted.size < got.size < 0.98 * mask.sum()
 
 
 def test_a_box_that_no_ray_meets_is_named(views):

@@ -6,9 +6,18 @@ import numpy as np
 
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
 from jaxnerf.core.numerics import norm
-from jaxnerf.core.structs import Batch
+from jaxnerf.core.structs import Batch, pytree
+from jaxnerf.data import runs
 
 BATCHINGS = ("all_images", "single_image")
+
+
+@pytree(static=("shape",))
+class Gathered:
+    """In place of all pixels of Views, those of one step's batch, where a device has no room for more."""
+
+    rows: jax.Array  # [batch, C], by position in the batch
+    shape: tuple[int, int]  # of all pixels [P, C]
 
 
 def pixel_colors(pixels, background):
@@ -51,24 +60,22 @@ def world_depth(views, index, pixels, depth, *, ndc=False):
 
 
 def live_pixels(views):
-    """Returns [L] int32, the ids of the pixels that belong to batches, ascending; None where all do.
+    """Returns Runs, the ids of the pixels that belong to batches; None where all do.
 
     Raises:
         ValueError: if a view has none; names it.
     """
     if views.mask is None:
         return None
-    live = np.flatnonzero(views.mask).astype(np.int32)
-    ends = np.append(np.asarray(views.offset)[1:], len(views.mask))
-    for view, (first, last) in enumerate(
-        zip(np.searchsorted(live, views.offset), np.searchsorted(live, ends), strict=True)
-    ):
-        if first == last:
+    parts = []
+    for view, (first, count) in enumerate(zip(views.offset, np.prod(views.size, axis=1), strict=True)):
+        parts.append(runs.runs_of(np.asarray(views.mask[first : first + count]), first))
+        if not len(parts[-1][0]):
             name = views.names[view] if views.names else view
             raise ValueError(
                 f"view {name}: its mask leaves no pixel, wanted at least one; drop the view or mend it"
             )
-    return live
+    return runs.join(parts)
 
 
 def draw_batch(
@@ -83,7 +90,7 @@ def draw_batch(
         seed: int.
         step: int32 scalar.
         positions: [B] int32, of the rays in the step's whole batch.
-        views: Views, on the device.
+        views: Views, on the device. Their pixels may be Gathered.
         live: None, or live_pixels(views): the pixels to draw from.
         batching: "all_images": each ray from any pixel of any view; "single_image": all rays of a
             step from one view, as in the paper's synthetic runs.
@@ -96,27 +103,34 @@ def draw_batch(
     Raises:
         ValueError: on an unknown batching.
     """
-    if batching not in BATCHINGS:
-        raise ValueError(f"draw_batch: batching is {batching!r}, wanted one of {BATCHINGS}")
-    step_key = jax.random.fold_in(jax.random.key(seed), step)
-    ray_keys = jax.vmap(lambda position: jax.random.fold_in(step_key, position))(positions)
-    pixel_keys, keys = jax.vmap(lambda key: tuple(jax.random.split(key)))(ray_keys)
-    first, count = 0, views.pixels.shape[0] if live is None else live.shape[0]
-    if batching == "single_image":
-        # No ray has this position, so the key is the step's own.
-        view = jax.random.randint(jax.random.fold_in(step_key, 2**32 - 1), (), 0, views.offset.shape[0])
-        first, count = views.offset[view], views.size[view].prod()
-        if live is not None:
-            first, last = jnp.searchsorted(live, jnp.stack([first, first + count]))
-            count = last - first
-    index = jax.vmap(lambda key: jax.random.randint(key, (), first, first + count))(pixel_keys)
-    index = index if live is None else live[index]
+    keys, index = draw_pixels(seed, step, positions, views, live, batching=batching)
     view = jnp.searchsorted(views.offset, index, side="right", method="compare_all") - 1
     place = index - views.offset[view]
     width = views.size[view, 1]
     pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
     rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
-    return keys, Batch(rays=rays, rgb=pixel_colors(views.pixels[index], views.background))
+    seen = views.pixels
+    colors = seen.rows[positions] if isinstance(seen, Gathered) else seen[index]
+    return keys, Batch(rays=rays, rgb=pixel_colors(colors, views.background))
+
+
+def draw_pixels(seed, step, positions, views, live=None, *, batching="all_images"):
+    """Returns the keys [B] of draw_batch and the ids [B] int32 of the pixels that its rays go through."""
+    if batching not in BATCHINGS:
+        raise ValueError(f"draw_batch: batching is {batching!r}, wanted one of {BATCHINGS}")
+    step_key = jax.random.fold_in(jax.random.key(seed), step)
+    ray_keys = jax.vmap(lambda position: jax.random.fold_in(step_key, position))(positions)
+    pixel_keys, keys = jax.vmap(lambda key: tuple(jax.random.split(key)))(ray_keys)
+    first, count = 0, views.pixels.shape[0] if live is None else live.size
+    if batching == "single_image":
+        # No ray has this position, so the key is the step's own.
+        view = jax.random.randint(jax.random.fold_in(step_key, 2**32 - 1), (), 0, views.offset.shape[0])
+        first, count = views.offset[view], views.size[view].prod()
+        if live is not None:
+            first, last = live.count_below(jnp.stack([first, first + count]))
+            count = last - first
+    index = jax.vmap(lambda key: jax.random.randint(key, (), first, first + count))(pixel_keys)
+    return keys, index if live is None else live.ids(index)
 
 
 def random_rays(views, count, view_rays, *, pixel_offset=0.5, seed=0):

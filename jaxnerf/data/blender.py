@@ -1,8 +1,8 @@
 """Scenes in the format of the NeRF paper's Blender renders: transforms_<split>.json beside PNG files."""
 
+import functools
 import math
 import os
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +19,12 @@ from jaxnerf.data.checks import (
     required,
 )
 from jaxnerf.data.images import average_blocks, image_size, read_image
+from jaxnerf.data.mapped import fill_pixels
 from jaxnerf.data.poses import check_pose
 
 
-def load_views(folder, *, split="train", factor=1, near=2.0, far=6.0, background=(1.0, 1.0, 1.0)):
-    """Returns one split of a Blender scene, with all its pixels in memory.
+def load_views(folder, *, split="train", factor=1, near=2.0, far=6.0, background=(1.0, 1.0, 1.0), only=None):
+    """Returns one split of a Blender scene, with all its pixels, see fill_pixels.
 
     Args:
         folder: the scene's folder, which holds transforms_<split>.json.
@@ -32,6 +33,7 @@ def load_views(folder, *, split="train", factor=1, near=2.0, far=6.0, background
         near, far: in t, where rays begin and end; directions have length 1 along the camera's axis.
         background: red, green, blue in [0, 1] that alpha is to be composited over. None takes the RGB of the
             files as it is and drops alpha; files without alpha can be read in no other way.
+        only: how many frames there are -> the indices of those to read; None: all.
 
     Returns:
         Views in the order of the frames. Factor 1 keeps the files' 8 or 16 bits, others give 16.
@@ -43,14 +45,15 @@ def load_views(folder, *, split="train", factor=1, near=2.0, far=6.0, background
     check_range(near, far)
     source, scene = _read_transforms(folder, split)
     angle, frames = _angle(scene, source), _frames(scene, source)
+    frames = frames if only is None else [frames[index] for index in only(len(frames))]
     paths = [_image_path(source, frame, where) for where, frame in frames]
     matrices = [(required(frame, "transform_matrix", where), where) for where, frame in frames]
     poses = [check_pose(matrix, source=where) for matrix, where in matrices]
-    pixels = _read_pixels(paths, factor, background, _declared_size(scene, source))
-    count, height, width, channels = pixels.shape
+    pixels, offset, (height, width) = _read_pixels(paths, factor, background, _declared_size(scene, source))
+    count = len(paths)
     return Views(
-        pixels=pixels.reshape(-1, channels),
-        offset=np.arange(count, dtype=np.int32) * np.int32(height * width),
+        pixels=pixels,
+        offset=offset,
         size=np.tile(np.int32([[height, width]]), (count, 1)),
         cameras=Camera(
             to_world=np.stack(poses).astype(np.float32),
@@ -143,25 +146,31 @@ def _image_path(source, frame, where):
 
 
 def _read_pixels(paths, factor, background, declared):
-    """Returns [V, H, W, C]. Two threads: Pillow and zlib work outside Python's lock."""
+    """Returns pixels [V H W, C], where each image's begin [V] int32, and their one (height, width)."""
+    first = _read_frame(paths[0], factor, background, declared)
+    _check_count(paths, first)
 
     def read(path):
-        return _read_frame(path, factor, background, declared)
+        image = _read_frame(path, factor, background, declared)
+        if image.shape != first.shape or image.dtype != first.dtype:
+            size, wanted = (f"{a.shape[1]} x {a.shape[0]} {a.dtype}" for a in (image, first))
+            raise ValueError(
+                f"{path}: is {size} after factor {factor}, wanted {wanted} as {paths[0].name}; "
+                "render all alike"
+            )
+        return image
 
-    pixels = None
-    with ThreadPoolExecutor(2) as pool:
-        for index, image in enumerate(pool.map(read, paths)):
-            if pixels is None:
-                _check_count(paths, image)
-                pixels = np.empty((len(paths), *image.shape), image.dtype)
-            if image.shape != pixels.shape[1:] or image.dtype != pixels.dtype:
-                size, first = (f"{a.shape[1]} x {a.shape[0]} {a.dtype}" for a in (image, pixels[0]))
-                raise ValueError(
-                    f"{paths[index]}: is {size} after factor {factor}, wanted {first} as {paths[0].name}; "
-                    "render all alike"
-                )
-            pixels[index] = image
-    return pixels
+    height, width, channels = first.shape
+    offset = np.arange(len(paths), dtype=np.int32) * np.int32(height * width)
+    pixels = fill_pixels(
+        paths,
+        [functools.partial(read, path) for path in paths],
+        shape=(len(paths) * height * width, channels),
+        dtype=first.dtype,
+        place=offset,
+        depends=("blender", factor, background),
+    )
+    return pixels, offset, (height, width)
 
 
 def _read_frame(path, factor, background, declared):

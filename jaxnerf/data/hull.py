@@ -10,14 +10,16 @@ from jaxnerf.data.silhouettes import count, silhouette
 
 _COARSEST = 16  # cells along each axis to begin with, or up to twice as many
 _CHUNK = 4096  # of these at once: their arrays stay in the processor's cache
+_MOST_VIEWS = 256  # that are looked at: more, from all around, would hardly empty a cell more
 
 
 def visual_hull(views, lower, upper, *, resolution):
     """Returns which cells of a box may hold something, as far as the alpha of the views tells.
 
     A cell is empty where one view that sees all of it has alpha 0 on every pixel that it may touch and on
-    their neighbours. What no view decides stays possible. So no matter is lost but what left no alpha around
-    its place: thinner than a pixel, or fainter than half a step of the file's bits.
+    their neighbours. What no view decides stays possible, and of many views only some are looked at. So no
+    matter is lost but what left no alpha around its place: thinner than a pixel, or fainter than half a step
+    of the file's bits.
 
     Args:
         views: Views with straight alpha, C = 4. A pixel outside their mask tells nothing.
@@ -38,7 +40,7 @@ def visual_hull(views, lower, upper, *, resolution):
     tree = [np.ones(levels[0] ** 3 * 8**depth, bool) for depth in range(len(levels))]
     roots = np.indices((levels[0],) * 3, np.float32).reshape(3, -1)
     # Neighbours in a list look alike; views from all around empty the coarse cells sooner.
-    for index in np.random.default_rng(0).permutation(len(views.offset)):
+    for index in np.random.default_rng(0).permutation(len(views.offset))[:_MOST_VIEWS]:
         view = silhouette(views, index)
         projections = [_projection(view, lower, (upper - lower) / level) for level in levels]
         alive = np.flatnonzero(tree[0])

@@ -37,9 +37,25 @@ def read_image(path, *, stored=None, turn=True):
         ValueError: if the file is missing, no image, or cut short.
     """
     pixels, value = _open(path, lambda image: (_decode(path, image), _orientation(image)))
-    upright = np.ascontiguousarray(_UPRIGHT[value](pixels)) if turn and value in _UPRIGHT else pixels
-    kept = stored and fits(pixels.shape[:2], stored) and not fits(upright.shape[:2], stored)
-    return pixels if kept else upright
+    if not (turn and _turns(pixels.shape[:2], value, stored)):
+        return pixels
+    return np.ascontiguousarray(_UPRIGHT[value](pixels))
+
+
+def image_form(path, *, stored=None, turn=True):
+    """Returns the shape (H, W, C) and the dtype of what read_image gives, from the file's first bytes."""
+    (width, height), channels, dtype, value = _open(
+        path, lambda image: (image.size, *_depth(image), _orientation(image))
+    )
+    if turn and value >= 5 and _turns((height, width), value, stored):
+        height, width = width, height
+    return (height, width, channels), dtype
+
+
+def _turns(size, value, stored):
+    """Returns whether an EXIF orientation of an image [H, W] is followed."""
+    upright = size[::-1] if value >= 5 else size
+    return value in _UPRIGHT and not (stored and fits(size, stored) and not fits(upright, stored))
 
 
 def fits(found, declared):
@@ -83,8 +99,22 @@ def _orientation(image):
     return turn if turn in _UPRIGHT else 1
 
 
+def _raw(image):
+    return image.tile[0][3] if image.format == "PNG" and image.tile else None
+
+
+def _depth(image):
+    """Returns the channels and the dtype of what _decode gives."""
+    raw = _raw(image)
+    if raw in ("RGB;16B", "RGBA;16B"):
+        return (4 if raw.startswith("RGBA") else 3), np.dtype(np.uint16)
+    if image.mode == "I;16":
+        return 3, np.dtype(np.uint16)
+    return (4 if image.has_transparency_data else 3), np.dtype(np.uint8)
+
+
 def _decode(path, image):
-    raw = image.tile[0][3] if image.format == "PNG" and image.tile else None
+    raw = _raw(image)
     if raw in ("RGB;16B", "RGBA;16B"):
         # Pillow keeps only the first byte of each 16 bit value. Naming the byte order the other way
         # round makes it keep the second, so two passes give all sixteen bits.

@@ -8,7 +8,7 @@ import numpy as np
 from jaxnerf.data import features
 from jaxnerf.data.findings import Finding
 from jaxnerf.data.images import read_image, read_mask
-from jaxnerf.data.photos import check_size
+from jaxnerf.data.photo_pixels import check_size
 
 _THUMB = 24  # px, side of what stands for a photograph when looking for others like it
 

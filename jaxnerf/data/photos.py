@@ -1,23 +1,17 @@
 """From the photographs of a Capture to Views: reading, shrinking, masks, lenses, who is held out."""
 
-import dataclasses
+import functools
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxnerf.core.structs import Camera, Views
 from jaxnerf.data.checks import check_background, check_factor
 from jaxnerf.data.copies import choose_copies
-from jaxnerf.data.images import average_blocks, fits, read_image, read_mask
+from jaxnerf.data.mapped import workers
+from jaxnerf.data.photo_pixels import form_of, read_masks, read_pixels, scaled_camera
 
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # coefficients
-
-
-class _Photo(NamedTuple):
-    pixels: np.ndarray  # [H, W, C]
-    mask: np.ndarray | None  # [H, W] bool
-    camera: Camera  # of these pixels
 
 
 def split_indices(capture, split, *, hold=8):
@@ -46,8 +40,8 @@ def split_indices(capture, split, *, hold=8):
     return chosen
 
 
-def load_views(capture, *, split="train", factor=1, hold=8, background=None):
-    """Returns one split of a capture, with all its pixels in memory.
+def load_views(capture, *, split="train", factor=1, hold=8, background=None, only=None):
+    """Returns one split of a capture, with all its pixels, see fill_pixels.
 
     Args:
         capture: Capture, with bounds in every frame.
@@ -55,6 +49,7 @@ def load_views(capture, *, split="train", factor=1, hold=8, background=None):
         factor: whole number; images are averaged down by it, cut at the right and below where it does not
             divide them. A folder images_N beside, with an N that divides it, is used where there is one.
         background: red, green, blue in [0, 1] behind images with alpha. None drops alpha.
+        only: how many frames the split has -> the indices of those to read; None: all.
 
     Returns:
         Views in the order of the names; near and far are the frames' bounds. With images of 8 bits and of
@@ -67,27 +62,23 @@ def load_views(capture, *, split="train", factor=1, hold=8, background=None):
     factor, background = check_factor(factor), check_background(background)
     frames, shrink = choose_copies(capture.frames, factor)
     chosen = [frames[index] for index in split_indices(capture, split, hold=hold)]
-
-    def read(frame):
-        return _read(frame, shrink, background)
-
-    with ThreadPoolExecutor(2) as pool:  # Pillow and zlib work outside Python's lock
-        photos = list(pool.map(read, chosen))
-    sizes = np.array([photo.pixels.shape[:2] for photo in photos])
+    chosen = chosen if only is None else [chosen[index] for index in only(len(chosen))]
+    with ThreadPoolExecutor(workers()) as pool:
+        forms = list(pool.map(functools.partial(form_of, shrink=shrink, background=background), chosen))
+    sizes = np.array([form.size for form in forms])
     ends = np.cumsum(sizes.prod(axis=1))
     if ends[-1] >= 2**31:  # offsets and pixel ids are int32
         raise ValueError(f"{capture.source}: has {ends[-1]} pixels, wanted less than 2^31; raise factor")
-    masks = None
-    if any(photo.mask is not None for photo in photos):
-        masks = [np.ones(p.pixels.shape[:2], bool) if p.mask is None else p.mask for p in photos]
-        masks = np.concatenate([mask.reshape(-1) for mask in masks])
+    offset = np.append(0, ends[:-1]).astype(np.int32)
+    pixels = read_pixels(chosen, forms, offset, shrink, background)
+    masks = read_masks(chosen, forms, shrink)
     bounds = np.float32([frame.bounds for frame in chosen])
-    pixels = _alike([photo.pixels for photo in photos])
+    cameras = [scaled_camera(frame, form, shrink) for frame, form in zip(chosen, forms, strict=True)]
     return Views(
         pixels=pixels,
-        offset=np.append(0, ends[:-1]).astype(np.int32),
+        offset=offset,
         size=sizes.astype(np.int32),
-        cameras=stack_cameras([photo.camera for photo in photos], [frame.name for frame in chosen]),
+        cameras=stack_cameras(cameras, [frame.name for frame in chosen]),
         near=bounds[:, 0],
         far=bounds[:, 1],
         mask=masks,
@@ -116,78 +107,3 @@ def stack_cameras(cameras, names):
         for name in ("to_world", "focal", "center")
     }
     return Camera(**numbers, distortion=distortion, lens=lens, height=height, width=width)
-
-
-def _read(frame, shrink, background):
-    """Returns the _Photo of a frame."""
-    camera = frame.camera
-    declared = camera.height, camera.width
-    pixels = read_image(frame.image, stored=declared, turn=frame.turned)
-    if background is None:
-        pixels = pixels[..., :3]
-    full = pixels.shape[:2]
-    check_size(frame.image, full, declared)
-    mask = None if frame.mask is None else _read_mask(frame, full)
-    if shrink > 1:
-        pixels, mask = _shrink(frame.image, pixels, mask, shrink, background)
-    scale = np.array(full[::-1]) / declared[::-1] / shrink
-    camera = dataclasses.replace(
-        camera,
-        focal=camera.focal * scale,
-        center=camera.center * scale,
-        height=pixels.shape[0],
-        width=pixels.shape[1],
-    )
-    return _Photo(pixels, mask, camera)
-
-
-def check_size(path, found, declared):
-    """Raises a ValueError unless an image is as large as its camera, or all of it that many times smaller."""
-    if not fits(found, declared):
-        raise ValueError(
-            f"{path}: is {found[1]} x {found[0]}, its camera is for {declared[1]} x {declared[0]}; wanted "
-            "that size or a whole part of it; copy the original or correct the camera"
-        )
-
-
-def _read_mask(frame, full):
-    """Returns the mask [H, W] of a frame at its image's size; a mask for the original shrinks with it."""
-    mask = read_mask(frame.mask, stored=full)
-    times = max(round(mask.shape[0] / full[0]), 1)
-    if not fits(full, mask.shape) or any(
-        times * have > side for have, side in zip(full, mask.shape, strict=True)
-    ):
-        raise ValueError(
-            f"{frame.mask}: is {mask.shape[1]} x {mask.shape[0]}, wanted {full[1]} x {full[0]} as "
-            f"{frame.image.name}; make it again"
-        )
-    return _all_blocks(mask, *full, times)
-
-
-def _all_blocks(mask, height, width, times):
-    """Returns [height, width] bool: a pixel counts where all of its block of the mask does."""
-    return mask[: height * times, : width * times].reshape(height, times, width, times).all((1, 3))
-
-
-def _shrink(path, pixels, mask, shrink, background):
-    height, width = (side // shrink * shrink for side in pixels.shape[:2])
-    if not height or not width:
-        raise ValueError(f"{path}: is {pixels.shape[1]} x {pixels.shape[0]}, too small for factor {shrink}")
-    small = average_blocks(pixels[:height, :width], shrink, background=background)
-    return small, None if mask is None else _all_blocks(mask, height // shrink, width // shrink, shrink)
-
-
-def _alike(images):
-    """Returns the pixels [P, C] of images, of one type and with one number of channels."""
-    channels = max(image.shape[-1] for image in images)
-    dtype = max((image.dtype for image in images), key=lambda dtype: dtype.itemsize)
-    total = sum(image.shape[0] * image.shape[1] for image in images)
-    pixels, first = np.full((total, channels), np.iinfo(dtype).max, dtype), 0
-    for image in images:
-        count = image.shape[0] * image.shape[1]
-        part = image.reshape(count, -1)
-        if image.dtype != dtype:
-            part = part.astype(dtype) * dtype.type(257)
-        pixels[first : first + count, : part.shape[1]] = part
-        first += count
-    return pixels

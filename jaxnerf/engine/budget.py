@@ -4,7 +4,6 @@ import sys
 import time
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaxnerf.data.batches import random_rays
@@ -24,11 +23,12 @@ class Choice(NamedTuple):
     seconds: float  # for the rays that were tried
 
 
-def choose(folder, error_budget, *, config=None, split=None, step=None, overwrite=False):
+def choose(folder, error_budget, *, config=None, split=None, step=None, chunk=None, overwrite=False):
     """Returns the settings of cheapest_settings for evaluate, and prints what was tried and picked."""
     # The search takes a while, so what would end the scoring after it comes first.
     claim_target(open_run(folder, config), folder, split=split, step=step, overwrite=overwrite)
-    choice, tried = cheapest_settings(folder, error_budget, config=config, split=split, step=step)
+    options = {"config": config, "split": split, "step": step, "chunk": chunk}
+    choice, tried = cheapest_settings(folder, error_budget, **options)
     for other in tried:
         print(f"{_text(other)}{'  <- picked' if other is choice else ''}", file=sys.stderr)
     return choice.settings
@@ -39,7 +39,7 @@ def _text(choice):
     return f"RMS error {choice.error:.5f} in {choice.seconds:.3f} s: {settings}"
 
 
-def cheapest_settings(folder, error_budget, *, config=None, split=None, step=None, num_rays=4096):
+def cheapest_settings(folder, error_budget, *, config=None, split=None, step=None, chunk=None, num_rays=4096):
     """Returns the cheapest Choice within a budget, and all that were tried.
 
     Tried on rays through random pixels of a split's views, of which only the cameras count: the error is that
@@ -52,6 +52,7 @@ def cheapest_settings(folder, error_budget, *, config=None, split=None, step=Non
         config: see open_run.
         split: views held out of training; the configuration's eval.split when None.
         step: of the checkpoint; the newest when None.
+        chunk: rays at once, see evaluate; of the exact rendering as many fewer as it has more samples.
         num_rays: to try on.
 
     Returns:
@@ -67,14 +68,16 @@ def cheapest_settings(folder, error_budget, *, config=None, split=None, step=Non
         experiment.load_views(split), num_rays, experiment.view_rays, pixel_offset=experiment.pixel_offset
     )
     step = newest_step(exact, folder, step)
-    truth = _render(exact, exact.weights(step), rays)[0]
+    chunk = experiment.eval.chunk if chunk is None else chunk
+    fewer = -(-chunk // int(_EXACT["samples"]))
+    truth = np.asarray(exact.image(exact.weights(step), rays, chunk=min(fewer, num_rays)).rgb)
     tried, weights = [], {}
 
     def attempt(settings):
         run = open_run(folder, config, settings=settings)
         if settings["skip_empty"] not in weights:  # neither samples nor stop change them
             weights[settings["skip_empty"]] = run.weights(step)
-        rgb, seconds = _render(run, weights[settings["skip_empty"]], rays)
+        rgb, seconds = _render(run, weights[settings["skip_empty"]], rays, min(chunk, num_rays))
         tried.append(Choice(settings, float(np.sqrt(np.mean((rgb - truth) ** 2))), seconds))
         return tried[-1].error <= error_budget
 
@@ -103,11 +106,11 @@ def _descend(attempt, tried, skip_empty, stops):
             break
 
 
-def _render(run, weights, rays):
+def _render(run, weights, rays, chunk):
     """Returns colours [N, 3] and the seconds that they took, compilation not counted."""
-    rgb, seconds = jax.block_until_ready(run.render(weights, rays)).rgb, []
+    rgb, seconds = run.image(weights, rays, chunk=chunk).rgb, []
     for _ in range(3):
         started = time.perf_counter()
-        jax.block_until_ready(run.render(weights, rays))
+        run.image(weights, rays, chunk=chunk)
         seconds.append(time.perf_counter() - started)
     return np.asarray(rgb), min(seconds)

@@ -26,6 +26,7 @@ class Experiment(NamedTuple):
     schedule: Callable[[int], float]  # step -> learning rate
     load_views: Callable[[str], Any]  # split -> Views
     draw: Callable[..., tuple]  # (step, positions, (Views, live, cells)) -> (keys, Batch)
+    ids: Callable[..., Any]  # (step, positions, as above) -> ids [B] int32 of the pixels that draw takes
     view_rays: Callable[..., Any]  # (Views, index, pixels) -> Rays
     world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in the file's units
     survey: Callable[..., tuple]  # Views -> possible cells, live pixels, cells to look at; each may be None
@@ -52,6 +53,11 @@ def build(config):
         batching = config.train.batching
         return batches.draw_batch(config.seed, step, positions, views, live, batching=batching, **options)
 
+    def ids(step, positions, data):
+        views, live, _ = data
+        batching = config.train.batching
+        return batches.draw_pixels(config.seed, step, positions, views, live, batching=batching)[1]
+
     if config.train.batching not in batches.BATCHINGS:
         raise ValueError(f"train.batching is {config.train.batching!r}, wanted one of {batches.BATCHINGS}")
     return Experiment(
@@ -60,6 +66,7 @@ def build(config):
         schedule=schedule,
         load_views=functools.partial(load_views, config.data),
         draw=draw,
+        ids=ids,
         view_rays=functools.partial(batches.view_rays, ndc=config.data.ndc),
         world_depth=functools.partial(batches.world_depth, ndc=config.data.ndc),
         survey=functools.partial(_survey, config, model),

@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.core.metrics import psnr, round_to_8_bits, ssim
-from jaxnerf.core.rendering import render_image
 from jaxnerf.data.batches import pixel_colors
 from jaxnerf.engine import hosts, merging, pictures, records, shards, workdir
 from jaxnerf.engine.load import newest_step, open_run
+from jaxnerf.engine.scores import scores
 
 _OTHER = "give --overwrite without --shard, or remove it"
 
@@ -43,7 +42,7 @@ def evaluate(
         split: of the data; the configuration's eval.split when None. Another split than that one
             is written to eval/<step>-<split>.
         step: of the checkpoint; the newest when None.
-        chunk: rays rendered at once; the configuration's eval.chunk when None.
+        chunk: rays rendered at once; the configuration's eval.chunk when None; 0: see image_renderer.
         settings: see open_run.
         overwrite: whether an earlier result of the same step and split is replaced.
         shard: (index, count): only every count-th view from that index on.
@@ -63,7 +62,7 @@ def score_run(
     run, folder, *, split=None, step=None, chunk=None, overwrite=False, views=None, shard=shards.WHOLE
 ):
     """As evaluate, for a run that is open already and views that may be read already."""
-    step, chunk = newest_step(run, folder, step), chunk or run.experiment.eval.chunk
+    step, chunk = newest_step(run, folder, step), run.experiment.eval.chunk if chunk is None else chunk
     target = claim_target(run, folder, split=split, step=step, overwrite=overwrite, shard=shard)
     split = split or run.experiment.eval.split
     views = run.experiment.load_views(split) if views is None else views
@@ -77,7 +76,7 @@ def score_run(
         with workdir.naming(partial):
             for name in merging.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
-            _score_views(run, functools.partial(run.render, weights), views, chunk, partial, shard)
+            _score_views(run, functools.partial(run.image, weights), views, chunk, partial, shard)
             return merging.merge(partial, target, chunk=chunk, **rest)
     except FileNotFoundError:  # another call has finished and moved it all, perhaps while this one began
         if partial.exists() and any((partial / "rows").glob("*")) or not target.exists():
@@ -144,7 +143,7 @@ def _score_views(run, render, views, chunk, folder, shard):
         pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
         started = time.perf_counter()
         rays = run.experiment.view_rays(views, index, pixels)
-        image = jax.block_until_ready(render_image(render, rays, chunk=chunk))
+        image = jax.block_until_ready(render(rays, chunk=chunk))
         seconds = time.perf_counter() - started
         truth = reference(views, index)
         row = {"name": name, **scores(image.rgb, truth, live_mask(views, index)), "seconds": seconds}
@@ -162,23 +161,3 @@ def live_mask(views, index):
         return None
     (height, width), first = views.size[index], int(views.offset[index])
     return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
-
-
-@jax.jit
-def _pair_scores(image, truth, mask):
-    if mask is not None:  # SSIM has windows, so it sees the photograph where nothing counts
-        image = jnp.where(mask[..., None], image, truth)
-    rounded, target = round_to_8_bits(image), round_to_8_bits(truth)
-    truncated = jnp.floor(jnp.clip(image, 0, 1) * 255) / 255  # colours of 8 bits stay as they are
-    return {
-        "psnr": psnr(rounded, target, mask=mask),
-        "ssim": ssim(rounded, target),
-        "psnr_float": psnr(image, truth, mask=mask),
-        "psnr_truncated": psnr(truncated, target, mask=mask),
-    }
-
-
-def scores(image, truth, mask=None):
-    """Returns the metrics of an image [H, W, 3] against its photograph, of the pixels in mask [H, W]."""
-    found = _pair_scores(jnp.asarray(image), jnp.asarray(truth), mask)
-    return {key: float(value) for key, value in found.items()}

@@ -9,7 +9,6 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 
-from jaxnerf.core.rendering import render_image
 from jaxnerf.engine import paths, pictures, scenes, shards, video
 from jaxnerf.engine.load import newest_step, open_run
 from jaxnerf.engine.records import Progress
@@ -50,7 +49,7 @@ def render_path(
         size: (width, height) px, see paths.resize.
         num_frames, closed: see paths.make_path.
         fps: frames a second; the path file's, or 24, when None.
-        chunk: rays at once; the configuration's eval.chunk when None.
+        chunk: rays at once; the configuration's eval.chunk when None; 0: see image_renderer.
         name: in place of the path's in the names of what is written.
         rgba: whether rgba/0000.png is written too: straight alpha, without the background.
         depth: whether there is a video of the depth too.
@@ -104,12 +103,12 @@ def write_frames(target, run, step, views, path, *, chunk=None, rgba=False, shar
     frames = shards.own(range(len(files)), shard)
     todo = shards.own(missing(), shard)
     if todo:
-        render = functools.partial(run.render, run.weights(step))
+        render = functools.partial(run.image, run.weights(step))
         posed, progress = paths.posed_views(views, path), Progress(len(frames))
         for done, index in enumerate(todo, len(frames) - len(todo) + 1):
             pixels = paths.path_pixels(posed, path, index, offset=run.experiment.pixel_offset)
             rays = run.experiment.view_rays(posed, index, pixels)
-            image = render_image(render, rays, chunk=chunk or run.experiment.eval.chunk)
+            image = render(rays, chunk=chunk)
             distance = run.experiment.world_depth(posed, index, pixels, image.depth)
             planes = [np.asarray(distance, np.float32), pictures.to_8_bits(image.rgb)]
             if rgba:

@@ -8,6 +8,7 @@ import jax
 from jaxnerf.data.batches import random_rays
 from jaxnerf.engine import build, fit, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
+from jaxnerf.engine.fitting import image_renderer
 from jaxnerf.engine.state import create_state
 
 
@@ -19,6 +20,7 @@ class Trained(NamedTuple):
     weights: Any  # step -> (params, grid or None)
     render: Any  # (weights, Rays [...]) -> Rendering [...] without weights, jitted once for a grid's shape
     config: Any  # ConfigDict, resolved
+    image: Any  # (weights, Rays [...], chunk=None) -> the same in chunks, see image_renderer
 
 
 def open_run(folder, config=None, *, data_dir=None, settings=None):
@@ -61,7 +63,8 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
         state = checkpoints.load(step, template())
         return state.params, extract(state.params) if extract else state.grid
 
-    return Trained(experiment, checkpoints.steps, weights, render, config)
+    image = image_renderer(render, experiment.eval.chunk)
+    return Trained(experiment, checkpoints.steps, weights, render, config, image)
 
 
 def newest_step(run, folder, step=None):

@@ -1,6 +1,7 @@
 """The training loop: resume, step, log, save, stop cleanly."""
 
 import contextlib
+import dataclasses
 import functools
 import pathlib
 import time
@@ -9,7 +10,8 @@ import jax
 import numpy as np
 
 from jaxnerf.core.metrics import decibels
-from jaxnerf.engine import build, hosts, parallel, records, revival, workdir
+from jaxnerf.data.batches import Gathered
+from jaxnerf.engine import build, fitting, hosts, parallel, records, revival, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
@@ -119,17 +121,30 @@ def _compile(experiment, views):
     started = time.perf_counter()
     possible, live, cells = experiment.survey(views)
     surveyed = time.perf_counter() - started
+    views = dataclasses.replace(views, mask=None)  # live has it
+    pixels, gather = views.pixels, fitting.has_no_room(views.pixels)
+    if gather:
+        rows = np.zeros_like(pixels, shape=(options.batch_size, pixels.shape[1]))
+        views = dataclasses.replace(views, pixels=Gathered(rows=rows, shape=pixels.shape))
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
-    placed = parallel.compile_step(
+    compile_step = functools.partial(
+        parallel.compile_step,
         step,
-        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, possible),
-        (views, live, cells),
         batch_size=options.batch_size,
-        block_size=options.block_size,
         samples_per_ray=experiment.samples_per_ray,
         mode=options.parallel,
     )
-    return *placed, surveyed, time.perf_counter() - started - surveyed
+    state = functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, possible)
+    run, *placed = fitting.fit_step(
+        lambda state, data, block: compile_step(state, data, block_size=block),
+        state,
+        (views, live, cells),
+        parallel.block_of(options, experiment.samples_per_ray),
+    )
+    if gather:
+        ids = functools.partial(experiment.ids, positions=np.arange(options.batch_size))
+        run = fitting.gather_ahead(run, jax.jit(lambda step, data: ids(step, data=data)), pixels)
+    return run, *placed, surveyed, time.perf_counter() - started - surveyed
 
 
 def _row(experiment, step, recent, clock, compile_seconds):

@@ -79,6 +79,7 @@ def _results(run, folder, views, weights, finished, *, origin, chunk):
     timed = [view["row"] for view in finished if not view["first"]] or rows
     seconds = sum(row["seconds"] for row in timed) / len(timed)
     trained = [row for row in records.read_rows(folder) if row["step"] <= origin["step"]]
+    conventions = {**run.experiment.conventions, "chunk": chunk or "auto"}
     return {
         **means(rows),
         "views": len(rows),
@@ -91,7 +92,7 @@ def _results(run, folder, views, weights, finished, *, origin, chunk):
         "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(weights[0])),
         "settings": {name: origin[name] for name in ("samples", "stop", "skip_empty")},
-        **card.metric_card({**run.experiment.conventions, "chunk": chunk}, views, split=origin["split"]),
+        **card.metric_card(conventions, views, split=origin["split"]),
         "images": rows,
     }
 

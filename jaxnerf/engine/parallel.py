@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, SingleDeviceSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxnerf.engine import hosts
+from jaxnerf.engine import hosts, memory
 
 MODES = ("auto", "jit", "sharded", "pmap")
 CPU_BLOCK_SAMPLES = 12_288
@@ -43,6 +43,7 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
 
     Raises:
         ValueError: if the batch does not split evenly, the processes' data differ, or on an unknown mode.
+        memory.NoRoom: if the step would need more memory than there is.
     """
     devices = devices_of(mode)
     block_size = block_size or default_block(batch_size // len(devices), samples_per_ray, devices[0].platform)
@@ -73,6 +74,7 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
             compiled = _with_state_everywhere(jitted, everywhere)
         else:
             compiled = jitted.lower(shapes, data, positions).compile()
+            memory.check(compiled)
         state = place(hosts.from_first(made.result()), everywhere)
 
     def run(state, data):
@@ -136,6 +138,13 @@ def default_block(share, samples_per_ray, platform):
     # The best size in experiments/step_cost.py; the activations of a whole batch would leave the cache.
     fitting = max(CPU_BLOCK_SAMPLES // int(samples_per_ray), 1)
     return max(size for size in range(1, min(share, fitting) + 1) if share % size == 0) if share > 0 else 0
+
+
+def block_of(options, samples_per_ray):
+    """Returns train.block_size of the options, or where that is 0 what the devices are fastest with."""
+    devices = devices_of(options.parallel)
+    share = options.batch_size // len(devices)
+    return min(options.block_size, share) or default_block(share, samples_per_ray, devices[0].platform)
 
 
 def split_positions(batch_size, num_devices, block_size):

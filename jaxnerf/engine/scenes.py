@@ -95,18 +95,21 @@ def _without_held_out(data, split):
     every = data.get("hold_out", 0)
     if not every or split not in ("train", "held_out"):
         return _read_views(data, split)
-    views = _read_views(data, "train")
-    count = len(views.offset)
-    if not 2 <= every <= count:
-        raise ValueError(f"data.hold_out is {every} of {count} views, wanted 2 to {count}, or 0 for none")
-    indices = subset.held_out(count, every)
-    return subset.select_views(views, indices if split == "held_out" else np.setdiff1d(range(count), indices))
+
+    def only(count):
+        if not 2 <= every <= count:
+            raise ValueError(f"data.hold_out is {every} of {count} views, wanted 2 to {count}, or 0 for none")
+        indices = subset.held_out(count, every)
+        return indices if split == "held_out" else np.setdiff1d(range(count), indices)
+
+    return _read_views(data, "train", only)
 
 
-def _read_views(data, split):
+def _read_views(data, split, only=None):
     if data.format == "synthetic":
         finish = data.get("finish", "usual")  # as it was before there was a choice
-        return synthetic.load_views(split=split, size=data.size, finish=finish)
+        views = synthetic.load_views(split=split, size=data.size, finish=finish)
+        return views if only is None else subset.select_views(views, only(len(views.offset)))
     data, _ = settle(data)
     folder = scene_folder(data.dir)
     if data.world not in WORLDS or (data.format == "blender" and data.world != "file"):
@@ -125,6 +128,7 @@ def _read_views(data, split):
             near=data.near or 2.0,
             far=data.far or 6.0,
             background=background_of(data),
+            only=only,
         )
     capture = bounds.with_bounds(formats.read_capture(folder, data.format))
     to_file = np.eye(4)
@@ -137,7 +141,9 @@ def _read_views(data, split):
     # Runs from before data.width have near and far of Blender's scenes in every format.
     near, far = (data.near, data.far) if "width" in data else (0.0, 0.0)
     capture = bounds.given(capture, near, far, to_file)
-    views = photos.load_views(capture, split=split, factor=data.factor, background=background_of(data))
+    views = photos.load_views(
+        capture, split=split, factor=data.factor, background=background_of(data), only=only
+    )
     box = None if capture.box is None else np.float32(capture.box)
     return dataclasses.replace(views, to_file=np.float32(to_file), box=box)
 

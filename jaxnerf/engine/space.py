@@ -1,6 +1,5 @@
 """The box of a scene: what of it is known to be empty before training, and what training finds to be."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf.core import contraction, occupancy
-from jaxnerf.data.batches import live_pixels, view_rays
 from jaxnerf.data.hull import visual_hull
-from jaxnerf.engine.marching import samples_in_box
+from jaxnerf.engine.live import pixels_that_meet
 
 _CHUNK = 8192  # cells asked at once: their activations stay in a processor's cache
 
@@ -137,7 +135,7 @@ def _stretches(shape):
 
 
 def survey(views, space, *, masks, ndc=False, pixel_offset=0.5):
-    """Returns what is known before training: possible [X, Y, Z] bool, live [L] and cells [M] int32.
+    """Returns what is known before training: possible [X, Y, Z] bool, live Runs, and cells [M] int32.
 
     Args:
         views: Views.
@@ -146,12 +144,11 @@ def survey(views, space, *, masks, ndc=False, pixel_offset=0.5):
         ndc, pixel_offset: see draw_batch.
 
     Returns:
-        possible: which cells may hold something; live: the pixels whose rays meet one, all that training
-        has to look at; cells: the flat indices of those that are possible.
+        possible: which cells may hold something; live: see live.pixels_that_meet; cells: the flat indices of
+        those that are possible.
     """
     possible = possible_cells(views, space, masks=masks)
-    shown = views.pixels[:, 3] > 0 if masks and views.pixels.shape[-1] == 4 else None
-    live = pixels_that_meet(views, space, possible, shown, ndc=ndc, pixel_offset=pixel_offset)
+    live = pixels_that_meet(views, space, possible, masks=masks, ndc=ndc, pixel_offset=pixel_offset)
     return possible, live, np.flatnonzero(possible).astype(np.int32)
 
 
@@ -168,46 +165,3 @@ def possible_cells(views, space, *, masks):
     upper = lower + count * (np.asarray(space.upper) - lower) / space.shape
     x, y, z = space.shape
     return visual_hull(views, lower, upper, resolution=count)[:x, :y, :z]
-
-
-def pixels_that_meet(views, space, possible, shown=None, *, ndc=False, pixel_offset=0.5, chunk=2**12):
-    """Returns [L] int32, ascending: the ids of live pixels that are shown or whose rays meet a possible cell.
-
-    Args:
-        views: Views.
-        space: Space.
-        possible: [X, Y, Z] bool.
-        shown: [P] bool, the pixels that have alpha, whose rays need not be followed; None follows all.
-        ndc, pixel_offset: see draw_batch.
-        chunk: rays followed at once.
-
-    Raises:
-        ValueError: if there are none.
-    """
-    live = live_pixels(views)
-    live = np.arange(views.pixels.shape[0], dtype=np.int32) if live is None else live
-
-    @jax.jit
-    def meets(views, grid, ids):
-        view = jnp.searchsorted(views.offset, ids, side="right", method="compare_all") - 1
-        place, width = ids - views.offset[view], views.size[view, 1]
-        pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
-        rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
-        samples = samples_in_box(None, grid, rays, step=space.step, cell=space.cell)
-        return ((samples.delta > 0) & occupancy.occupied_at(grid, rays, samples.t)).any(axis=-1)
-
-    if space.contracted:
-        return live  # every ray does
-    colourless = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None)
-    found = np.zeros(live.size, bool) if shown is None else shown[live]
-    grid, asked = space.create(possible), np.flatnonzero(~found)
-    for start in range(0, asked.size, chunk):
-        places = asked[np.minimum(np.arange(start, start + chunk), asked.size - 1)]  # one compiled shape
-        found[places] = meets(colourless, grid, live[places])
-    met = live[found]
-    if not met.size:
-        raise ValueError(
-            f"no ray of {len(views.offset)} views meets anything in the box {space.lower} to {space.upper}; "
-            "correct space.lower and space.upper"
-        )
-    return met
