@@ -6,6 +6,7 @@ import pathlib
 import shutil
 import sys
 
+from jaxnerf.engine.events import Events
 from jaxnerf.engine.workdir import naming, write_text
 
 
@@ -25,25 +26,17 @@ class Records:
         if cut:
             print(f"{self._path}: left out a last line that was cut short", file=sys.stderr)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self.rows))
-        try:
-            from tensorboardX import SummaryWriter
-        except ImportError:
-            self._events = None
-        else:
-            self._events = SummaryWriter(str(pathlib.Path(workdir) / "tensorboard"), purge_step=first_step)
+        self._events = Events(workdir, first_step=first_step)
 
     def append(self, row):
         """Adds a row: step and other numbers. NaN and infinity are written as JSON knows them in Python."""
         self.rows.append(row)
         with naming(self._path), self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
-        if self._events is not None:
-            for name, value in row.items():
-                self._events.add_scalar(name, value, row["step"])
+        self._events.append(row)
 
     def close(self):
-        if self._events is not None:
-            self._events.close()
+        self._events.close()
 
 
 def read_rows(workdir):
