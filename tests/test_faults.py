@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 
@@ -184,6 +185,21 @@ def test_a_disk_full_of_metrics_is_named(tmp_path):
     with pytest.raises(OSError, match="No space left.*metrics.jsonl"):
         log.append({"step": 1, "seconds": 1.0})
     log.close()
+
+
+def test_a_disk_full_of_events_holds_nobody_up(tmp_path, monkeypatch, capsys):
+    """tensorboardX's own thread ends there, and the eleventh row would wait for it for ever."""
+    folder = tmp_path / "tensorboard"
+    folder.mkdir()
+    monkeypatch.setattr("tensorboardX.event_file_writer.time.time", lambda: 1.0)
+    os.symlink("/dev/full", folder / f"events.out.tfevents.1.0.{socket.gethostname()}")
+    log = records.Records(tmp_path, first_step=0)
+    for step in range(1, 100):
+        log.append({"step": step, "seconds": 1.0})
+    log.close()
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and "tensorboard: no more events are written (No space left on device)" in said[0]
+    assert len(records.read_rows(tmp_path)) == 99
 
 
 def test_metrics_that_are_damaged_are_left_out_and_said(tmp_path, capsys):

@@ -6,6 +6,7 @@ import pathlib
 import shutil
 import sys
 
+from jaxnerf.engine.events import Events
 from jaxnerf.engine.workdir import naming, write_text
 
 
@@ -31,12 +32,7 @@ class Records:
         if cut:
             print(f"{self._path}: left out a last line that was cut short", file=sys.stderr)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self.rows))
-        try:
-            from tensorboardX import SummaryWriter
-        except ImportError:
-            pass
-        else:
-            self._events = SummaryWriter(str(pathlib.Path(workdir) / "tensorboard"), purge_step=first_step)
+        self._events = Events(workdir, first_step=first_step)
 
     def append(self, row):
         """Adds a row: step and other numbers. NaN and infinity are written as JSON knows them in Python."""
@@ -45,9 +41,7 @@ class Records:
             return
         with naming(self._path), self._path.open("a") as file:
             file.write(json.dumps(row) + "\n")
-        if self._events is not None:
-            for name, value in row.items():
-                self._events.add_scalar(name, value, row["step"])
+        self._events.append(row)
 
     def close(self):
         if self._events is not None:
