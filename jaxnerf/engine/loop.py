@@ -179,7 +179,7 @@ def _text(row, options, late):
         drawn = row["rays"] + row["left_out"]
         missed += f"  {row['left_out'] / drawn:.0%} of rays found the pool full"
     missed += "".join(f"  {name} network dead" for name in revival.dead_networks(row))
-    missed += f"  {row['revived']} networks begun anew" if row["revived"] else ""
+    missed += f"  networks begun anew: {row['revived']}" if row["revived"] else ""
     return (
         f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{_minutes(row['seconds'])} done, {_minutes(0.0 if late else left)} left{missed}"
