@@ -62,14 +62,18 @@ def measured(folder, workdir):
     )
     while process.poll() is None and not (rows.is_file() and rows.stat().st_size):
         time.sleep(0.05)
-    first = time.perf_counter() - started
+    first, ticks = (
+        time.perf_counter() - started,
+        pathlib.Path(f"/proc/{process.pid}/stat").read_text().split(),
+    )
+    until = sum(map(int, ticks[13:15])) / os.sysconf("SC_CLK_TCK")
     if process.wait():
         raise SystemExit(f"training ended with {process.returncode}")
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     core_seconds, largest = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
     compiling = json.loads(rows.read_text().splitlines()[0])["compile_seconds"]
     return (
-        f"first step after {first:.1f} s, of which {compiling:.1f} s were compiling; "
+        f"first step after {first:.1f} s and {until:.1f} core seconds ({compiling:.1f} s were compiling); "
         f"{core_seconds:.1f} core seconds in all; at most {largest:.2f} GB resident with mapped pixels; "
         f"1-minute load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
     )

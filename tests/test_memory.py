@@ -47,7 +47,7 @@ def test_a_program_without_room_is_not_run(monkeypatch):
     compiled = jax.jit(lambda x: jnp.outer(x, x)).lower(jnp.ones(500)).compile()
     memory.check(compiled)
     monkeypatch.setattr(memory, "left", lambda: 500_000)
-    with pytest.raises(memory.NoRoom, match="needs 0.00 GB where 0.00 GB are left"):  # a million bytes
+    with pytest.raises(memory.NoRoom, match="needs 1.0 MB where 0.5 MB are left"):  # a million bytes
         memory.check(compiled)
     monkeypatch.setattr(memory, "left", lambda: None)
     memory.check(compiled)
@@ -150,7 +150,7 @@ def test_a_chunk_that_does_not_fit_is_halved_and_the_picture_is_the_same(monkeyp
     monkeypatch.setattr(memory, "left", lambda: 12 * 16 + 100)
     tried.clear()
     fitting.image_renderer(colours, 40)(jnp.float32(2), rays)
-    assert "render chunk: 40 rays at once (--chunk): needs 0.00 GB where" in capsys.readouterr().err
+    assert "render chunk: 40 rays at once (--chunk): needs 0.0 MB where" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -10,6 +10,7 @@ import inspect
 import logging
 import os
 import shutil
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -40,19 +41,17 @@ def fill_pixels(paths, read, *, shape, dtype, place, depends=()):
         with the same files finds it again. Where it cannot be kept the array is in memory, with a warning.
     """
 
-    def fill(pixels):
+    def fill(put):
         def one(task):
-            first, image = task[0], task[1]()
-            image = image.reshape(-1, image.shape[-1])
-            pixels[first : first + len(image)] = image
+            image = task[1]()
+            put(task[0], image.reshape(-1, image.shape[-1]).astype(dtype, copy=False))
 
         with ThreadPoolExecutor(workers()) as pool:
             for _ in pool.map(one, zip(place, read, strict=True)):
                 pass
-        return pixels
 
     if np.dtype(dtype).itemsize * shape[0] * shape[1] < _LARGE:
-        return fill(np.empty(shape, dtype))
+        return _in_memory(fill, shape, dtype)
     path = None
     try:
         folder = default_folder()
@@ -62,12 +61,22 @@ def fill_pixels(paths, read, *, shape, dtype, place, depends=()):
         return _make(path, fill, shape, dtype) if found is None else found
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
         logging.warning("pixels cannot be mapped from %s (%s), so they are held in memory", path, error)
-    return fill(np.empty(shape, dtype))
+    return _in_memory(fill, shape, dtype)
 
 
 def workers():
     """Returns how many files are read at a time: Pillow and zlib work outside Python's lock."""
     return min(max(os.cpu_count() or 1, 2), 8)
+
+
+def _in_memory(fill, shape, dtype):
+    pixels = np.empty(shape, dtype)
+
+    def put(first, part):
+        pixels[first : first + len(part)] = part
+
+    fill(put)
+    return pixels
 
 
 def _open(path, shape, dtype):
@@ -87,17 +96,22 @@ def _open(path, shape, dtype):
 
 
 def _make(path, fill, shape, dtype):
-    """Returns the mapped file, filled beside its place first, so that nobody meets half of it."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    _make_room(path.parent, size)
-    partial = path.with_name(f"{path.stem}.{os.getpid()}.tmp")
+    """Returns the mapped file, written beside its place first, so that nobody meets half of it."""
+    row = shape[1] * np.dtype(dtype).itemsize
+    _make_room(path.parent, shape[0] * row)
+    partial, lock = path.with_name(f"{path.stem}.{os.getpid()}.tmp"), threading.Lock()
+    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
     try:
-        pixels = np.lib.format.open_memmap(partial, "w+", dtype, tuple(shape))
-        if hasattr(os, "posix_fallocate"):  # a disk that is full says so here; later it would end the process
-            with open(partial, "r+b") as file:
-                os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
-        fill(pixels).flush()
-        del pixels
+        with open(partial, "wb") as file:
+            np.lib.format.write_array_header_1_0(file, header)
+            start = file.tell()
+
+            def put(first, part):
+                with lock:
+                    file.seek(start + int(first) * row)
+                    file.write(np.ascontiguousarray(part))
+
+            fill(put)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

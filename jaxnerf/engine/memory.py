@@ -13,7 +13,7 @@ class NoRoom(Exception):
     """A program needs more memory than there is, by what its compiler says."""
 
     def __init__(self, needed, room):
-        super().__init__(f"needs {needed / 1e9:.2f} GB where {max(room, 0) / 1e9:.2f} GB are left")
+        super().__init__(f"needs {needed / 1e6:,.1f} MB where {max(room, 0) / 1e6:,.1f} MB are left")
         self.share = room / needed
 
 
