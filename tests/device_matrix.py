@@ -66,13 +66,19 @@ def train(folder, model, precision, mode, place):
     flags += runs.as_flags(runs.PACKED if model == "packed" else {})
     flags += [f"--config.{name}.compute_dtype={precision}" for name in ("coarse", "fine")]
     wide = str(int(precision == "float64"))
-    environment = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": wide}
+    program = "wide_train.py" if precision == "float64" else "train"
+    environment = {
+        "PYTHONPATH": str(runs.ROOT),
+        "JAX_NUM_CPU_DEVICES": str(devices),
+        "JAX_PLATFORMS": "cpu",
+        "JAX_ENABLE_X64": wide,
+    }
     if (target / "eval" / str(STEPS[precision]) / "results.json").exists():
         started = []
     elif processes > 1:
-        started = runs.start_together(processes, *flags, **environment)
+        started = runs.start_together(processes, program, *flags, **environment)
     else:
-        started = [runs.start("train", *flags, **environment)]
+        started = [runs.start(program, *flags, **environment)]
     for process in started:
         _, err = process.communicate()
         if process.returncode:

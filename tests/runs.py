@@ -44,8 +44,9 @@ def as_flags(fields):
 
 
 def start(program, *flags, **environment):
-    """Starts python -m jaxnerf.<program> with its output in pipes."""
-    command = [sys.executable, "-m", f"jaxnerf.{program}", *map(str, flags)]
+    """Starts python -m jaxnerf.<program>, or a program here that ends in .py, with its output in pipes."""
+    what = [str(ROOT / "tests" / program)] if program.endswith(".py") else ["-m", f"jaxnerf.{program}"]
+    command = [sys.executable, *what, *map(str, flags)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=ROOT, env={**os.environ, **environment}, **pipes)
 
@@ -57,10 +58,10 @@ def free_port():
         return free.getsockname()[1]
 
 
-def start_together(count, *flags, **environment):
+def start_together(count, program, *flags, **environment):
     """Starts so many processes of one training."""
     flags = (*flags, f"--coordinator=127.0.0.1:{free_port()}", f"--num_processes={count}")
-    return [start("train", *flags, f"--process_id={index}", **environment) for index in range(count)]
+    return [start(program, *flags, f"--process_id={index}", **environment) for index in range(count)]
 
 
 def run(program, *flags):
