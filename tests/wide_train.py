@@ -1,7 +1,7 @@
 """python -m jaxnerf.train whose cameras, and so rays and samples, are float64: for device_matrix.py.
 
-Under JAX_ENABLE_X64 parameters and densities are float64 by themselves, but cameras are read as float32, whose
-roundings differ by how many rays a device has: 1e-7, which is the float32 bar, not that of float64.
+Under JAX_ENABLE_X64 parameters and densities are float64 by themselves, but cameras are read as float32, and
+roundings of what follows from them depend on how many rays a device has.
 """
 
 import dataclasses
