@@ -9,9 +9,8 @@ import time
 import jax
 import numpy as np
 
-from jaxnerf.core.metrics import decibels
 from jaxnerf.data.batches import Gathered
-from jaxnerf.engine import build, fitting, hosts, parallel, records, revival, workdir
+from jaxnerf.engine import build, fitting, hosts, parallel, records, revival, status, workdir
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.control import Clock, Interrupt
 from jaxnerf.engine.evaluate import evaluate
@@ -69,7 +68,7 @@ def train(experiment, views, folder):
     first = int(state.step)
     log = records.Records(folder, first_step=first, write=hosts.is_first())
     before = log.rows[-1]["seconds"] if log.rows else 0.0
-    hosts.say(_header(experiment, views, state, survey_seconds, compile_seconds))
+    hosts.say(status.header(experiment, views, state, survey_seconds, compile_seconds))
     progress = records.Progress(options.max_steps, show=hosts.is_first())
     clock = Clock(before, first * options.batch_size - int(state.counters.get("left_out", 0)))
     look = revival.make_look(experiment, folder)
@@ -85,9 +84,9 @@ def train(experiment, views, folder):
             last = step == options.max_steps or stopped
             save = step % options.save_every == 0 or last
             if step % options.log_every == 0 or save:  # a checkpoint's row holds its clock
-                row = _row(experiment, step, recent, clock, compile_seconds)
+                row = status.row(experiment, step, recent, clock, compile_seconds)
                 log.append(row)
-                progress.show(step, _text(row, options, late))
+                progress.show(step, status.line(row, options, late))
                 recent = []
                 _check_finite(row, options, folder)
             if save:
@@ -147,50 +146,6 @@ def _compile(experiment, views):
     return run, *placed, surveyed, time.perf_counter() - started - surveyed
 
 
-def _row(experiment, step, recent, clock, compile_seconds):
-    """Returns the metrics since the last row: means of the errors, the rest as it stands."""
-    values = {name: np.array([float(metrics[name]) for metrics in recent]) for name in recent[0]}
-    left_out = int(values["left_out"][-1]) if "left_out" in values else 0
-    rays = step * experiment.train.batch_size - left_out
-    return {
-        "step": step,
-        "seconds": clock.seconds(),
-        "compile_seconds": compile_seconds,
-        "rays": rays,
-        "rays_per_second": clock.rate(rays),
-        "loss": values["loss"].mean(),
-        "psnr_coarse": float(decibels(values["mse_coarse"].mean())),
-        "psnr_fine": float(decibels(values["mse"].mean())),
-        "lr": float(experiment.schedule(step - 1)),
-        "grad_norm": values["grad_norm"][-1],
-        "nonfinite": int(values["nonfinite"][-1]),
-        "nonfinite_in_a_row": int(values["nonfinite_in_a_row"][-1]),
-        "left_out": left_out,
-        **{name: int(values[name][-1]) for name in values if name == "revived" or name.startswith("dead_")},
-    }
-
-
-def _text(row, options, late):
-    left = (options.max_steps - row["step"]) * options.batch_size / max(row["rays_per_second"], 1e-9)
-    if options.max_seconds:
-        left = min(left, options.max_seconds - row["seconds"])
-    missed = f"  {row['nonfinite']} steps not finite" if row["nonfinite"] else ""
-    if row["left_out"]:
-        drawn = row["rays"] + row["left_out"]
-        missed += f"  {row['left_out'] / drawn:.0%} of rays found the pool full"
-    missed += "".join(f"  {name} network dead" for name in revival.dead_networks(row))
-    missed += f"  networks begun anew: {row['revived']}" if row["revived"] else ""
-    return (
-        f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
-        f"{_minutes(row['seconds'])} done, {_minutes(0.0 if late else left)} left{missed}"
-    )
-
-
-def _minutes(seconds):
-    minutes, seconds = divmod(int(seconds), 60)
-    return f"{minutes}:{seconds:02d}"
-
-
 def _check_finite(row, options, folder):
     if row["nonfinite_in_a_row"] >= options.max_nonfinite:
         raise ValueError(
@@ -199,35 +154,3 @@ def _check_finite(row, options, folder):
             f"learning rate {row['lr']:.2g}); nothing of them was kept: lower train.lr_init, or check "
             "images and poses"
         )
-
-
-def _header(experiment, views, state, survey_seconds, compile_seconds):
-    """Returns the lines that say once what runs on what."""
-    devices = parallel.devices_of(experiment.train.parallel)
-    machines = f", in {jax.process_count()} processes" if jax.process_count() > 1 else ""
-    counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
-    eyes = np.asarray(views.cameras.to_world)[:, :, 3]
-    near, far = np.min(views.near), np.max(views.far)
-    dtype = jax.tree.leaves(state.params)[0].dtype
-    shares = ", ".join(f"{name} {count:,}" for name, count in counts.items())
-    space = []
-    if state.grid is not None:
-        cells = "x".join(map(str, state.grid.possible.shape))
-        share = float(state.grid.possible.mean())
-        space = [f"space       {share:.1%} of {cells} cells possible, found in {survey_seconds:.1f} s"]
-    return "\n".join(
-        [
-            f"device      {len(devices)} x {devices[0].device_kind} ({devices[0].platform}){machines}",
-            f"precision   parameters {dtype}; compiled in {compile_seconds:.1f} s",
-            f"parameters  {sum(counts.values()):,} ({shares})",
-            f"views       {len(views.offset)}, {views.pixels.shape[0]:,} pixels, t from {near:g} to {far:g}",
-            *space,
-            f"cameras     within {_point(eyes.min(0))} to {_point(eyes.max(0))}",
-            f"steps       {int(state.step)} of {experiment.train.max_steps} taken, "
-            f"{experiment.train.batch_size} rays each",
-        ]
-    )
-
-
-def _point(values):
-    return "(" + ", ".join(f"{value:.2f}" for value in values) + ")"
