@@ -1,4 +1,4 @@
-"""What a training says of itself: once what runs on what, then rows of metrics, each as a line to read too."""
+"""What a training says of itself: what runs on what, then rows of metrics, each also as a line to read."""
 
 import jax
 import numpy as np
