@@ -2,26 +2,21 @@
 
 import functools
 import json
-import pathlib
-import sys
 
 import jax
 import jax.numpy as jnp
 import pytest
-
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "experiments"))
-
-import ablation_report
-import paired_runs
-import reproducibility
-from ablation_variants import COMPLETE, variants
 
 from jaxnerf import Rays
 from jaxnerf.engine import workdir
 from jaxnerf.engine.build import build
 from jaxnerf.engine.scenes import load_views
 from runs import smoke_config
+from studies import study
 
+ablation_report, paired_runs = study("ablation_report"), study("paired_runs")
+reproducibility, ablation_variants = study("reproducibility"), study("ablation_variants")
+COMPLETE, variants = ablation_variants.COMPLETE, ablation_variants.variants
 BASE = paired_runs.configuration("ablation")
 VARIANTS = variants(BASE, 100)
 RAYS = Rays(

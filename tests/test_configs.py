@@ -207,7 +207,7 @@ def test_one_module_alone_reads_the_configuration():
         } - {"to_json_best_effort", "update"}
         # To put --data_dir and other settings in, or to read what fit.py looks at.
         allowed = {"engine/load.py": {"data", "eval"}, "engine/loop.py": {"data"}}
-        allowed = allowed.get(name, {"data"} if main else set())
+        allowed = allowed.get(name, {"data", "train"} if main else set())
         assert name in ("engine/build.py", "engine/fit.py") or read <= allowed, (name, read)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import shutil
-import sys
 import types
 
 import jax
@@ -19,10 +18,8 @@ from jaxnerf.engine.build import build, build_model
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
-from runs import ROOT, smoke_config
+from runs import smoke_config
 from test_step import toy_draw, toy_model
-
-sys.path.insert(0, str(ROOT / "experiments"))
 
 OPTIMIZER = optax.adam(1e-3)
 RAYS = 64
@@ -276,21 +273,3 @@ def test_checkpoints_from_before_the_counters_are_read(tmp_path):
         "dead_fine": 0,
     }
     assert_same(read.params, state.params, rtol=0, atol=0)
-
-
-def test_the_study_runs(monkeypatch):
-    import collapse
-
-    invite = collapse.inviting_config
-
-    def smaller(steps):
-        config = invite(steps)
-        config.data.size, config.fine.depth, config.fine.width, config.train.batch_size = 24, 2, 8, 16
-        return config
-
-    monkeypatch.setattr(collapse, "inviting_config", smaller)
-    study = collapse.Study(3)
-    rows = [study.run(seed, allowed) for seed in (0, 1) for allowed in (0, 10)]
-    assert collapse.same(rows).startswith("Of 2 runs in which no network died, 2 ")
-    assert rows[0]["parameters"] != rows[2]["parameters"] and rows[0]["psnr"] == rows[1]["psnr"]
-    assert [len(collapse.summary(group)) for group in collapse.both(rows)] == [len(collapse.HEADS)] * 2

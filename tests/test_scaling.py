@@ -1,23 +1,17 @@
 """What the study of scaling computes: bytes of a compiled step, and the model on paper."""
 
-import pathlib
-import sys
-
 import jax.numpy as jnp
 import optax
 import pytest
-
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "experiments"))
-
-import scaling
-import scaling_model
 
 from helpers import random_rays
 from jaxnerf.engine import parallel
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
+from studies import study
 from test_step import toy_draw, toy_model
 
+scaling, scaling_model = study("scaling"), study("scaling_model")
 SLOW = scaling_model.Machine("slow", 100.0, 0.5, 4, 8.0, 2.0, 0.0, "nobody")
 
 

@@ -4,19 +4,14 @@ import ast
 import importlib
 import json
 import pathlib
-import sys
 
 import pytest
 
 from configs import capture, lego_small, quickstart
-from runs import ROOT
+from studies import study
 
-sys.path.insert(0, str(ROOT / "experiments"))
-
-import needs_report  # noqa: E402
-import scene_needs  # noqa: E402
-import scene_parts  # noqa: E402
-
+needs_report, scene_needs = study("needs_report"), study("scene_needs")
+scene_parts = study("scene_parts")
 PRICE = {"use_viewdirs": 0.01, "width": 0.06, "num_freqs": 0.9, "depth": 0.05}  # dB of each field's change
 
 

@@ -8,8 +8,7 @@ import threading
 
 import pytest
 
-from jaxnerf.engine import evaluate as evaluation
-from jaxnerf.engine import frames, merging, shards
+from jaxnerf.engine import fitting, merging, shards, workdir
 from jaxnerf.engine.evaluate import score_run
 from jaxnerf.engine.frames import render_path
 from jaxnerf.engine.load import open_run
@@ -48,9 +47,8 @@ def fresh(run, whole):
 @pytest.fixture
 def rendered(monkeypatch):
     """A list that grows by an entry a frame that is rendered."""
-    asked, render_image = [], evaluation.render_image
-    for module in (evaluation, frames):
-        monkeypatch.setattr(module, "render_image", lambda *a, **k: asked.append(1) or render_image(*a, **k))
+    asked, render_image = [], fitting.render_image
+    monkeypatch.setattr(fitting, "render_image", lambda *a, **k: asked.append(1) or render_image(*a, **k))
     return asked
 
 
@@ -131,7 +129,7 @@ def test_views_of_other_settings_are_not_mixed(fresh, run, whole):
     other = open_run(run[0], settings={"samples": 2.0})
     with pytest.raises(ValueError, match=r"20.tmp: holds .* samples 1.0, not 2.0; give --overwrite without"):
         score_run(other, run[0], shard=(1, 2))
-    config = run[1].config.copy_and_resolve_references()
+    config = workdir.read_config(run[0])
     config.fine.density_bias = 0.5
     with pytest.raises(ValueError, match="rendered with configuration"):
         score_run(open_run(run[0], config), run[0])

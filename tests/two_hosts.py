@@ -47,7 +47,7 @@ def toy_experiment():
         passes_from_start=0,
     )
     return experiment._replace(
-        model=types.SimpleNamespace(init=plain.init, render=render, space=space),
+        model=types.SimpleNamespace(init=plain.init, render=render, space=space, entrances={}),
         draw=lambda step, positions, data: toy_draw(step, positions, (rays, jnp.array([-1]))),
         survey=lambda views: (None, None, np.arange(0, 64, 2, dtype=np.int32)),
     )

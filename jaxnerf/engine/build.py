@@ -1,6 +1,7 @@
 """From a configuration to the functions of a run. Nothing else reads the configuration."""
 
 import functools
+import json
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -91,6 +92,14 @@ def conventions(data):
     return {name: data[name] for name in names} | {
         name: data.get(name, 0) for name in ("hold_out", "num_views")
     }
+
+
+def identity(config):
+    """Returns as text what renderings depend on: not on how it was trained, nor where the data lies."""
+    plain = json.loads(config.to_json_best_effort())
+    data = {name: value for name, value in plain["data"].items() if name != "dir"}
+    rest = {name: value for name, value in plain.items() if name not in ("train", "eval", "data")}
+    return json.dumps({**rest, "data": data}, sort_keys=True)
 
 
 def build_model(config):

@@ -6,7 +6,6 @@ makes results.json of them and moves the folder to eval/<step>/.
 """
 
 import functools
-import json
 import pathlib
 import shutil
 import time
@@ -102,15 +101,11 @@ def claim_target(run, folder, *, split=None, step=None, overwrite=False, shard=s
 def _origin(run, weights, views, split, step):
     """Returns all that the scores depend on, but for the chunk, which they do not show."""
     settings = {name: vars(run.experiment.eval).get(name) for name in ("samples", "stop", "skip_empty")}
-    config = json.loads(run.config.to_json_best_effort())
-    for name in ("train", "eval"):
-        config.pop(name)
-    config["data"].pop("dir")
     return {
         "split": split,
         "step": step,
         **settings,
-        "configuration": shards.digest(json.dumps(config, sort_keys=True)),
+        "configuration": shards.digest(run.identity),
         "parameters": shards.digest(weights[0]),
         "cameras": shards.digest(views.cameras, views.near, views.far, "/".join(views.names)),
         "photographs": shards.digest(views.pixels, sample=4096),

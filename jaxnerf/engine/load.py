@@ -19,7 +19,7 @@ class Trained(NamedTuple):
     steps: Any  # () -> steps of the finished checkpoints, ascending
     weights: Any  # step -> (params, grid or None)
     render: Any  # (weights, Rays [...]) -> Rendering [...] without weights, jitted once for a grid's shape
-    config: Any  # ConfigDict, resolved
+    identity: str  # of its configuration, see build.identity
     image: Any  # (weights, Rays [...], chunk=None) -> the same in chunks, see image_renderer
 
 
@@ -64,7 +64,7 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
         return state.params, extract(state.params) if extract else state.grid
 
     image = image_renderer(render, experiment.eval.chunk)
-    return Trained(experiment, checkpoints.steps, weights, render, config, image)
+    return Trained(experiment, checkpoints.steps, weights, render, build.identity(config), image)
 
 
 def newest_step(run, folder, step=None):
