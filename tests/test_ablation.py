@@ -177,7 +177,7 @@ def test_the_table_pairs_seeds_and_says_what_they_agree_on():
     }
     cost = {COMPLETE: {"flops": 2e6, "time": 1.0, "ms": 3.0}}
     lines = ablation_report.report(
-        {"steps": 1000, "scenes": {"lego": {"views": 100, "runs": runs, "cost": cost}}}
+        {"steps": 1000, "cost": cost, "scenes": {"lego": {"views": 100, "runs": runs}}}
     )
     assert "1,000 steps" in lines[0] and "seeds 0, 1, 2, 10" in lines[0]
     assert "| complete | 21.00 +- 1.00 | - |  | 0.500 +- 0.000 | 1,234 | 2,000 | 1.00 |" in lines
