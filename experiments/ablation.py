@@ -100,8 +100,8 @@ def _measure(scene, kept, save, out, wanted):
             kept_of = ("psnr", "ssim", "training_seconds", "seconds_per_frame", "parameters", "views")
             about["runs"].setdefault(name, {})[str(seed)] = {key: results[key] for key in kept_of}
             save()
-    # Times are told by that of the complete model, so it is always among them.
-    ablation_cost.measure(about, {name: configuration(name, 0) for name in {*names, COMPLETE}}, views)
+    # Times are told by that of the complete model, so it is always among them; the scene makes no difference.
+    ablation_cost.measure(kept, {name: configuration(name, 0) for name in {*names, COMPLETE}}, views)
     save()
     return True
 

@@ -19,21 +19,21 @@ def load_views(config):
     return build.load_views(config.data, "train")
 
 
-def measure(about, configs, views):
-    """Adds to about["cost"] what training costs each variant {name: config}, the complete one among them.
+def measure(kept, configs, views):
+    """Adds to kept["cost"] what training costs each variant {name: config}, the complete one among them.
 
     "flops": of the compiled step, by ray. "time": its time over that of the complete model, the median over
     rounds in which each was timed once, so that a machine with other work counts for less. "ms": of a step.
     """
-    if about.get("cost", {}).keys() >= configs.keys():
+    if kept.get("cost", {}).keys() >= configs.keys():
         return
-    about["machine"] = speed_machine.describe()
+    kept["machine"] = speed_machine.describe()
     steps = {name: _compiled(config, views) for name, config in configs.items()}
     rounds = [{name: _seconds(step) for name, step in steps.items()} for _ in range(1 + _ROUNDS)][1:]
     for name, step in steps.items():
         cost = {"flops": flops_per_ray(step), "ms": 1e3 * statistics.median(row[name] for row in rounds)}
         cost["time"] = statistics.median(row[name] / row[COMPLETE] for row in rounds)
-        about.setdefault("cost", {})[name] = cost
+        kept.setdefault("cost", {})[name] = cost
 
 
 def flops_per_ray(step):

@@ -71,7 +71,7 @@ def plot(kept, path):
         left.set(yticks=range(len(names)), yticklabels=names, xlabel="PSNR less the complete model's, dB")
         left.axvline(0, color="k", linewidth=0.8)
         left.set_title(f"{scene}, {kept['steps']:,} steps; a dot a seed", fontsize=10)
-        for name, cost in about.get("cost", {}).items():
+        for name, cost in kept.get("cost", {}).items():
             scores = [run["psnr"] for run in about["runs"].get(name, {}).values()]
             if scores:
                 color = f"C{names.index(name)}" if name in names else "k"

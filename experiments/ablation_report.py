@@ -16,9 +16,11 @@ def report(kept):
         lines += [
             f"{scene}: {about['views']} training views, {views} test views, {kept['steps']:,} steps of every "
             f"run, seeds {', '.join(map(str, seeds))}. Figures are means +- standard deviation over seeds. "
-            f"Times: {about.get('machine', 'not measured')}.",
+            f"Times: {kept.get('machine', 'not measured')}.",
             "",
-            *table.markdown(HEADS, [row(name, about) for name in about["runs"]]),
+            *table.markdown(
+                HEADS, [row(name, about, kept.get("cost", {}).get(name)) for name in about["runs"]]
+            ),
             "",
             agreement(about),
             "",
@@ -38,9 +40,9 @@ def agreement(about):
     )
 
 
-def row(name, about):
-    """Returns the cells of a variant."""
-    runs, cost = about["runs"][name], about.get("cost", {}).get(name)
+def row(name, about, cost):
+    """Returns the cells of a variant; cost is None where it was not measured."""
+    runs = about["runs"][name]
     differences = to_complete(name, about)
     return (
         name,

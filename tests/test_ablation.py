@@ -5,6 +5,7 @@ import json
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxnerf import Rays
@@ -172,7 +173,7 @@ def test_the_table_pairs_seeds_and_says_what_they_agree_on():
     }
     cost = {COMPLETE: {"flops": 2e6, "time": 1.0, "ms": 3.0}}
     lines = ablation_report.report(
-        {"steps": 1000, "scenes": {"lego": {"views": 100, "runs": runs, "cost": cost}}}
+        {"steps": 1000, "cost": cost, "scenes": {"lego": {"views": 100, "runs": runs}}}
     )
     assert "1,000 steps" in lines[0] and "seeds 0, 1, 2, 10" in lines[0]
     assert "| complete | 21.00 +- 1.00 | - |  | 0.500 +- 0.000 | 1,234 | 2,000 | 1.00 |" in lines
@@ -185,11 +186,19 @@ def test_the_table_pairs_seeds_and_says_what_they_agree_on():
 
 
 @pytest.mark.parametrize(
-    "again, four, same, where",
-    [((0.0, 0, 9), 20.2, "equal bit for bit", "within"), ((1e-3, 4, 9), 25.0, "4 of 9 differ", "OUTSIDE")],
+    "moved, four, same, where",
+    [
+        (0, 20.2, "all 200 parameters are equal, bit for bit", "within"),
+        (3, 25.0, "3 of 200 parameters differ, by up to 2.0e", "OUTSIDE"),
+    ],
 )
-def test_the_lines_on_reproducibility_say_what_was_found(again, four, same, where):
-    scores = {0: 20.0, 1: 21.0}
-    text = "\n".join(reproducibility.report(scores, again=again, four=four, drift=(2e-4, 5, 9), steps=600))
+def test_the_lines_on_reproducibility_say_what_was_found(moved, four, same, where):
+    one, other = np.zeros(200, np.float32), np.zeros(200, np.float32)
+    other[:moved] = 2.0
+    again = reproducibility.difference(one, other)
+    drift = reproducibility.difference(one, np.linspace(0, 1, 200, dtype=np.float32))
+    lines = reproducibility.report({0: 20.0, 1: 21.0}, again=again, four=four, drift=drift, steps=600)
+    text = "\n".join(lines)
     assert same in text and f"{where} the seeds' spread of 1.00 dB" in text
-    assert "20.50 +- 0.71 dB (20.00, 21.00)" in text and "by up to 2.0e-04" in text
+    assert "20.50 +- 0.71 dB (20.00, 21.00)" in text
+    assert "more than 5.0e-01, one in a hundred by more than 9.9e-01, the worst by 1.0e+00" in text
