@@ -17,7 +17,7 @@ import sys
 
 import paired_runs
 import table  # which defines --readme
-from ablation_variants import COMPLETE, variants
+from ablation_variants import COMPLETE, variants, workdir_name
 from absl import flags
 
 from jaxnerf import app
@@ -114,11 +114,6 @@ def _steps(kept, count, base):
         raise ValueError(f"{_OUT.value}: has runs of {before} steps, wanted {asked}; give another --out")
     kept["steps"] = before or asked or count()
     return kept["steps"]
-
-
-def workdir_name(scene, name, seed):
-    """Returns where in --out a run lies."""
-    return f"{scene}/{name.replace(' ', '_')}-{seed}"
 
 
 def _save(path, kept):

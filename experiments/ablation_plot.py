@@ -6,7 +6,7 @@ import sys
 import imageio.v3 as iio
 import numpy as np
 from ablation_report import to_complete
-from ablation_variants import COMPLETE
+from ablation_variants import COMPLETE, workdir_name
 from PIL import Image, ImageDraw
 
 from jaxnerf.engine import pictures
@@ -34,9 +34,7 @@ def draw_pictures(kept, out, path):
 
 def _scored(out, scene, name, seed):
     """Returns the folder of a run's newest score."""
-    import ablation
-
-    found = (out / ablation.workdir_name(scene, name, seed) / "eval").glob("*/results.json")
+    found = (out / workdir_name(scene, name, seed) / "eval").glob("*/results.json")
     return max((path.parent for path in found), key=lambda folder: int(folder.name))
 
 

@@ -32,5 +32,10 @@ def variants(config, num_views):
     }
 
 
+def workdir_name(scene, name, seed):
+    """Returns where in --out a run lies."""
+    return f"{scene}/{name.replace(' ', '_')}-{seed}"
+
+
 def _networks(**fields):
     return {f"{network}.{field}": value for network in _BOTH for field, value in fields.items()}
