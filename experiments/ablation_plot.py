@@ -76,8 +76,10 @@ def plot(kept, path):
                 where = cost["flops"] / 1e3, statistics.fmean(scores)
                 right.errorbar(*where, yerr=[[where[1] - min(scores)], [max(scores) - where[1]]], color=color)
                 right.plot(*where, "o", color=color)
-                right.annotate(name, where, fontsize=7, xytext=(4, 3), textcoords="offset points")
+                if name == COMPLETE:
+                    right.annotate(name, where, fontsize=8, xytext=(6, 3), textcoords="offset points")
         right.margins(x=0.2)
+        right.set_title("colours as on the left", fontsize=10)
         right.set(xlabel="kFLOP a ray of training", ylabel="PSNR on test views, dB")
         for axis in (left, right):
             axis.grid(alpha=0.3)
