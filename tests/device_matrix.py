@@ -35,10 +35,7 @@ def main(folder, models=("dense", "packed"), precisions=tuple(STEPS)):
         for precision in precisions:
             steps = STEPS[precision]
             one = train(folder, model, precision, "auto", "1 device")
-            for mode, place in [("sharded", name) for name in PLACES] + [
-                ("pmap", "4 devices"),
-                ("pmap", "2 x 2"),
-            ]:
+            for mode, place in (*(("sharded", name) for name in PLACES), *PMAPPED):
                 found = train(folder, model, precision, mode, place)
                 apart, scores = difference(one, found)
                 good &= apart <= BARS[precision] and scores <= SCORE_BAR and found["left_out"] == 0

@@ -19,6 +19,7 @@ from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.state import create_state
 from jaxnerf.engine.step import make_train_step
 from runs import smoke_config
+from studies import study
 from test_step import toy_draw, toy_model
 
 OPTIMIZER = optax.adam(1e-3)
@@ -273,3 +274,25 @@ def test_checkpoints_from_before_the_counters_are_read(tmp_path):
         "dead_fine": 0,
     }
     assert_same(read.params, state.params, rtol=0, atol=0)
+
+
+def test_the_study_counts_what_died_what_was_saved_and_what_stayed_the_same():
+    collapse = study("collapse")
+    row = {"dead": (), "revived": 0, "found": [], "psnr": 20.0, "parameters": "a"}
+    rows = [row | {"revive": allowed, "seed": seed} for seed in range(3) for allowed in (0, 10)]
+    rows[0] |= {"dead": ("fine",), "psnr": 8.0}
+    rows[1] |= {"revived": 2, "found": [100, 150], "psnr": 17.0, "parameters": "b"}
+    without, revived = map(collapse.summary, collapse.both(rows))
+    assert without == ("0", "3", "1", "0 times in 0 runs", "-", "20.00 dB", "8.00 dB")
+    assert revived == (
+        "10",
+        "3",
+        "0",
+        "2 times in 1 runs",
+        "125 (first 100, last 150)",
+        "20.00 dB",
+        "17.00 dB",
+    )
+    assert collapse.same(rows).startswith("Of 2 runs in which no network died, 2 end with the same")
+    rows[3]["parameters"] = "c"
+    assert collapse.same(rows).startswith("Of 2 runs in which no network died, 1 end with the same")
