@@ -32,7 +32,7 @@ def _measure(file, steps):
     views = build.load_views(config.data, "train")
     config, _ = fit.fit_config(config, views)
     experiment = build.build(config)
-    possible, live, cells = experiment.survey(views)
+    possible, data = experiment.survey(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.seed, possible)
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
@@ -40,7 +40,7 @@ def _measure(file, steps):
     run, state, data = parallel.compile_step(
         step,
         state,
-        (views, live, cells),
+        data,
         batch_size=rays,
         samples_per_ray=experiment.samples_per_ray,
         mode="sharded",

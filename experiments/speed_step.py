@@ -19,7 +19,7 @@ from jaxnerf.data.subset import select_views
 from jaxnerf.engine import build, parallel
 from jaxnerf.engine.fit import fit_config
 from jaxnerf.engine.state import create_state
-from jaxnerf.engine.step import make_train_step
+from jaxnerf.engine.step import TrainData, make_train_step
 
 PERIOD = 64  # steps timed together, so that looks at the grid are among them
 RAYS, ROOM, FACTORS, VIEWS = (256, 512, 1024, 2048), (0.5, 1, 2), (8, 4, 2), (25, 50, 100)
@@ -31,7 +31,7 @@ class Step(NamedTuple):
     config: Any  # without open sizes
     run: Callable[..., tuple]  # (state, data, positions) -> (state, metrics); takes the state's memory
     state: Any
-    data: tuple
+    data: TrainData
     positions: Any
     count_flops: Callable[[], float]
 
@@ -40,18 +40,15 @@ def compiled(config, views):
     """Returns the Step of a configuration on one device."""
     config, _ = fit_config(config, views)
     experiment = build.build(config)
-    possible, live, cells = experiment.survey(views)
+    possible, data = experiment.survey(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.seed, possible)
-    step, data = (
-        make_train_step(experiment.model, experiment.optimizer, experiment.draw),
-        (views, live, cells),
-    )
+    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     rays, platform = config.train.batch_size, jax.default_backend()
     block = config.train.block_size or parallel.default_block(rays, experiment.samples_per_ray, platform)
     positions = jnp.asarray(parallel.split_positions(rays, 1, block)[0])
 
     def count_flops():
-        without_looks = (views, live, None if cells is None else cells[:0])
+        without_looks = data._replace(cells=None if data.cells is None else data.cells[:0])
         return (
             jax.jit(step)
             .lower(state, without_looks, positions.reshape(1, -1))

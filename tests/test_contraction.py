@@ -15,6 +15,7 @@ from jaxnerf.engine.marching import samples_in_box
 from jaxnerf.engine.space import contracted_field, make_space
 from jaxnerf.fields.mlp import Field
 
+KEY = jax.random.key(0)
 ROOM, SIDE = 0.5, 32  # half the plain part's side, cells a side
 CELL = (4 * ROOM / SIDE,) * 3
 CENTER = np.float32([0.3, -0.2, 0.1])
@@ -165,7 +166,6 @@ def test_thresholds_fall_where_steps_grow():
         (2.0,) * 3,
         resolution=16,
         step=0.1,
-        seed=0,
         contracted=True,
         threshold=0.01,
         update_every=1,
@@ -173,8 +173,9 @@ def test_thresholds_fall_where_steps_grow():
         field=Field(None, lambda p, x, v: (jnp.full(x.shape[:-1], 0.05), x)),
     )
     grid = space.create(np.ones(space.shape, bool))
+    update, cells = jax.jit(space.update), jnp.arange(16**3, dtype=jnp.int32)
     for step in range(20):
-        grid = space.update(jnp.int32(200 + step), {"fine": None}, grid, jnp.arange(16**3, dtype=jnp.int32))
+        grid = update(KEY, jnp.int32(200 + step), {"fine": None}, grid, cells)
     occupied = np.asarray(grid.occupied)
     assert not occupied[4:12, 4:12, 4:12].any()  # 0.05 over 0.1 is below 1 %
     assert occupied[0].all() and occupied[:, -1].all()  # over a far cell's step it is not
@@ -193,7 +194,7 @@ def test_a_contracted_field_is_asked_inside_its_box():
 def test_a_scene_trained_along_whole_rays_may_skip_afterwards():
     """What is far outside of the plain part is kept, and seen as without a grid."""
     field = Field(None, lambda params, x, viewdirs: (jnp.zeros(x.shape[:-1]), x))
-    options = {"threshold": 0.01, "update_every": 1, "look_at_once": 2**15, "seed": 0, "contracted": True}
+    options = {"threshold": 0.01, "update_every": 1, "look_at_once": 2**15, "contracted": True}
     space = make_space(
         *(tuple(bound.tolist()) for bound in BOX), resolution=SIDE, step=0.02, field=field, **options
     )

@@ -23,7 +23,7 @@ from jaxnerf.engine.marching import samples_in_box
 from jaxnerf.engine.packed import packed_model
 from jaxnerf.engine.space import make_space
 from jaxnerf.engine.state import create_state
-from jaxnerf.engine.step import make_train_step
+from jaxnerf.engine.step import TrainData, make_train_step
 from jaxnerf.engine.workdir import read_config
 from jaxnerf.fields.grid import grid_field
 from jaxnerf.fields.mlp import Field
@@ -57,8 +57,8 @@ class Tiny:
         config, _ = fit_config(tiny_config(), views)
         self.experiment = experiment = build(config)
         self.field = grid_field(lower=config.space.lower, upper=config.space.upper, **config.features)
-        self.possible, *places = experiment.survey(views)
-        self.data = jax.tree.map(jnp.asarray, (views, *places))
+        self.possible, data = experiment.survey(views)
+        self.data = jax.tree.map(jnp.asarray, data)
         self.train = jax.jit(self._train)
         pixels = np.moveaxis(np.indices((SIZE, SIZE)), 0, -1)[..., ::-1] + np.float32(0.5)
 
@@ -170,10 +170,10 @@ def test_without_a_space_there_is_nothing_for_it():
     assert experiment.model.space is None and state.grid is None
     assert set(state.counters) == {"nonfinite", "nonfinite_in_a_row", "revived", "dead_coarse", "dead_fine"}
     views = experiment.load_views("train")
-    possible, live, cells = experiment.survey(views)
-    assert possible is None and live is None and cells is None
+    possible, data = experiment.survey(views)
+    assert possible is None and data.live is None and data.cells is None
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
-    after, metrics = jax.eval_shape(step, state, (views, live, cells), jnp.arange(64)[None])
+    after, metrics = jax.eval_shape(step, state, data, jnp.arange(64)[None])
     assert jax.tree.structure(after) == jax.tree.structure(state)
     assert "left_out" not in metrics and after.grid is None
 
@@ -215,7 +215,6 @@ def toy():
         config.space.upper,
         resolution=8,
         step=0.5,
-        seed=0,
         field=field,
         threshold=0.01,
         update_every=2,
@@ -239,7 +238,7 @@ def toy():
     def draw(step, positions, data):
         order = jax.random.permutation(jax.random.fold_in(jax.random.key(1), step), 64)
         keys = jax.vmap(lambda place: jax.random.fold_in(jax.random.key(2), 64 * step + place))(positions)
-        drawn = jax.tree.map(lambda leaf: leaf[order[positions]], data[1])
+        drawn = jax.tree.map(lambda leaf: leaf[order[positions]], data.live)
         return keys, Batch(rays=drawn, rgb=0.5 + 0.5 * drawn.viewdirs)
 
     cells = np.arange(512, dtype=np.int32)
@@ -247,7 +246,7 @@ def toy():
         model=model,
         optimizer=optax.adam(1e-2),
         draw=draw,
-        survey=lambda views: (np.ones(space.shape, bool), rays, cells),
+        survey=lambda views: (np.ones(space.shape, bool), TrainData(np.uint32(0), views, rays, cells)),
     )
 
 
@@ -255,13 +254,13 @@ def toy():
 def toy_runs(unoptimized, toy):
     """Twelve steps in each mode."""
     views = toy.load_views("train")
-    possible, *places = toy.survey(views)
+    possible, data = toy.survey(views)
     step = make_train_step(toy.model, toy.optimizer, toy.draw)
     return {
         mode: run_steps(
             step,
             create_state(toy.model, toy.optimizer, 0, possible),
-            (views, *places),
+            data,
             12,
             mode,
             batch_size=64,

@@ -41,10 +41,13 @@ def fill(photo, asked, value=7, **options):
     return mapped.fill_pixels([photo], tasks, shape=SHAPE, dtype=np.uint8, place=[0, 6], **options)
 
 
-def test_a_second_call_reads_nothing_until_a_file_changes(photo, cache):
+@pytest.mark.parametrize("many", [True, False])
+def test_a_second_call_reads_nothing_until_a_file_changes(photo, cache, monkeypatch, many):
+    monkeypatch.setattr(mapped, "_LARGE", 1 if many else 2**28)
+    monkeypatch.setattr(mapped, "_SLOW", 0.0)
     asked = []
     first, second = fill(photo, asked), fill(photo, asked, value=9)
-    assert isinstance(first, np.memmap) and not second.flags.writeable
+    assert isinstance(first, np.memmap) == isinstance(second, np.memmap) == many
     assert sorted(asked) == [0, 1] and first[:, 0].tolist() == second[:, 0].tolist() == [7] * 6 + [8] * 6
     assert [file.suffix for file in cache.iterdir()] == [".npy"]
     os.utime(photo, ns=(1, 1))
@@ -73,11 +76,19 @@ def test_what_fails_leaves_no_file(photo, cache):
     assert not list(cache.iterdir())
 
 
-def test_without_room_on_the_disk_pixels_are_in_memory(photo, cache, monkeypatch, caplog):
+def test_few_pixels_that_are_soon_decoded_are_not_kept(photo, cache, monkeypatch):
+    monkeypatch.setattr(mapped, "_LARGE", 2**28)
+    assert fill(photo, [])[0, 0] == 7 and not list(cache.iterdir())
+
+
+@pytest.mark.parametrize("many", [True, False])
+def test_without_room_on_the_disk_pixels_are_in_memory(photo, cache, monkeypatch, caplog, many):
+    monkeypatch.setattr(mapped, "_LARGE", 1 if many else 2**28)
+    monkeypatch.setattr(mapped, "_SLOW", 0.0)
     monkeypatch.setattr(mapped, "_SPARE", 2**60)
     found = fill(photo, [])
     assert not isinstance(found, np.memmap) and found[:, 0].tolist() == [7] * 6 + [8] * 6
-    assert "cannot be mapped" in caplog.text and not list(cache.iterdir())
+    assert "cannot be kept" in caplog.text and not list(cache.iterdir())
 
 
 def test_what_was_used_longest_ago_goes_first(photo, cache, monkeypatch):

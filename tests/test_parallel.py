@@ -10,7 +10,7 @@ from helpers import assert_same, random_rays
 from jaxnerf.engine import parallel
 from jaxnerf.engine.build import build
 from jaxnerf.engine.state import create_state
-from jaxnerf.engine.step import make_train_step
+from jaxnerf.engine.step import TrainData, make_train_step
 from runs import smoke_config
 from test_step import toy_draw, toy_model
 
@@ -47,7 +47,7 @@ def runs(compiled_once, experiment, views):
         mode: run_steps(
             step,
             create_state(model, optimizer, 0),
-            (views, None, None),
+            TrainData(np.uint32(0), views, None, None),
             10,
             mode,
             batch_size=64,
@@ -92,8 +92,9 @@ def test_the_batch_is_the_same_ray_for_ray(experiment, views, mode):
         return state, jax.tree.map(gather, seen) if axis_name else seen
 
     state = {"step": jnp.int32(3)}
-    _, (seen,) = run_steps(probe, state, (views, None, None), 1, mode, batch_size=64, block_size=8)
-    keys, batch = jax.jit(experiment.draw)(3, jnp.arange(64), (views, None, None))
+    data = TrainData(np.uint32(0), views, None, None)
+    _, (seen,) = run_steps(probe, state, data, 1, mode, batch_size=64, block_size=8)
+    keys, batch = jax.jit(experiment.draw)(3, jnp.arange(64), data)
     np.testing.assert_array_equal(seen["key"], jax.random.key_data(keys))
     assert_same((seen["rgb"], seen["rays"]), (batch.rgb, batch.rays))
 
@@ -126,3 +127,17 @@ def test_an_uneven_batch_does_not_train(mode):
 def test_an_unknown_mode_is_named():
     with pytest.raises(ValueError, match="parallel is 'tpu', wanted one of"):
         parallel.compile_step(None, None, None, batch_size=4, mode="tpu")
+
+
+def test_runs_of_other_seeds_are_one_program():
+    texts, drawn = [], []
+    for seed in (0, 1):
+        config = smoke_config()
+        config.seed = seed
+        experiment = build(config)
+        possible, data = experiment.survey(experiment.load_views("train"))
+        state = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, 0))  # noqa: B023
+        step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
+        texts.append(jax.jit(step).lower(state, data, np.arange(64)[None]).as_text())
+        drawn.append(np.asarray(jax.jit(experiment.ids)(0, np.arange(64), data)))
+    assert texts[0] == texts[1] and (drawn[0] != drawn[1]).mean() > 0.9

@@ -1,4 +1,4 @@
-"""The box of a scene: which cells and pixels count, when cells are looked at, and samples through it."""
+"""The box of a scene: when its cells are looked at, and samples through it."""
 
 import dataclasses
 import functools
@@ -12,22 +12,20 @@ import jaxnerf
 from helpers import compiled, full_grid, rays_past_origin
 from jaxnerf import Rays
 from jaxnerf.core import occupancy
-from jaxnerf.data import synthetic
-from jaxnerf.engine import live, marching
+from jaxnerf.engine import marching
 from jaxnerf.engine import space as spaces
 from jaxnerf.engine.extraction import crop_grid
-from jaxnerf.engine.live import pixels_that_meet
-from jaxnerf.fields import showcase
 from jaxnerf.fields.mlp import Field
 
 BOX = (-1.5, -1.5, -1.0), (1.5, 1.5, 1.3)  # holds the embedded scene
+KEY = jax.random.key(0)
 FOUND = 1e4  # the density of everywhere
 
 
 def a_space(density=FOUND, box=BOX, **options):
     field = Field(None, lambda params, x, viewdirs: (jnp.full(x.shape[:-1], density), x))
     given = {"resolution": 8, "step": 0.1, "threshold": 0.01, "update_every": 16, "look_at_once": 2**18}
-    return spaces.make_space(*box, seed=0, field=field, **{**given, **options})
+    return spaces.make_space(*box, field=field, **{**given, **options})
 
 
 @functools.cache
@@ -40,18 +38,13 @@ def looks_at_cells(num_steps, num_cells, **options):
     cells = np.random.default_rng(0).permutation(np.prod(space.shape))[:num_cells].astype(np.int32)
 
     def step(grid, index):
-        grid = space.update(index, {"fine": None}, grid, jnp.asarray(cells))
+        grid = space.update(KEY, index, {"fine": None}, grid, jnp.asarray(cells))
         return grid, grid.mean.reshape(-1)
 
     first = space.create(np.ones(space.shape, bool))
     mean = jax.jit(lambda grid: jax.lax.scan(step, grid, jnp.arange(num_steps)))(first)[1]
     counts = np.log1p(-np.minimum(np.float64(mean) / FOUND, 1 - 1e-6)) / np.log(0.8)
     return counts.round().astype(int)[:, cells], np.delete(counts, cells, axis=1)
-
-
-@pytest.fixture(scope="module")
-def views():
-    return synthetic.load_views(size=24)
 
 
 def test_cells_are_cubes_along_all_sides():
@@ -66,7 +59,7 @@ def test_an_empty_cell_is_left_out_after_half_a_dozen_looks():
     assert grid.occupied.all()
     update, shares = jax.jit(space.update), []
     for look in range(6):
-        grid = update(16 * look + 15, {"fine": None}, grid, cells)
+        grid = update(KEY, 16 * look + 15, {"fine": None}, grid, cells)
         shares.append(float(grid.occupied.mean()))
     assert shares[3] == 1 and shares[5] == 0
 
@@ -76,9 +69,9 @@ def test_what_is_not_possible_stays_empty():
     possible = np.random.default_rng(1).uniform(size=space.shape) < 0.1
     grid = space.create(possible)
     np.testing.assert_array_equal(grid.occupied, possible)
-    got = jax.jit(space.update)(15, {"fine": None}, grid, np.flatnonzero(possible).astype(np.int32))
+    got = jax.jit(space.update)(KEY, 15, {"fine": None}, grid, np.flatnonzero(possible).astype(np.int32))
     np.testing.assert_array_equal(got.occupied, possible)
-    assert space.update(15, {"fine": None}, grid, np.zeros(0, np.int32)) is grid
+    assert space.update(KEY, 15, {"fine": None}, grid, np.zeros(0, np.int32)) is grid
 
 
 def test_where_one_look_sees_all_each_cell_is_looked_at_once_an_interval():
@@ -125,12 +118,11 @@ def test_looks_that_see_all_cells_are_alike():
     assert (counts[-1] >= 1).all()
 
 
-def test_a_look_depends_on_seed_and_step_alone():
+def test_a_look_depends_on_its_key_alone():
     space = spaces.make_space(
         *BOX,
         resolution=8,
         step=0.1,
-        seed=3,
         field=Field(None, lambda params, x, viewdirs: (jnp.abs(x[..., 0]), x)),
         threshold=0.01,
         update_every=4,
@@ -138,79 +130,10 @@ def test_a_look_depends_on_seed_and_step_alone():
     )
     cells, grid = np.arange(np.prod(space.shape)), space.create(np.ones(space.shape, bool))
     update = compiled(space.update)
-    first, again, later = (update(step, {"fine": None}, grid, cells).mean for step in (3, 3, 7))
+    keys = jax.random.split(KEY)[np.array([0, 0, 1])]
+    first, again, later = (update(key, 3, {"fine": None}, grid, cells).mean for key in keys)
     np.testing.assert_array_equal(first, again)
     assert (first != later).mean() > 0.9
-
-
-def test_all_is_possible_without_masks(views):
-    space = a_space()
-    assert spaces.possible_cells(views, space, masks=False).all()
-    opaque = dataclasses.replace(views, pixels=views.pixels[:, :3])
-    possible = spaces.possible_cells(opaque, space, masks=True)
-    assert possible.all() and possible.shape == space.shape == (8, 8, 6)
-
-
-@pytest.mark.parametrize("resolution", [16, 37])
-def test_possible_cells_hold_all_matter_of_the_embedded_scene(views, resolution):
-    """Also where the hull is made of more cells than the box has."""
-    space = a_space(resolution=resolution)
-    possible = spaces.possible_cells(views, space, masks=True)
-    assert possible.shape == space.shape and possible.mean() < 0.8
-    lower, upper = (np.float32(bound) for bound in BOX)
-    x = lower + np.random.default_rng(2).uniform(size=(1, 200_000, 3)).astype(np.float32) * (upper - lower)
-    density, _ = compiled(showcase.scene)(x, x)
-    cells = np.floor((x[0] - lower) / (upper - lower) * space.shape).astype(int)
-    seen = density[0] > 1.0  # thinner matter may leave no alpha
-    assert seen.mean() > 0.02 and possible[tuple(cells[seen].T)].all()
-
-
-@pytest.mark.parametrize("step", [0.05, 0.3])
-def test_every_pixel_that_shows_something_is_live(views, step):
-    space = a_space(resolution=32, step=step)
-    possible, met, cells = spaces.survey(views, space, masks=True)
-    np.testing.assert_array_equal(cells, np.flatnonzero(possible))
-    met = met.all_ids()
-    assert met.dtype == cells.dtype == np.int32 and (np.diff(met) > 0).all()
-    shown = np.flatnonzero(views.pixels[:, 3] > 0)
-    assert np.isin(shown, met).all()
-    assert met.size < 0.98 * len(views.pixels)
-    # Their rays are not followed; all others are.
-    np.testing.assert_array_equal(met, pixels_that_meet(views, space, possible).all_ids())
-
-
-def test_pixels_outside_their_mask_are_not_live(views):
-    mask = np.arange(len(views.pixels)) % 3 == 0
-    masked = dataclasses.replace(views, mask=mask)
-    space = a_space()
-    possible = np.ones(space.shape, bool)
-    wanted = pixels_that_meet(views, space, possible).all_ids()
-    got = pixels_that_meet(masked, space, possible, chunk=1000).all_ids()  # a chunk is no matter
-    np.testing.assert_array_equal(got, wanted[mask[wanted]])
-    fourth = np.where(np.arange(mask.size)[:, None] % 4 == 0, np.uint16(9), np.uint16(0)).repeat(4, axis=1)
-    masked = dataclasses.replace(masked, pixels=fourth)
-    got = pixels_that_meet(masked, space, ~possible, masks=True).all_ids()
-    np.testing.assert_array_equal(got, np.arange(0, mask.size, 12))
-
-
-def test_of_very_many_pixels_tiles_are_asked_and_none_is_lost(views, monkeypatch):
-    mask = np.random.default_rng(0).random(len(views.pixels)) < 0.9
-    pixels = np.where(np.arange(len(mask))[:, None] == 7, 9, np.zeros_like(views.pixels))  # in a corner
-    views = dataclasses.replace(views, pixels=pixels, mask=mask | (np.arange(len(mask)) == 7))
-    space = a_space(resolution=32)
-    possible = np.zeros(space.shape, bool)
-    possible[13:19, 13:19, 9:14] = True
-    wanted = pixels_that_meet(views, space, possible, masks=True).all_ids()
-    monkeypatch.setattr(live, "_EACH", 0)
-    monkeypatch.setattr(live, "_TILES", len(mask) / 2.5**2)  # of 3 x 3 px
-    got = pixels_that_meet(views, space, possible, masks=True).all_ids()
-    assert 7 in wanted and np.isin(wanted, got).all() and views.mask[got].all()
-    assert wanted.size < got.size < 0.6 * mask.sum()
-
-
-def test_a_box_that_no_ray_meets_is_named(views):
-    with pytest.raises(ValueError, match=r"no ray of 60 views .*\(50, 50, 50\).* correct space.lower"):
-        spaces.survey(views, a_space(box=((50, 50, 50), (51, 51, 51))), masks=False)
 
 
 def lengths(rays):
@@ -253,13 +176,13 @@ def test_a_cell_that_was_empty_comes_back_when_its_density_grows():
     """Long after the start, too, when neighbours no longer count."""
     field = Field(None, lambda params, x, viewdirs: (jnp.where(x[..., 0] > 0, params, 0.0), x))
     options = {"resolution": 8, "step": 0.1, "threshold": 0.01, "update_every": 16, "look_at_once": 2**18}
-    space = spaces.make_space(*BOX, seed=0, field=field, **options)
+    space = spaces.make_space(*BOX, field=field, **options)
     grid, cells = space.create(jnp.ones(space.shape, bool)), jnp.arange(np.prod(space.shape))
     update = jax.jit(space.update)
     for step in range(15, 400, 16):
-        grid = update(step, {"fine": 0.0}, grid, cells)
+        grid = update(KEY, step, {"fine": 0.0}, grid, cells)
     assert not grid.occupied.any()
-    grid = update(415, {"fine": 9.0}, grid, cells)
+    grid = update(KEY, 415, {"fine": 9.0}, grid, cells)
     half = space.shape[0] // 2
     assert grid.occupied[half:].all() and not grid.occupied[:half].any()
 

@@ -114,8 +114,8 @@ def test_broken_cache_is_rendered_again(tmp_path, caplog):
         path.write_bytes(body)
         again = synthetic.load_views(split="val", size=8, cache=tmp_path).pixels
         np.testing.assert_array_equal(again, first)
-        np.testing.assert_array_equal(np.load(path)["array"], first)
-    np.savez(path, array=first[:5])
+        np.testing.assert_array_equal(np.load(path)["pixels"], first)
+    np.savez(path, pixels=first[:5])
     np.testing.assert_array_equal(synthetic.load_views(split="val", size=8, cache=tmp_path).pixels, first)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     assert len(caplog.records) >= 5

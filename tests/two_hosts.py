@@ -14,6 +14,7 @@ from jaxnerf.engine import hosts, loop, shards
 from jaxnerf.engine.build import build
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.space import make_space
+from jaxnerf.engine.step import TrainData
 from jaxnerf.fields.mlp import Field
 from runs import smoke_config
 from test_step import toy_draw, toy_model
@@ -39,17 +40,17 @@ def toy_experiment():
         (1.0, 1.0, 1.0),
         resolution=4,
         step=0.1,
-        seed=0,
         field=Field(None, density),
         threshold=0.02,
         update_every=2,
         look_at_once=64,
         passes_from_start=0,
     )
+    cells = np.arange(0, 64, 2, dtype=np.int32)
     return experiment._replace(
         model=types.SimpleNamespace(init=plain.init, render=render, space=space, entrances={}),
         draw=lambda step, positions, data: toy_draw(step, positions, (rays, jnp.array([-1]))),
-        survey=lambda views: (None, None, np.arange(0, 64, 2, dtype=np.int32)),
+        survey=lambda views: (None, TrainData(np.uint32(0), views, None, cells)),
     )
 
 

@@ -118,19 +118,24 @@ def draw_pixels(seed, step, positions, views, live=None, *, batching="all_images
     """Returns the keys [B] of draw_batch and the ids [B] int32 of the pixels that its rays go through."""
     if batching not in BATCHINGS:
         raise ValueError(f"draw_batch: batching is {batching!r}, wanted one of {BATCHINGS}")
-    step_key = jax.random.fold_in(jax.random.key(seed), step)
-    ray_keys = jax.vmap(lambda position: jax.random.fold_in(step_key, position))(positions)
+    key = step_key(seed, step)
+    ray_keys = jax.vmap(lambda position: jax.random.fold_in(key, position))(positions)
     pixel_keys, keys = jax.vmap(lambda key: tuple(jax.random.split(key)))(ray_keys)
     first, count = 0, views.pixels.shape[0] if live is None else live.size
     if batching == "single_image":
         # No ray has this position, so the key is the step's own.
-        view = jax.random.randint(jax.random.fold_in(step_key, 2**32 - 1), (), 0, views.offset.shape[0])
+        view = jax.random.randint(jax.random.fold_in(key, 2**32 - 1), (), 0, views.offset.shape[0])
         first, count = views.offset[view], views.size[view].prod()
         if live is not None:
             first, last = live.count_below(jnp.stack([first, first + count]))
             count = last - first
     index = jax.vmap(lambda key: jax.random.randint(key, (), first, first + count))(pixel_keys)
     return keys, index if live is None else live.ids(index)
+
+
+def step_key(seed, step):
+    """Returns the key of a step; of it come those of its rays, by their positions in the batch."""
+    return jax.random.fold_in(jax.random.key(seed), step)
 
 
 def random_rays(views, count, view_rays, *, pixel_offset=0.5, seed=0):

@@ -135,8 +135,8 @@ def _second_bytes(path, raw):
 def average_blocks(pixels, factor, *, background=None):
     """Returns the image shrunk by area: each new pixel is the mean of factor x factor old ones.
 
-    The mean is taken of premultiplied colour in float64, so a transparent pixel's colour, which nobody
-    sees, does not bleed into the edge of an object.
+    The mean is taken of premultiplied colour, summed in whole numbers and so without rounding; a transparent
+    pixel's colour, which nobody sees, does not bleed into the edge of an object.
 
     Args:
         pixels: [H, W, 3] or [H, W, 4] with straight alpha, uint8 or uint16.
@@ -156,15 +156,26 @@ def average_blocks(pixels, factor, *, background=None):
         raise ValueError(
             f"factor {factor} does not divide {width} x {height}, wanted one that does; take one of {works}"
         )
-    scaled = pixels / np.float64(np.iinfo(pixels.dtype).max)
-    if channels == 4:
-        scaled[..., :3] *= scaled[..., 3:]
-    # Rows first: adding whole rows runs through memory in order, which both axes at once does not.
-    rows = scaled.reshape(height // factor, factor, width * channels).sum(axis=1)
-    mean = rows.reshape(height // factor, width // factor, factor, channels).sum(axis=2) / factor**2
+    # One channel after the other, each side by side in memory: six times as fast as all at once.
+    planes = np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
+    largest = np.iinfo(pixels.dtype).max
     if channels == 3:
+        mean = np.stack([_sum_blocks(plane, factor) for plane in planes], axis=-1) / (largest * factor**2)
         return np.rint(mean * 65535).astype(np.uint16)
-    return to_straight(mean[..., :3], mean[..., 3], background=background)
+    alpha = planes[3].astype(np.uint16 if pixels.dtype == np.uint8 else np.uint32)  # holds largest^2
+    colour = np.stack([_sum_blocks(plane * alpha, factor) for plane in planes[:3]], axis=-1)
+    cover = _sum_blocks(alpha, factor) / (largest * factor**2)
+    return to_straight(colour / (float(largest) ** 2 * factor**2), cover, background=background)
+
+
+def _sum_blocks(plane, factor):
+    """Returns the sums [H / factor, W / factor] uint64 of an image's [H, W] blocks."""
+    height, width = plane.shape
+    rows = plane.reshape(height // factor, factor, width)
+    total = rows[:, 0].astype(np.uint64 if plane.dtype == np.uint32 else np.uint32)
+    for index in range(1, factor):
+        total += rows[:, index]
+    return total.reshape(height // factor, width // factor, factor).sum(axis=2, dtype=np.uint64)
 
 
 def to_straight(premultiplied, alpha, *, background=None):

@@ -1,4 +1,4 @@
-"""The pixels of a scene: in memory where they are few, else decoded once into a file that is mapped.
+"""The pixels of a scene, decoded once into a file of the user's cache: read from it, or mapped if many.
 
 A mapped file costs no memory of the process's own: the system reads the parts that are asked for, and takes
 them out again when something else needs the room.
@@ -21,6 +21,7 @@ from jaxnerf.data import images
 from jaxnerf.data.cache import default_folder
 
 _LARGE = 2**28  # bytes, from which pixels are mapped
+_SLOW = 0.5  # seconds that decoding takes, from which fewer pixels are kept, too
 _KEPT = 2**35  # bytes of such files that stay in the cache; those used longest ago go first
 _ABANDONED = 3600  # seconds after which nobody writes to a file any more
 _SPARE = 2**28  # bytes that the disk keeps free
@@ -37,8 +38,9 @@ def fill_pixels(paths, read, *, shape, dtype, place, depends=()):
         depends: what else the pixels depend on.
 
     Returns:
-        An array in memory, or where that would be large a mapped file in the user's cache; the next call
-        with the same files finds it again. Where it cannot be kept the array is in memory, with a warning.
+        An array in memory, or where that would be large a mapped file in the user's cache. What is large or
+        took a while to decode is kept there, and the next call with the same files finds it again. Where it
+        cannot be kept the array is in memory, with a warning.
     """
 
     def fill(put):
@@ -50,18 +52,24 @@ def fill_pixels(paths, read, *, shape, dtype, place, depends=()):
             for _ in pool.map(one, zip(place, read, strict=True)):
                 pass
 
-    if np.dtype(dtype).itemsize * shape[0] * shape[1] < _LARGE:
-        return _in_memory(fill, shape, dtype)
-    path = None
+    mapped = np.dtype(dtype).itemsize * shape[0] * shape[1] >= _LARGE
+    path = pixels = None
     try:
         folder = default_folder()
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"pixels_{_fingerprint(paths, shape, dtype, depends)}.npy"
-        found = _open(path, shape, dtype)
-        return _make(path, fill, shape, dtype) if found is None else found
+        found = _open(path, shape, dtype, mapped)
+        if found is not None:
+            return found
+        if mapped:
+            _make(path, fill, shape, dtype)
+            return _open(path, shape, dtype, mapped)
+        started, pixels = time.perf_counter(), _in_memory(fill, shape, dtype)
+        if time.perf_counter() - started > _SLOW:
+            _make(path, lambda put: put(0, pixels), shape, dtype)
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
-        logging.warning("pixels cannot be mapped from %s (%s), so they are held in memory", path, error)
-    return _in_memory(fill, shape, dtype)
+        logging.warning("pixels cannot be kept in %s (%s), so they are held in memory", path, error)
+    return _in_memory(fill, shape, dtype) if pixels is None else pixels
 
 
 def workers():
@@ -79,10 +87,10 @@ def _in_memory(fill, shape, dtype):
     return pixels
 
 
-def _open(path, shape, dtype):
-    """Returns the mapped file, None where it is missing or broken."""
+def _open(path, shape, dtype, mapped):
+    """Returns the pixels of a file, mapped or read; None where it is missing or broken."""
     try:
-        pixels = np.load(path, mmap_mode="r")
+        pixels = np.load(path, mmap_mode="r" if mapped else None)
     except FileNotFoundError:
         return None
     except (ValueError, EOFError) as error:
@@ -96,7 +104,7 @@ def _open(path, shape, dtype):
 
 
 def _make(path, fill, shape, dtype):
-    """Returns the mapped file, written beside its place first, so that nobody meets half of it."""
+    """Writes the file beside its place first, so that nobody meets half of it."""
     row = shape[1] * np.dtype(dtype).itemsize
     _make_room(path.parent, shape[0] * row)
     partial, lock = path.with_name(f"{path.stem}.{os.getpid()}.tmp"), threading.Lock()
@@ -115,7 +123,6 @@ def _make(path, fill, shape, dtype):
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-    return _open(path, shape, dtype)
 
 
 def _make_room(folder, size):

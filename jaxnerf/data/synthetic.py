@@ -52,15 +52,15 @@ def load_views(*, split="train", size=100, finish="usual", cache=None):
         raise ValueError(f"finish is {finish!r}, wanted one of {sorted(FINISHES)}; correct data.finish")
     count, size = _COUNT[split], int(size)
     stack = _cameras(split, size)
-    pixels = load_or_make(
+    form = (count * size * size, 4), np.uint16
+    kept = load_or_make(
         cache,
         f"showcase_{finish}_{split}_{size}_{_fingerprint()}",
-        lambda: render_views(stack, FINISHES[finish]),
-        shape=(count * size * size, 4),
-        dtype=np.uint16,
+        lambda: {"pixels": render_views(stack, FINISHES[finish])},
+        fits=lambda arrays: [(each.shape, each.dtype) for each in arrays.values()] == [form],
     )
     return Views(
-        pixels=pixels,
+        pixels=kept["pixels"],
         offset=np.arange(count, dtype=np.int32) * np.int32(size * size),
         size=np.full((count, 2), size, np.int32),
         cameras=stack,

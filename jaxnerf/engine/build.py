@@ -1,5 +1,6 @@
 """From a configuration to the functions of a run. Nothing else reads the configuration."""
 
+import dataclasses
 import functools
 import json
 from collections.abc import Callable
@@ -7,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from jaxnerf.data import batches
@@ -14,7 +16,9 @@ from jaxnerf.engine.fit import OUTSIDE, SIZES
 from jaxnerf.engine.models import Model, hierarchical_model
 from jaxnerf.engine.packed import packed_model, skip_empty_afterwards
 from jaxnerf.engine.scenes import background_of, load_views, settle
-from jaxnerf.engine.space import contracted_field, make_space, survey
+from jaxnerf.engine.space import contracted_field, make_space
+from jaxnerf.engine.step import TrainData
+from jaxnerf.engine.survey import survey
 from jaxnerf.fields.grid import grid_field
 from jaxnerf.fields.mlp import mlp_field
 
@@ -26,11 +30,11 @@ class Experiment(NamedTuple):
     optimizer: optax.GradientTransformation
     schedule: Callable[[int], float]  # step -> learning rate
     load_views: Callable[[str], Any]  # split -> Views
-    draw: Callable[..., tuple]  # (step, positions, (Views, live, cells)) -> (keys, Batch)
-    ids: Callable[..., Any]  # (step, positions, as above) -> ids [B] int32 of the pixels that draw takes
+    draw: Callable[..., tuple]  # (step, positions, TrainData) -> (keys, Batch)
+    ids: Callable[..., Any]  # (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes
     view_rays: Callable[..., Any]  # (Views, index, pixels) -> Rays
     world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in the file's units
-    survey: Callable[..., tuple]  # Views -> possible cells, live pixels, cells to look at; each may be None
+    survey: Callable[..., tuple]  # Views -> possible cells, None of a model without a space; TrainData
     samples_per_ray: int  # of the network that has most
     seed: int
     pixel_offset: float
@@ -48,16 +52,13 @@ def build(config):
     model = build_model(config)
     schedule = _schedule(config.train)
     options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
+    batching = {"batching": config.train.batching}
 
     def draw(step, positions, data):
-        views, live, _ = data
-        batching = config.train.batching
-        return batches.draw_batch(config.seed, step, positions, views, live, batching=batching, **options)
+        return batches.draw_batch(data.seed, step, positions, data.views, data.live, **batching, **options)
 
     def ids(step, positions, data):
-        views, live, _ = data
-        batching = config.train.batching
-        return batches.draw_pixels(config.seed, step, positions, views, live, batching=batching)[1]
+        return batches.draw_pixels(data.seed, step, positions, data.views, data.live, **batching)[1]
 
     if config.train.batching not in batches.BATCHINGS:
         raise ValueError(f"train.batching is {config.train.batching!r}, wanted one of {batches.BATCHINGS}")
@@ -186,7 +187,7 @@ def _space(config, field):
     names = ("resolution", "step", "threshold", "update_every", "look_at_once")
     options = {name: space[name] for name in names}
     options["contracted"] = outside == "contracted"
-    return make_space(space.lower, space.upper, seed=config.seed, field=field, **options)
+    return make_space(space.lower, space.upper, field=field, **options)
 
 
 def _view_options(config):
@@ -212,15 +213,19 @@ def _samples_per_ray(config):
 
 
 def _survey(config, model, views):
+    possible = cells = None
     if model.space is None:
-        return None, batches.live_pixels(views), None
-    return survey(
-        views,
-        model.space,
-        masks=config.space.masks and not config.data.ndc,
-        ndc=config.data.ndc,
-        pixel_offset=config.data.pixel_offset,
-    )
+        live = batches.live_pixels(views)
+    else:
+        possible, live, cells = survey(
+            views,
+            model.space,
+            masks=config.space.masks and not config.data.ndc,
+            ndc=config.data.ndc,
+            pixel_offset=config.data.pixel_offset,
+        )
+    seed = np.uint32(config.seed % 2**32)
+    return possible, TrainData(seed, dataclasses.replace(views, mask=None), live, cells)  # live has the mask
 
 
 def _schedule(train):

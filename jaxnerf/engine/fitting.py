@@ -68,12 +68,12 @@ def gather_ahead(run, ids, pixels):
         if step is None:
             step = int(state.step)
             asked = ids(step, data)
-        views, *rest = data
-        rows = parallel.place(pixels[np.asarray(asked)], views.pixels.rows.sharding)
+        drawn = data.views.pixels
+        rows = parallel.place(pixels[np.asarray(asked)], drawn.rows.sharding)
         step += 1
         asked = ids(step, data)  # now: once the step is under way, it would have to wait for that
-        pixels_of_step = dataclasses.replace(views.pixels, rows=rows)
-        return run(state, (dataclasses.replace(views, pixels=pixels_of_step), *rest))
+        views = dataclasses.replace(data.views, pixels=dataclasses.replace(drawn, rows=rows))
+        return run(state, data._replace(views=views))
 
     return gathered
 

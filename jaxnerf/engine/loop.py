@@ -118,13 +118,13 @@ def _score(folder):
 def _compile(experiment, views):
     options = experiment.train
     started = time.perf_counter()
-    possible, live, cells = experiment.survey(views)
+    possible, data = experiment.survey(views)
     surveyed = time.perf_counter() - started
-    views = dataclasses.replace(views, mask=None)  # live has it
     pixels, gather = views.pixels, fitting.has_no_room(views.pixels)
     if gather:
         rows = np.zeros_like(pixels, shape=(options.batch_size, pixels.shape[1]))
-        views = dataclasses.replace(views, pixels=Gathered(rows=rows, shape=pixels.shape))
+        gathered = Gathered(rows=rows, shape=pixels.shape)
+        data = data._replace(views=dataclasses.replace(data.views, pixels=gathered))
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     compile_step = functools.partial(
         parallel.compile_step,
@@ -137,7 +137,7 @@ def _compile(experiment, views):
     run, *placed = fitting.fit_step(
         lambda state, data, block: compile_step(state, data, block_size=block),
         state,
-        (views, live, cells),
+        data,
         parallel.block_of(options, experiment.samples_per_ray),
     )
     if gather:

@@ -1,4 +1,4 @@
-"""The box of a scene: what of it is known to be empty before training, and what training finds to be."""
+"""The box of a scene, and what training finds to be empty in it."""
 
 import functools
 from collections.abc import Callable
@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf.core import contraction, occupancy
-from jaxnerf.data.hull import visual_hull
-from jaxnerf.engine.live import pixels_that_meet
 
 _CHUNK = 8192  # cells asked at once: their activations stay in a processor's cache
 
@@ -24,7 +22,7 @@ class Space(NamedTuple):
     step: float  # world units between samples
     threshold: float | np.ndarray  # 1 / world unit, the density below which a cell is empty; or of each
     create: Callable[..., occupancy.Grid]  # possible [X, Y, Z] bool -> Grid
-    update: Callable[..., occupancy.Grid]  # (step, params, Grid, cells [L] int32) -> Grid
+    update: Callable[..., occupancy.Grid]  # (key, step, params, Grid, cells [L] int32) -> Grid
     contracted: bool = False  # see Grid
 
     @property
@@ -40,7 +38,6 @@ def make_space(
     *,
     resolution,
     step,
-    seed,
     field,
     threshold,
     update_every,
@@ -54,7 +51,6 @@ def make_space(
         lower, upper: [3] world units.
         resolution: cells along the longest side; along the others so many that they are cubes.
         step: world units between samples, where space is plain.
-        seed: of the places that are looked at.
         field: Field; its density under params["fine"] is what counts. None where there are no updates.
         threshold: the share of light absorbed in a step below which a cell is empty.
         update_every: steps between two looks.
@@ -79,7 +75,7 @@ def make_space(
             contracted=contracted,
         )
 
-    def update(step, params, grid, cells):
+    def update(key, step, params, grid, cells):
         if cells.size == 0:
             return grid
         looks = -(-cells.size // look_at_once)  # that see all cells
@@ -90,8 +86,6 @@ def make_space(
         look = jnp.where(young, step // often, step // update_every)
 
         def looked():
-            # No ray has this position, so the key is the step's own.
-            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), step), 2**32 - 2)
             # Whole chunks, as a rest of another size would be compiled too.
             place = jnp.arange(count + (-count % _CHUNK if count > _CHUNK else 0))
             index = look % looks * count + place
@@ -132,36 +126,3 @@ def _stretches(shape):
     along = [np.abs(4 * (np.arange(size) + 0.5) / size - 2) for size in shape]
     largest = np.max(np.meshgrid(*along, indexing="ij"), axis=0)
     return np.float32(1 / np.minimum(2 - largest, 1) ** 2)
-
-
-def survey(views, space, *, masks, ndc=False, pixel_offset=0.5):
-    """Returns what is known before training: possible [X, Y, Z] bool, live Runs, and cells [M] int32.
-
-    Args:
-        views: Views.
-        space: Space.
-        masks: whether pixels without alpha show that nothing is there.
-        ndc, pixel_offset: see draw_batch.
-
-    Returns:
-        possible: which cells may hold something; live: see live.pixels_that_meet; cells: the flat indices of
-        those that are possible.
-    """
-    possible = possible_cells(views, space, masks=masks)
-    live = pixels_that_meet(views, space, possible, masks=masks, ndc=ndc, pixel_offset=pixel_offset)
-    return possible, live, np.flatnonzero(possible).astype(np.int32)
-
-
-def possible_cells(views, space, *, masks):
-    """Returns [X, Y, Z] bool, what the views' alpha leaves possible; all without masks."""
-    if not masks or views.pixels.shape[-1] != 4:
-        return np.ones(space.shape, bool)
-    # The hull halves its cells, so it is fastest with few of them times a power of two along each axis.
-    count, halvings = max(space.shape), 0
-    while count > 31:
-        count, halvings = -(-count // 2), halvings + 1
-    count <<= halvings
-    lower = np.asarray(space.lower)
-    upper = lower + count * (np.asarray(space.upper) - lower) / space.shape
-    x, y, z = space.shape
-    return visual_hull(views, lower, upper, resolution=count)[:x, :y, :z]

@@ -28,8 +28,8 @@ def create_state(model, optimizer, seed, possible=None):
         possible = jnp.ones(model.space.shape, bool)
 
     @jax.jit  # run op by op, initialisation would take longer than compiling it
-    def create(possible):
-        params = model.init(jax.random.key(seed))
+    def create(key, possible):
+        params = model.init(key)
         zero = jnp.zeros((), jnp.int32)
         names = ("nonfinite", "nonfinite_in_a_row", "revived", *(f"dead_{name}" for name in params))
         counters = dict.fromkeys(names, zero)
@@ -40,4 +40,4 @@ def create_state(model, optimizer, seed, possible=None):
             step=zero, params=params, opt_state=optimizer.init(params), grid=grid, counters=counters
         )
 
-    return create(possible)
+    return create(jax.random.key(seed), possible)

@@ -1,11 +1,25 @@
 """One training step: draw rays, render them, descend on the squared error."""
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import optax
 
+from jaxnerf.core.structs import Views
+from jaxnerf.data import batches
+from jaxnerf.data.runs import Runs
 from jaxnerf.engine.revival import count_dead
 from jaxnerf.engine.state import TrainState
+
+
+class TrainData(NamedTuple):
+    """What a run's steps read and never change. The seed is among it: runs that differ by it compile once."""
+
+    seed: Any  # uint32
+    views: Views
+    live: Runs | None  # the pixels to draw from; None: all
+    cells: Any  # [L] int32, those that the grid is looked at in; None of a model without a space
 
 
 def make_train_step(model, optimizer, draw):
@@ -17,13 +31,13 @@ def make_train_step(model, optimizer, draw):
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see data.batches.draw_batch.
 
     Returns:
-        train_step(state, data, positions, *, axis_name=None) -> (state, metrics). data is
-        (views, live, cells): what draw takes, and the cells [L] that the grid is looked at in.
-        positions is [N, B] int32, the places of this device's rays in the whole batch: N blocks
-        that are run one after the other and whose gradients add up, so that B rays' activations
-        stay in the cache (or in the memory) whatever the batch. With an axis_name all sums are
-        also over that axis of devices. metrics are scalars: "loss", "mse" (last rendering),
-        "mse_coarse" (first), "grad_norm", "rays" that counted, and the counters.
+        train_step(state, data, positions, *, axis_name=None) -> (state, metrics). data is TrainData,
+        or of a model without a space whatever draw takes. positions is [N, B] int32, the places of
+        this device's rays in the whole batch: N blocks that are run one after the other and whose
+        gradients add up, so that B rays' activations stay in the cache (or in the memory) whatever
+        the batch. With an axis_name all sums are also over that axis of devices. metrics are
+        scalars: "loss", "mse" (last rendering), "mse_coarse" (first), "grad_norm", "rays" that
+        counted, and the counters.
 
         The counters: "nonfinite" steps, whose loss or gradient was not finite; they leave parameters,
         optimiser and grid as they were. "nonfinite_in_a_row". "dead_<name>" of each network, see
@@ -67,7 +81,9 @@ def make_train_step(model, optimizer, draw):
         grid = state.grid
         if model.space is not None:
             counters["left_out"] = state.counters["left_out"] + drawn - rays
-            grid = model.space.update(state.step, params, grid, data[2])
+            # No ray has this position, so the key is the step's own.
+            key = jax.random.fold_in(batches.step_key(data.seed, state.step), 2**32 - 2)
+            grid = model.space.update(key, state.step, params, grid, data.cells)
         state = TrainState(
             step=state.step + 1,
             params=params,

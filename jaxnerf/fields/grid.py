@@ -1,6 +1,6 @@
 """The fast field: features at the vertices of several grids, and two small networks that read them."""
 
-import functools
+import itertools
 from collections.abc import Sequence
 
 import jax
@@ -119,14 +119,9 @@ def interpolate(table, place, size, *, rows):
     spread = [jnp.clip(value, 0, 1) * (count - 1) for value, count in zip(place, size, strict=True)]
     low = [jnp.minimum(value.astype(jnp.int32), count - 2) for value, count in zip(spread, size, strict=True)]
     share = [value - start for value, start in zip(spread, low, strict=True)]
+    weights = _of_corners(jnp.multiply, [(1 - part, part) for part in share])
     total = 0.0
-    for corner in np.ndindex(2, 2, 2):
-        row = rows.start + _row(
-            [start + step for start, step in zip(low, corner, strict=True)], size, len(rows)
-        )
-        weight = 1.0
-        for part, step in zip(share, corner, strict=True):
-            weight = weight * (part if step else 1 - part)
+    for row, weight in zip(_corner_rows(low, size, rows), weights, strict=True):
         total = total + weight[:, None] * table.at[row].get(mode="promise_in_bounds")
     return total
 
@@ -146,11 +141,23 @@ def harmonics(directions):
     )
 
 
-def _row(vertex, size, count):
-    if count == np.prod(size):
-        return (vertex[0] * size[1] + vertex[1]) * size[2] + vertex[2]
-    scattered = (v.astype(jnp.uint32) * jnp.uint32(prime) for v, prime in zip(vertex, _PRIMES, strict=True))
-    return (functools.reduce(jnp.bitwise_xor, scattered) % jnp.uint32(count)).astype(jnp.int32)
+def _corner_rows(low, size, rows):
+    """Returns the rows [N] of the 8 vertices around places, of which low is the lowest along each axis."""
+    if len(rows) == np.prod(size):
+        strides = (size[1] * size[2], size[2], 1)
+        along = [(v * stride, v * stride + stride) for v, stride in zip(low, strides, strict=True)]
+        return [rows.start + row for row in _of_corners(jnp.add, along)]
+    first = [v.astype(jnp.uint32) for v in low]
+    along = [(v * prime, (v + 1) * prime) for v, prime in zip(first, map(jnp.uint32, _PRIMES), strict=True)]
+    scattered = _of_corners(jnp.bitwise_xor, along)
+    return [rows.start + (row % jnp.uint32(len(rows))).astype(jnp.int32) for row in scattered]
+
+
+def _of_corners(combine, along):
+    """Returns the 8 combinations of two values along each of three axes, z fastest."""
+    x, y, z = along
+    pairs = [combine(*pair) for pair in itertools.product(x, y)]
+    return [combine(*pair) for pair in itertools.product(pairs, z)]
 
 
 def _near_zero(key, shape):
