@@ -177,7 +177,7 @@ def test_pixels_that_stay_on_the_host_train_the_same(compiled_once, tmp_path, mo
         monkeypatch.setattr(fitting, "has_no_room", lambda pixels, kind=kind: kind == "host")
         (tmp_path / kind).mkdir()
         for steps in ends:
-            experiment = build(smoke_config(max_steps=steps, parallel="jit"))
+            experiment = build(smoke_config(max_steps=steps, parallel="jit"))._replace(model=toy_model())
             views = experiment.load_views("train")
             views = dataclasses.replace(views, mask=np.arange(len(views.pixels)) % 3 > 0)
             assert loop.train(experiment, views, tmp_path / kind)
