@@ -114,7 +114,7 @@ def get_config():
                 "samples": 1.0,  # along a ray, times those of training
                 "skip_empty": False,  # of a network trained along whole rays: leave out what is not seen
                 "stop": 1e-3,  # where empty space is skipped: a ray ends where no more than this passes
-                "samples_at_once": 16_384,  # where empty space is skipped
+                "samples_at_once": 0,  # where empty space is skipped; 0: what the device is fastest with
                 "at_end": False,  # score the split when training ends
             },
         }

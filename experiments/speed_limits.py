@@ -71,7 +71,7 @@ def _frame_row(folder):
     flops = run.render.lower(weights, rays).compile().cost_analysis()["flops"]
     asked = {name: rays.near.size * count for name, count in _samples_per_ray(config).items()}
     if model.space is not None:
-        capacity = options.samples_at_once
+        capacity = build.samples_at_once(config)
         rounds = _rounds(model, weights, rays, options, capacity)
         one, far = jnp.zeros((1, capacity, 3)), jnp.ones((1, capacity, 3))
         scene = jax.jit(lambda params, *places: model.scene(params, weights[1])(*places))

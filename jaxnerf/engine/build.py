@@ -7,6 +7,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -190,11 +191,17 @@ def _space(config, field):
     return make_space(space.lower, space.upper, field=field, **options)
 
 
+def samples_at_once(config):
+    """Returns how many samples a picture's rounds ask where empty space is skipped."""
+    # On a CPU activations stay in the cache; an accelerator is slow with little to do.
+    return config.eval.samples_at_once or (2**12 if jax.default_backend() == "cpu" else 2**17)
+
+
 def _view_options(config):
     return {
         "stop": config.eval.stop,
         "view_samples": config.eval.samples,
-        "samples_at_once": config.eval.samples_at_once,
+        "samples_at_once": samples_at_once(config),
         "background": background_of(config.data),
     }
 
