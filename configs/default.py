@@ -32,6 +32,9 @@ def get_config():
                 # "colmap", "llff", or "auto": what is in the folder
                 "format": "synthetic",
                 "dir": "",  # the scene's folder, here or under $JAXNERF_SCENES
+                # which photographs and cameras "dir" holds, written when training begins; not of "blender",
+                # whose splits have files of their own
+                "capture": "",
                 "factor": 1,  # images are area-averaged down this many times; 0: to data.width
                 "width": 800,  # px, about
                 "size": 100,  # px, side of the embedded scene's images

@@ -145,7 +145,7 @@ def test_lists_of_arrays_from_every_numpy(protocol, numpy_1, tmp_path):
         np.testing.assert_array_equal(weights.networks[0][name][1], bias)
 
 
-def test_the_run_is_a_run_like_any_other(tmp_path):
+def test_the_run_is_a_run_like_any_other(compiled_once, tmp_path):
     """By the program; then scored, loaded, and trained on from the learning rate of its step."""
     networks = [random_layers(seed, **SMALL) for seed in (1, 2)]
     files, (_, fine) = write("original", tmp_path / "theirs", networks, step=10)
@@ -157,7 +157,7 @@ def test_the_run_is_a_run_like_any_other(tmp_path):
     ask = questions(0)
     wanted = fine(*ask, num_freqs=4, num_view_freqs=2, skip=0)
     np.testing.assert_allclose(scene(*ask)[1], wanted[1], rtol=1e-5, atol=1e-5)
-    config = smoke_config(max_steps=11, log_every=1, parallel="jit")
+    config = smoke_config(max_steps=11, log_every=1)
     assert train_and_evaluate(config, tmp_path / "run")
     assert open_run(tmp_path / "run").steps() == [10, 11]
     experiment = build.build(config)

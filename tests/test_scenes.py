@@ -17,7 +17,7 @@ import captures
 from configs import capture, default
 from jaxnerf import Rays, render_rays
 from jaxnerf.data.batches import live_pixels, pixel_colors, view_rays
-from jaxnerf.engine import scenes
+from jaxnerf.engine import scenes, workdir
 from jaxnerf.fields import showcase
 
 RAYS = 64  # a view
@@ -227,6 +227,32 @@ def test_what_is_settled_stays(tmp_path):
     assert again.to_dict() == data.to_dict() and not lines and not scenes.is_open(again)
     synthetic = default.get_config().data
     assert scenes.settle(synthetic)[0].to_dict() == synthetic.to_dict()
+
+
+def test_a_capture_that_changed_since_training_is_refused(tmp_path):
+    captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
+    data, _ = scenes.settle(a_data(tmp_path))
+    assert data.capture.startswith("8 photographs, ") and len(scenes.load_views(data, "train").offset) == 7
+    file = tmp_path / "transforms.json"
+    whole = json.loads(file.read_text())
+    moved = json.loads(file.read_text())
+    moved["frames"][3]["transform_matrix"][0][3] += 0.01
+    for content, found in (({**whole, "frames": whole["frames"][1:]}, "7"), (moved, "8")):
+        file.write_text(json.dumps(content))
+        for split in ("train", "test"):
+            with pytest.raises(ValueError, match=f"holds {found} photographs, .* training saw 8 photographs"):
+                scenes.load_views(data, split)
+        workdir.claim(tmp_path / "run", to_config(data))
+        with pytest.raises(ValueError, match="another configuration .*data.capture '8 photographs"):
+            workdir.claim(tmp_path / "run", to_config(scenes.settle(a_data(tmp_path))[0]))
+    del data["capture"]  # of a run from before there was this
+    assert len(scenes.load_views(data, "train").offset) == 7
+
+
+def to_config(data):
+    config = capture.get_config()
+    config.data = data
+    return config
 
 
 def test_ndc_wants_cameras_that_look_one_way(tmp_path):

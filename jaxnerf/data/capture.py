@@ -1,5 +1,6 @@
 """What a reader of a format finds in a folder: posed photographs, not yet opened, in the file's own world."""
 
+import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,3 +32,14 @@ class Capture(NamedTuple):
     points: np.ndarray | None = None  # [N, 3] float64, matter on surfaces; None: not known
     box: tuple | None = None  # (lower [3], upper [3]) outside which the format says there is nothing
     notes: tuple[str, ...] = ()  # a line each: what was left out of the folder, and why
+
+
+def fingerprint(capture):
+    """Returns a line that is the same as long as a Capture's photographs, cameras and splits are the same."""
+    digest = hashlib.sha256(repr(capture.splits).encode())
+    for frame in capture.frames:
+        camera = frame.camera
+        digest.update(repr((frame.name, camera.lens, camera.height, camera.width)).encode())
+        for array in (camera.to_world, camera.focal, camera.center, camera.distortion):
+            digest.update(b"" if array is None else np.float32(array).tobytes())
+    return f"{len(capture.frames)} photographs, {digest.hexdigest()[:8]}"

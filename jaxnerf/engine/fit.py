@@ -101,6 +101,7 @@ def fill_from(config, fitted):
             for name in scenes.OPEN:
                 if config.data.get(name) in scenes.OPEN[name] and name in fitted.data:
                     config.data[name] = fitted.data[name]
+            config.data.capture = config.data.get("capture") or fitted.data.get("capture", "")
         if not (config.get("space") and config.space.skip_empty):
             return config
         for name in SIZES:

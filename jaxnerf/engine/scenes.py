@@ -8,6 +8,7 @@ import pathlib
 import numpy as np
 
 from jaxnerf.data import blender, bounds, copies, formats, images, photos, subset, synthetic, world
+from jaxnerf.data.capture import fingerprint
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 WORLDS = {
@@ -29,10 +30,11 @@ def settle(data, *, missing_ok=False):
     """Returns a copy of a data section without what is left to the capture, and lines that say what it is.
 
     See OPEN: the format, the factor that brings images to data.width, the world, what is behind alpha, and
-    whether to use NDC. missing_ok: whether all of it stays open where there is no such folder.
+    whether to use NDC. And data.capture says from now on which capture that was. missing_ok: whether all of
+    it stays open where there is no such folder.
     """
     data, lines = copy.deepcopy(data), []
-    if data.format == "synthetic" or not is_open(data):
+    if data.format == "synthetic" or not (is_open(data) or _is_new(data)):
         return data, lines
     try:
         folder = scene_folder(data.dir)
@@ -60,6 +62,8 @@ def settle(data, *, missing_ok=False):
     if data.get("background") == "":
         data.background = "white" if images.has_alpha(capture.frames[0].image) else "none"
         lines.append(f"background  {data.background}")
+    if _is_new(data):
+        data.capture = fingerprint(capture)
     if data.ndc is None:
         data.ndc = data.world == "forward"
         lines.append(f"rays        {'in normalised device coordinates' if data.ndc else 'straight'}")
@@ -72,6 +76,11 @@ def _suited_world(data, capture):
     if data.get("world") is None and data.format == "llff":
         return "forward"  # as it was before there was a choice
     return "forward" if data.ndc or world.looks_forward(capture) else "around"
+
+
+def _is_new(data):
+    """Returns whether data.capture is to be filled: not in old runs, nor for splits in files of their own."""
+    return data.get("capture") == "" and data.format != "blender"
 
 
 def is_open(data):
@@ -130,7 +139,13 @@ def _read_views(data, split, only=None):
             background=background_of(data),
             only=only,
         )
-    capture = bounds.with_bounds(formats.read_capture(folder, data.format))
+    capture = formats.read_capture(folder, data.format)
+    if data.get("capture") not in (None, "", found := fingerprint(capture)):
+        raise ValueError(
+            f"{folder}: holds {found}, where training saw {data.capture}: other photographs would be in each "
+            "split, and the world another; restore what was there, or train anew in another --workdir"
+        )
+    capture = bounds.with_bounds(capture)
     to_file = np.eye(4)
     if data.world == "forward":
         if data.ndc and not world.looks_forward(capture, cosine=0.5):

@@ -19,6 +19,7 @@ FREE = (
 FREE += ("train.block_size", "train.parallel", "train.max_nonfinite", "train.revive", "eval.")
 # Fields that runs may be older than, and what they were then; None: whatever it is now.
 SINCE = {
+    "data.capture": None,
     "data.finish": "usual",
     "data.width": None,
     "data.world": None,
