@@ -25,7 +25,7 @@ from jaxnerf.engine.workdir import write_text
 _OUT = flags.DEFINE_string("out", None, "Folder of the page.", required=True)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier page.")
 _VIEWS = 3  # of each run in the pictures
-_HEIGHT = 200  # px of a picture there
+_HEIGHT = 128  # px of a picture there
 _NO_PLOT = "No plot, which needs matplotlib"
 
 
