@@ -4,6 +4,7 @@ import ctypes
 import gc
 import signal
 import sys
+import warnings
 
 from absl import app, flags, logging
 
@@ -112,4 +113,7 @@ def _interrupt(number, _):
 def _leave(code, error):
     line = " ".join(str(error).split())
     print(f"error: {line}", file=sys.stderr)
+    # What was under way fails while it is torn down, as on a full disk, and has nothing to add.
+    sys.unraisablehook = lambda _: None
+    warnings.simplefilter("ignore")
     sys.exit(code)

@@ -37,6 +37,7 @@ class Checkpoints:
         step = int(state.step)
         if step not in self.steps():
             try:
+                _hush()
                 self._open().save(step, state, force=True, custom_metadata={"crc32": _sum(state)})
             except Exception as error:  # orbax raises many kinds
                 raise ValueError(
@@ -140,7 +141,7 @@ def _sum(state):
 
 @functools.cache
 def _hush():
-    """Leaves out what orbax's readers say that are still under way when another of them has failed."""
+    """Leaves out what orbax's readers and writers say that are under way when another of them has failed."""
     before = sys.unraisablehook
 
     def hook(unraisable):
