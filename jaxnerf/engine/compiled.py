@@ -30,8 +30,8 @@ def keep_compiled():
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        # JAX's own limit of 1 s leaves out a dozen small programs that take as long together.
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        # JAX's own limit of 1 s leaves out dozens of small programs, which take as long together.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def tidy(folder, largest=LARGEST):
