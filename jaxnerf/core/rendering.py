@@ -1,5 +1,8 @@
 """The volume renderer, for any scene that is a function (x, viewdirs) -> (density, rgb)."""
 
+import functools
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -173,16 +176,28 @@ def render_image(render, rays, *, chunk):
     Raises:
         ValueError: if chunk < 1 or there are no rays.
     """
-    shape = rays.near.shape
-    count = rays.near.size
+    shape, count = rays.near.shape, rays.near.size
     if chunk < 1 or count < 1:
         raise ValueError(f"render_image: chunk {chunk} and {count} rays, wanted at least 1 of each")
-    flat = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[len(shape) :]), rays)
     parts = []
     for start in range(0, count, chunk):
-        index = jnp.minimum(jnp.arange(start, start + chunk), count - 1)
-        part = render(jax.tree.map(lambda leaf, index=index: leaf[index], flat))
+        part = render(_chunk_of(rays, start, chunk=chunk))
         parts.append(without_weights(part))
+    return _joined(parts, shape=shape)
+
+
+# Both jitted: op by op they would take longer than a small picture's rays.
+@functools.partial(jax.jit, static_argnames="chunk")
+def _chunk_of(rays, start, *, chunk):
+    """Returns Rays [chunk], those of rays [...] from start on, or copies of the last."""
+    axes, index = rays.near.ndim, jnp.minimum(start + jnp.arange(chunk), rays.near.size - 1)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[axes:])[index], rays)
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _joined(parts, *, shape):
+    """Returns the Rendering [...] of this shape from Renderings [chunk], of whose last some are too many."""
+    count = math.prod(shape)
     whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
 
