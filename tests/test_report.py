@@ -65,8 +65,8 @@ def test_the_page_has_every_run_and_names_what_it_could_not_read(runs, tmp_path)
     left_out = page.split("## Left out")[1]
     assert f"{runs[1]}: lacks" in left_out and f"{runs[3]}: has no eval/*/results.json" in left_out
     sheet = iio.imread(tmp_path / "page" / "pictures.png")
-    assert sheet.shape == (2 * 200, 6 * 400, 3)
-    assert sheet[100, 200::400, 0].tolist() == [0, 1, 50, 51, 150, 151]  # views 0, 1 and 3 of four
+    assert sheet.shape == (2 * 128, 6 * 256, 3)
+    assert sheet[64, 128::256, 0].tolist() == [0, 1, 50, 51, 150, 151]  # views 0, 1 and 3 of four
     names = {path.name for path in (tmp_path / "page").iterdir()}
     assert names - {"psnr.png"} == {"report.md", "pictures.png"}
     assert ("psnr.png" in names) == ("![PSNR over time](psnr.png)" in page)
