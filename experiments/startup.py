@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 
+import paired_runs
 import table  # which defines --readme
 from absl import flags
 
@@ -51,11 +52,11 @@ def start(config, cache, seed):
     """Returns the seconds of a training process up to the end of its first step, and those of compiling."""
     with tempfile.TemporaryDirectory() as workdir:
         fields = (f"seed={seed}", "train.max_steps=1", "train.log_every=1", "eval.at_end=False")
-        own = "" if config == "quickstart" else _DATA_DIR.value
+        synthetic = paired_runs.configuration(config).data.format == "synthetic"
         command = [
             *(sys.executable, "-u", "-m", "jaxnerf.train", f"--config=configs/{config}.py"),
             *(f"--config.{field}" for field in fields),
-            *(f"--workdir={workdir}/run", *([f"--data_dir={own}"] if own else [])),
+            *(f"--workdir={workdir}/run", *([] if synthetic else [f"--data_dir={_DATA_DIR.value}"])),
         ]
         environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_COMP")}
         environment |= {"XDG_CACHE_HOME": str(cache)}

@@ -128,7 +128,7 @@ def _make(path, fill, shape, dtype):
 def _make_room(folder, size):
     """Deletes what was used longest ago and what was never finished; OSError if the disk is full even so."""
     files, kept = [], size
-    for file in folder.glob("pixels_*"):
+    for file in (*folder.glob("pixels_*"), *folder.glob("survey_*")):
         with contextlib.suppress(FileNotFoundError):  # another process may tidy up, too
             files.append((file.stat().st_mtime, file.stat().st_size, file))
     for used, length, file in sorted(files, reverse=True):
