@@ -33,6 +33,10 @@ _ROOT = pathlib.Path(__file__).resolve().parent.parent
 def main(argv):
     """Starts each configuration several times and prints the table."""
     del argv
+    known = sorted(file.stem for file in (_ROOT / "configs").glob("*.py"))
+    wrong = [config for config in _CONFIGS.value if config not in known]
+    if wrong:
+        raise ValueError(f"--configs has {wrong[0]!r}, wanted some of {', '.join(known)}")
     rows = []
     for config in _CONFIGS.value:
         with tempfile.TemporaryDirectory() as folder:
