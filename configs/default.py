@@ -104,6 +104,8 @@ def get_config():
                 "beta1": 0.9,
                 "beta2": 0.999,
                 "epsilon": 1e-8,
+                # > 0: what is rendered are parameters averaged over about the last power-th of all steps
+                "average_power": 0.0,
                 "log_every": 100,  # steps
                 "save_every": 5000,  # steps
                 "keep": 3,  # checkpoints

@@ -11,10 +11,12 @@ def get_config():
     config = default.get_config()
     config.data.format, config.data.dir, config.data.factor = "blender", "lego", 8
     config.field, config.space.skip_empty = "grid", True
+    config.features.view_width = 64
     train = config.train
     train.batch_size, train.max_steps, train.lr_steps = 512, 0, 0
     train.lr_init, train.lr_final, train.warmup_steps = 5e-3, 1.5e-4, 50
     train.beta2, train.epsilon = 0.99, 1e-15  # a feature that is rarely seen moves as far as any other
+    train.average_power = 10.0
     train.log_every, train.save_every = 200, 4000
     config.space.hide_from = 300
     config.eval.chunk = 16_384  # empty rays cost little, and full pools are what is fast

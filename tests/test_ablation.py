@@ -197,8 +197,12 @@ def test_the_lines_on_reproducibility_say_what_was_found(moved, four, same, wher
     other[:moved] = 2.0
     again = reproducibility.difference(one, other)
     drift = reproducibility.difference(one, np.linspace(0, 1, 200, dtype=np.float32))
-    lines = reproducibility.report({0: 20.0, 1: 21.0}, again=again, four=four, drift=drift, steps=600)
+    smaller = reproducibility.difference(one, np.full(200, 3e-4, np.float32))
+    lines = reproducibility.report(
+        {0: 20.0, 1: 21.0}, again=again, four=four, drift=drift, paper_drift=smaller, steps=600
+    )
     text = "\n".join(lines)
     assert same in text and f"{where} the seeds' spread of 1.00 dB" in text
     assert "20.50 +- 0.71 dB (20.00, 21.00)" in text
-    assert "more than 5.0e-01, one in a hundred by more than 9.9e-01, the worst by 1.0e+00" in text
+    assert "more than 5.0e-01, one in a hundred by more than 9.9e-01, the worst by 1.0e+00; at the" in text
+    assert text.endswith("the worst by 3.0e-04.")

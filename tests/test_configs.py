@@ -216,5 +216,5 @@ def test_the_optimizer_is_adam_with_the_configured_numbers():
     config.train.update({"lr_init": 0.1, "lr_final": 0.1, "beta1": 0.5, "beta2": 0.75, "epsilon": 1e-3})
     optimizer = build(config).optimizer
     weights, gradient = jax.numpy.array([1.0]), jax.numpy.array([0.01])
-    update, _ = optimizer.update(gradient, optimizer.init(weights))
+    update, _ = optimizer.update(gradient, optimizer.init(weights), weights)
     assert float(optax.apply_updates(weights, update)[0]) == pytest.approx(1 - 0.1 * 0.01 / 0.011, rel=1e-4)

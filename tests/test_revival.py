@@ -14,6 +14,7 @@ import pytest
 from helpers import assert_same, random_rays
 from jaxnerf import Batch
 from jaxnerf.engine import loop, parallel, records, revival
+from jaxnerf.engine.averaging import averaged
 from jaxnerf.engine.build import build, build_model
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.state import create_state
@@ -116,15 +117,17 @@ def killed(state):
     return jax.tree.map(jnp.array, dataclasses.replace(state, params={**state.params, "coarse": dead}))
 
 
-def test_what_begins_anew_is_new_and_the_rest_stays():
-    start = create_state(mortal_model(), OPTIMIZER, 0)
+@pytest.mark.parametrize("optimizer", [OPTIMIZER, averaged(OPTIMIZER, 10.0)], ids=["last", "averaged"])
+def test_what_begins_anew_is_new_and_the_rest_stays(optimizer):
+    start = create_state(mortal_model(), optimizer, 0)
     used = jax.tree.map(lambda leaf: leaf + 1, start)
-    state = revival.make_revive(mortal_model(), OPTIMIZER, 0)(used, ("coarse",))
+    state = revival.make_revive(mortal_model(), optimizer, 0)(used, ("coarse",))
     assert_same(state.params["fine"], used.params["fine"], rtol=0, atol=0)
     assert np.abs(state.params["coarse"]["w"] - start.params["coarse"]["w"]).max() > 0.1, "it would die again"
     old, new = (jax.tree_util.tree_leaves_with_path(tree.opt_state) for tree in (used, state))
     for (path, before), (_, after) in zip(old, new, strict=True):
-        assert_same(after, jnp.zeros_like(before) if "coarse" in str(path) else before, rtol=0, atol=0)
+        begun = state.params["coarse"]["w"] if "average" in str(path) else jnp.zeros_like(before)
+        assert_same(after, begun if "coarse" in str(path) else before, rtol=0, atol=0)
     changed = {name: int(state.counters[name] - used.counters[name]) for name in state.counters}
     assert changed == {**dict.fromkeys(used.counters, 0), "dead_coarse": -1, "revived": 1}
 

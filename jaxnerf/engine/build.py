@@ -13,6 +13,7 @@ import numpy as np
 import optax
 
 from jaxnerf.data import batches
+from jaxnerf.engine.averaging import averaged
 from jaxnerf.engine.fit import OUTSIDE, SIZES
 from jaxnerf.engine.models import Model, hierarchical_model
 from jaxnerf.engine.packed import packed_model, skip_empty_afterwards
@@ -65,7 +66,7 @@ def build(config):
         raise ValueError(f"train.batching is {config.train.batching!r}, wanted one of {batches.BATCHINGS}")
     return Experiment(
         model=model,
-        optimizer=optax.adam(schedule, config.train.beta1, config.train.beta2, config.train.epsilon),
+        optimizer=_optimizer(config.train, schedule),
         schedule=schedule,
         load_views=functools.partial(load_views, config.data),
         draw=draw,
@@ -233,6 +234,14 @@ def _survey(config, model, views):
         )
     seed = np.uint32(config.seed % 2**32)
     return possible, TrainData(seed, dataclasses.replace(views, mask=None), live, cells)  # live has the mask
+
+
+def _optimizer(train, schedule):
+    adam = optax.adam(schedule, train.beta1, train.beta2, train.epsilon)
+    power = train.get("average_power", 0.0)
+    if power < 0:
+        raise ValueError(f"train.average_power is {power}, wanted more than 0, or 0 for none")
+    return averaged(adam, power) if power else adam
 
 
 def _schedule(train):

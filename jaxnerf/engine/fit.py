@@ -14,7 +14,7 @@ _FINEST = (32, 256)  # vertices along the longest side, at least and at most
 SIZES = ("lower", "upper", "resolution", "step", "outside")
 OUTSIDE = ("nothing", "contracted")  # what is taken to be outside of the box
 _MOST_STEPS = 144  # along the longest side: finer images need finer features sooner than finer steps
-_TRAINING = 800  # steps for the square root of a pixel: finer images need more, though not as many more
+_TRAINING = 1000  # steps for the square root of a pixel: finer images need more, though not as many more
 _WIDEST = 3.0  # times all of contracted space: a box that is wider is no better than that
 _LARGEST_GRID = 128  # cells: beyond, looking at all of them costs more than the samples it saves
 

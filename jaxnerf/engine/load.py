@@ -7,6 +7,7 @@ import jax
 
 from jaxnerf.data.batches import random_rays
 from jaxnerf.engine import build, fit, workdir
+from jaxnerf.engine.averaging import rendered_params
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.fitting import image_renderer
 from jaxnerf.engine.state import create_state
@@ -61,7 +62,8 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
 
     def weights(step):
         state = checkpoints.load(step, template())
-        return state.params, extract(state.params) if extract else state.grid
+        params = rendered_params(state)
+        return params, extract(params) if extract else state.grid
 
     image = image_renderer(render, experiment.eval.chunk)
     return Trained(experiment, checkpoints.steps, weights, render, build.identity(config), image)

@@ -89,13 +89,16 @@ def make_revive(model, optimizer, seed):
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), state.step), 2**32 - 3)
         fresh = model.init(key)
         anew = {name: jax.tree.map(lambda _, name=name: name in names, tree) for name, tree in fresh.items()}
+        forgets = optax.tree.map_params(
+            optimizer, lambda _, anew: anew, state.opt_state, anew, transform_non_params=lambda _: False
+        )
         forgotten = dict.fromkeys((f"dead_{name}" for name in names), jnp.zeros((), jnp.int32))
         revived = state.counters["revived"] + len(names)
         return dataclasses.replace(
             state,
             params={name: (fresh if name in names else state.params)[name] for name in fresh},
-            opt_state=optax.tree.map_params(
-                optimizer, lambda old, anew: jnp.zeros_like(old) if anew else old, state.opt_state, anew
+            opt_state=jax.tree.map(
+                lambda old, new, anew: new if anew else old, state.opt_state, optimizer.init(fresh), forgets
             ),
             grid=None if model.space is None else model.space.create(state.grid.possible),
             counters={**state.counters, **forgotten, "revived": revived},

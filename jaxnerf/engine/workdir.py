@@ -24,6 +24,7 @@ SINCE = {
     "data.width": None,
     "data.world": None,
     "data.num_views": 0,
+    "train.average_power": 0.0,
     "space.outside": "nothing",
     "coarse.encode": True,
     "fine.encode": True,
