@@ -32,7 +32,7 @@ _DEVICES = "--xla_force_host_platform_device_count="
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs.", required=True)
 _STEPS = flags.DEFINE_integer("steps", 600, "Of every run.", lower_bound=DRIFT)
 _SEEDS = flags.DEFINE_list("seeds", ["0", "1", "2", "3", "4"], "Two or more.")
-_ONE = flags.DEFINE_string("one", None, "Internal: workdir,seed,steps,Adam of the run that this process makes.")
+_ONE = flags.DEFINE_string("one", None, "Internal: workdir,seed,steps,Adam of the run to make here.")
 
 
 class Difference(NamedTuple):
@@ -128,7 +128,8 @@ def _start(folder, seed, devices=1, adam="own"):
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     others = [flag for flag in environment.get("XLA_FLAGS", "").split() if not flag.startswith(_DEVICES)]
     environment["XLA_FLAGS"] = " ".join([*others, f"{_DEVICES}{devices}"])
-    command = [sys.executable, __file__, f"--out={folder.parent}", f"--one={folder},{seed},{_STEPS.value},{adam}"]
+    one = f"--one={folder},{seed},{_STEPS.value},{adam}"
+    command = [sys.executable, __file__, f"--out={folder.parent}", one]
     code = subprocess.run(command, env=environment).returncode
     if code:
         raise ValueError(f"{folder}: its process ended with {code}, see above; the same command goes on")
