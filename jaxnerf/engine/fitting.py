@@ -1,11 +1,12 @@
 """Training steps and pictures in parts that there is room for in memory."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
 
-from jaxnerf.core.rendering import render_image
+from jaxnerf.core.rendering import render_chosen, render_image
 from jaxnerf.engine import memory, parallel
 
 _CPU_CHUNK = 2**12  # rays that are rendered at once where there is room for them
@@ -78,13 +79,14 @@ def gather_ahead(run, ids, pixels):
     return gathered
 
 
-def image_renderer(render, default):
+def image_renderer(render, default, unseen=None):
     """Returns image(weights, rays [...], chunk=None) -> Rendering [...], in chunks that there is room for.
 
     Args:
         render: (weights, Rays [N]) -> Rendering [N], jitted.
         default: the chunk where none is given. 0, here and there: as large as suits the device, which for a
             CPU is the default.
+        unseen: (weights, Rays [...]) -> which of them to render, and what the others are; None: render all.
     """
     fitting = {}  # by what was asked for: what there was room for
 
@@ -98,7 +100,10 @@ def image_renderer(render, default):
             if fitting.get(key) != size:
                 part = jax.tree.map(lambda leaf: _first(leaf, rays.near.ndim, size), rays)
                 memory.check(render.lower(weights, part).compile())  # the calls below find it compiled
-            return jax.block_until_ready(render_image(lambda rays: render(weights, rays), rays, chunk=size))
+            part = functools.partial(render, weights)
+            if unseen is None:
+                return jax.block_until_ready(render_image(part, rays, chunk=size))
+            return jax.block_until_ready(render_chosen(part, rays, *unseen(weights, rays), chunk=size))
 
         result, fitting[key] = memory.back_off(
             attempt, fitting.get(key, asked), cause="render chunk", unit="rays at once (--chunk)"

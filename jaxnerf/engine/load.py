@@ -65,7 +65,8 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
         params = rendered_params(state)
         return params, extract(params) if extract else state.grid
 
-    image = image_renderer(render, experiment.eval.chunk)
+    unseen = model.unseen and jax.jit(lambda weights, rays: model.unseen(weights[1], rays))
+    image = image_renderer(render, experiment.eval.chunk, unseen)
     return Trained(experiment, checkpoints.steps, weights, render, build.identity(config), image)
 
 

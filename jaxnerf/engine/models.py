@@ -20,6 +20,9 @@ class Model(NamedTuple):
     scene: Callable[..., Callable]  # (params, grid) -> the scene that counts
     space: Any = None  # Space; None where all of it is asked
     entrances: dict[str, tuple[str, ...]] = {}  # of the networks, see Field
+    # (grid, Rays [...]) -> bool [...], which may see something, and the Rendering [...] of those that do not;
+    # None: all may
+    unseen: Callable[..., tuple] | None = None
 
 
 def hierarchical_model(

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 
 from jaxnerf.core import occupancy
 from jaxnerf.core.packing import render_packed
+from jaxnerf.core.rendering import render_nothing
 from jaxnerf.engine.extraction import crop_grid, rays_to_look, visible_grid
-from jaxnerf.engine.marching import samples_in_box
+from jaxnerf.engine.marching import may_meet, samples_in_box
 from jaxnerf.engine.models import Model
 
 _STEP_IN_FOG = 3.0  # times the step
@@ -61,8 +62,15 @@ def packed_model(
     def restricted(params, grid):
         return occupancy.restrict_scene(scene(params), grid)
 
-    entrances = {"fine": field.entrances}
-    return Model(lambda key: {"fine": field.init(key)}, render, view, restricted, space, entrances)
+    return Model(
+        init=lambda key: {"fine": field.init(key)},
+        render=render,
+        view=view,
+        scene=restricted,
+        space=space,
+        entrances={"fine": field.entrances},
+        unseen=_unseen_of(space, background),
+    )
 
 
 def skip_empty_afterwards(model, space, look, *, stop, view_samples, samples_at_once, background):
@@ -88,7 +96,15 @@ def skip_empty_afterwards(model, space, look, *, stop, view_samples, samples_at_
 
     rays = look(rays_to_look(space))
     view = _view_of(scene, space, view_samples, stop, samples_at_once, background)
-    return model._replace(view=view), lambda params: crop_grid(find(params, rays))
+    model = model._replace(view=view, unseen=_unseen_of(space, background))
+    return model, lambda params: crop_grid(find(params, rays))
+
+
+def _unseen_of(space, background):
+    def unseen(grid, rays):
+        return may_meet(grid, rays, cell=space.cell), render_nothing(rays, background=background)
+
+    return unseen
 
 
 def _view_of(scene, space, view_samples, stop, samples_at_once, background):
