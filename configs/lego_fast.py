@@ -20,5 +20,5 @@ def get_config():
     train.log_every, train.save_every = 200, 4000
     config.space.hide_from = 300
     config.eval.samples = 1.5  # training draws its samples, pictures have theirs in the middles
-    config.eval.chunk = 16_384  # empty rays cost little, and full pools are what is fast
+    config.eval.chunk = 8192  # full pools are fast
     return config

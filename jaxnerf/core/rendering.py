@@ -1,5 +1,6 @@
 """The volume renderer, for any scene that is a function (x, viewdirs) -> (density, rgb)."""
 
+import dataclasses
 import functools
 import math
 
@@ -212,7 +213,8 @@ def render_chosen(render, rays, chosen, otherwise, *, chunk):
     """Returns a whole image of which only some rays are rendered, those that may see something.
 
     Args:
-        render, rays, chunk: see render_image.
+        render, rays, chunk: see render_image; but the last chunk is filled up with rays of no length, which
+            cost least.
         chosen: [H, W] bool, which rays are rendered.
         otherwise: Rendering [H, W] without weights, of the others; see render_nothing.
 
@@ -243,16 +245,17 @@ def _chunk_of(rays, start, *, chunk):
 
 @jax.jit
 def _order(chosen):
-    """Returns [N], the places of the rays that are chosen [...], and after them the last one's again."""
-    order = jnp.flatnonzero(chosen, size=chosen.size)
-    return order[jnp.minimum(jnp.arange(chosen.size), chosen.sum() - 1)]
+    """Returns [N], the places of the rays that are chosen [...]; those of no ray after them."""
+    return jnp.flatnonzero(chosen, size=chosen.size, fill_value=chosen.size)
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
 def _chosen_of(rays, order, start, *, chunk):
-    """Returns places [chunk], those in order from start on or copies of the last, and the Rays there."""
-    axes, places = rays.near.ndim, order[jnp.minimum(start + jnp.arange(chunk), order.size - 1)]
-    return places, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[axes:])[places], rays)
+    """Returns places [chunk], those in order from start on, and the Rays there: of no length for no ray."""
+    axes = rays.near.ndim
+    places = order.at[start + jnp.arange(chunk)].get(mode="fill", fill_value=order.size)
+    part = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[axes:]).at[places].get(mode="clip"), rays)
+    return places, dataclasses.replace(part, far=jnp.where(places < order.size, part.far, part.near))
 
 
 @functools.partial(jax.jit, donate_argnums=0)
@@ -261,7 +264,7 @@ def _with_part(whole, places, part):
 
     def put(leaf, new):
         flat = leaf.reshape(-1, *new.shape[1:])
-        return flat.at[places].set(new).reshape(leaf.shape)
+        return flat.at[places].set(new, mode="drop").reshape(leaf.shape)
 
     return jax.tree.map(put, whole, part)
 
