@@ -1,6 +1,5 @@
 """The rendering part of speed_vs_error.py: seconds a frame against the error, setting by setting."""
 
-import functools
 import itertools
 import statistics
 import time
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import speed_machine
 
-from jaxnerf import pixel_grid, psnr, render_image
+from jaxnerf import pixel_grid, psnr
 from jaxnerf.engine import workdir
 from jaxnerf.engine.evaluate import reference
 from jaxnerf.engine.load import newest_step, open_run
@@ -74,7 +73,8 @@ def settings(config, skips):
     """
     learned = "features" if config.get("field") == "grid" else "fine"
     dtype = config[learned].get("compute_dtype", "float32")
-    own = dict(zip(KEYS, (1.0, config.eval.stop, config.eval.chunk, dtype, not skips), strict=True))
+    own = (config.eval.samples, config.eval.stop, config.eval.chunk, dtype, not skips)
+    own = dict(zip(KEYS, own, strict=True))
     tried, notes = [own], []
     if not skips:
         tried.insert(0, own | {"skip_empty": False})
@@ -93,14 +93,14 @@ def _renderer(folder, config, setting, step, views):
     for name in ("coarse", "fine"):
         config[name].compute_dtype = setting["compute_dtype"]
     run = open_run(folder, config, settings={key: setting[key] for key in ("samples", "stop", "skip_empty")})
-    render = functools.partial(run.render, run.weights(step))
+    weights = run.weights(step)
 
     def frame(index, side=None):
         size = np.asarray(views.size[index])
         pixels = pixel_grid(*([side] * 2 if side else size.tolist()), offset=run.experiment.pixel_offset)
         pixels = pixels * (size[::-1] / side if side else np.ones(2))[None, None]
         rays = run.experiment.view_rays(views, index, pixels.astype(jnp.float32))
-        return np.asarray(render_image(render, rays, chunk=setting["chunk"]).rgb)
+        return np.asarray(run.image(weights, rays, chunk=setting["chunk"]).rgb)
 
     return frame
 
