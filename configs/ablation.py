@@ -1,7 +1,8 @@
 """The complete model of experiments/ablation.py: the paper's, smaller in proportion, on lego at 100 x 100.
 
-Two networks alike, half as deep and a fifth as wide, a fifth of the samples, and three octaves less, as
-pixels are eight times as large. Softplus and the learning rate are those of lego_small.py.
+Two networks alike, half as deep and a fifth as wide. As pixels are eight times as large, an eighth of the
+samples, which are then as many pixels apart, and three octaves less. Softplus and the learning rate are
+those of lego_small.py.
 """
 
 from configs import lego_small
@@ -13,7 +14,7 @@ def get_config():
     for network in (config.coarse, config.fine):
         network.depth, network.width, network.skip_layer, network.view_width = 4, 48, 2, 24
         network.num_freqs, network.num_view_freqs, network.use_viewdirs = 7, 4, True
-    config.sampling.num_coarse, config.sampling.num_fine = 12, 24
+    config.sampling.num_coarse, config.sampling.num_fine = 8, 16
     config.sampling.rule = "segments"
     train = config.train
     train.max_steps, train.lr_steps, train.max_seconds = 1000, 1000, 0.0

@@ -1,7 +1,7 @@
 """What each part of the method buys and costs: the rows of the paper's Table 2, at a size for one core.
 
     JAXNERF_SCENES=... python experiments/ablation.py --out=DIR [--data_dir=/path/to/lego] \
-        [--scenes=lego,embedded] [--steps=1000 | --minutes=2] [--seeds=0,1,2] \
+        [--scenes=lego,embedded] [--steps=6000 | --minutes=2] [--seeds=0,1,2] \
         [--only="no hierarchy,5 octaves"] [--readme=README.md]
 
 Trains and scores configs/ablation.py and, for as many steps, what it is without one part, as

@@ -287,7 +287,7 @@ def test_the_program_says_what_it_found_and_keeps_its_hands_off_the_capture(fold
 SCENES = {  # a part of what experiments/check_planted.py plants by hand
     "lego": ["clean"],
     "fern": ["clean", "y and z flipped", "bounds in cm"],
-    "fox": ["clean", "focal x 0.8"],
+    "fox": ["clean"],
     "can": ["clean"],
 }
 

@@ -137,8 +137,8 @@ def test_finer_images_are_trained_on_longer(views):
     got, lines = fit_config(config, views)
     sharp, _ = fit_config(config, dataclasses.replace(views, size=16 * views.size))
     assert sharp.train.max_steps == pytest.approx(4 * got.train.max_steps, abs=4)
-    assert got.train.max_steps == got.train.lr_steps == round(800 * 24**0.5) and not is_open(got)
-    assert any(line.startswith("training") and "3,919" in line for line in lines)
+    assert got.train.max_steps == got.train.lr_steps == round(1000 * 24**0.5) and not is_open(got)
+    assert any(line.startswith("training") and "4,899" in line for line in lines)
     filled = fill_from(config, got)
     assert filled.to_json_best_effort() == got.to_json_best_effort()
     config.train.max_steps = 7
