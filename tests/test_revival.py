@@ -181,9 +181,7 @@ def train_toy(folder, **options):
 
 
 def toy_state():
-    config = smoke_config().train
-    optimizer = optax.adam(lambda step: 1e-2, config.beta1, config.beta2, config.epsilon)
-    return create_state(mortal_model(), optimizer, 0)
+    return create_state(mortal_model(), build(smoke_config()).optimizer, 0)
 
 
 @pytest.fixture(scope="module")
