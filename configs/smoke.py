@@ -13,7 +13,6 @@ def get_config():
     config.sampling.num_coarse, config.sampling.num_fine = 8, 8
     train = config.train
     train.batch_size, train.max_steps, train.lr_steps = 64, 20, 20
-    train.average_power = 10.0
     train.log_every, train.save_every = 5, 10
     config.eval.chunk = 250
     return config

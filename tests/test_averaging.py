@@ -13,6 +13,7 @@ from jaxnerf.engine.averaging import averaged, rendered_params
 from jaxnerf.engine.build import build
 from jaxnerf.engine.checkpoint import Checkpoints
 from jaxnerf.engine.load import open_run
+from jaxnerf.engine.loop import train_and_evaluate
 from jaxnerf.engine.state import create_state
 from runs import smoke_config
 
@@ -63,10 +64,11 @@ def test_averaged_parameters_are_rendered_where_there_are_such():
     assert rendered_params(types.SimpleNamespace(params=passed[-1], opt_state=plain)) is passed[-1]
 
 
-def test_a_run_renders_its_average(trained):
-    run = open_run(trained)
+def test_a_run_renders_its_average(compiled_once, tmp_path):
+    assert train_and_evaluate(smoke_config(average_power=10.0), tmp_path)
+    run = open_run(tmp_path)
     like = create_state(run.experiment.model, run.experiment.optimizer, run.experiment.seed)
-    state = Checkpoints(trained).load(20, like)
+    state = Checkpoints(tmp_path).load(20, like)
     params, _ = run.weights(20)
     assert_same(params, state.opt_state.average, rtol=0, atol=0)
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), params, state.params)

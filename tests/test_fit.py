@@ -238,5 +238,5 @@ def test_sizes_of_lego(scenes_dir):
     build(config)
     slow, _ = fit_config(lego_mlp_fast.get_config(), lego)
     assert slow.space.lower == space.lower and slow.space.step == space.step
-    assert config.train.max_steps == config.train.lr_steps == 8000
+    assert config.train.max_steps == config.train.lr_steps == 10000
     build(slow)
