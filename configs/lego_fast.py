@@ -19,6 +19,6 @@ def get_config():
     train.average_power = 10.0
     train.log_every, train.save_every = 200, 4000
     config.space.hide_from = 300
-    config.eval.samples = 1.5  # training draws its samples, pictures have theirs in the middles
-    config.eval.chunk = 8192  # full pools are fast
+    config.eval.samples = 1.5  # no jitter averages over a step there, so steps are finer
+    config.eval.chunk = 8192  # enough rays to fill pools, not many more than see something in a small picture
     return config

@@ -7,7 +7,6 @@ import pytest
 
 from helpers import all_finite, assert_same, compiled, random_rays
 from jaxnerf import Samples, positions, render_hierarchical, render_image, render_rays, render_samples
-from jaxnerf.core.rendering import render_chosen, render_nothing
 
 SHAPE = (4, 3)
 
@@ -189,36 +188,6 @@ def test_an_image_does_not_depend_on_its_chunks(rays, chunk):
     assert_same(got, dataclasses.replace(draw["rays"](None, rays), weights=None))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_rays_that_are_not_chosen_are_not_rendered(rays, share):
-    asked = []
-
-    @jax.jit
-    def render(rays):
-        jax.debug.callback(lambda *parts: asked.append(parts), rays.origins, rays.far - rays.near)
-        return through_ball(None, rays)
-
-    chosen = jnp.asarray(np.random.default_rng(0).uniform(size=SHAPE) < share)
-    nothing = render_nothing(rays, background=jnp.array([0.1, 0.2, 0.3]))
-    got = jax.block_until_ready(render_chosen(render, rays, chosen, nothing, chunk=5))
-    jax.effects_barrier()
-    whole = dataclasses.replace(draw["rays"](None, rays), weights=None)
-    either = lambda a, b: np.where(np.asarray(chosen).reshape(*SHAPE, *(1,) * (a.ndim - 2)), a, b)  # noqa: E731
-    assert_same(got, jax.tree.map(either, whole, nothing))
-    assert len(asked) == -(-int(chosen.sum()) // 5)
-    asked = [origin for part, length in asked for origin in np.asarray(part)[np.asarray(length) > 0].tolist()]
-    assert sorted(asked) == sorted(np.asarray(rays.origins)[np.asarray(chosen)].tolist())
-
-
-def test_nothing_looks_as_an_empty_scene(rays):
-    background = jnp.array([0.1, 0.2, 0.3])
-    empty = lambda x, viewdirs: (jnp.zeros(x.shape[:-1]), x)  # noqa: E731
-    seen = render_rays(None, empty, rays, num_samples=4, background=background)
-    got = render_nothing(rays, background=background)
-    assert_same(got, dataclasses.replace(seen, weights=None), rtol=0, atol=1e-6)
-    assert_same(render_nothing(rays).rgb, np.zeros((*SHAPE, 3)), rtol=0, atol=0)
-
-
 def test_wrong_arguments(rays):
     t = np.ones((*SHAPE, 2), np.float32)
     both = Samples(t=t, delta=t)
@@ -232,9 +201,7 @@ def test_wrong_arguments(rays):
         "rule is 'none'": lambda: render_hierarchical(
             None, ball, ball, rays, num_coarse=4, num_fine=4, rule="none"
         ),
-        "render_image: chunk": lambda: render_image(lambda rays: through_ball(None, rays), rays, chunk=0),
-        "render_chosen: chunk": lambda: render_chosen(None, rays, np.ones(SHAPE, bool), None, chunk=0),
-        "render_chosen: chosen": lambda: render_chosen(None, rays, np.ones(3, bool), None, chunk=4),
+        "chunk": lambda: render_image(lambda rays: through_ball(None, rays), rays, chunk=0),
     }.items():
         with pytest.raises(ValueError, match=message):
             jax.eval_shape(call)

@@ -172,37 +172,6 @@ def test_samples_stand_for_all_of_the_way_through_the_box(step, random, stretch)
     assert (counted <= way * lengths(rays) / step + 2.001).all()  # no ray asks more than it is long
 
 
-@pytest.mark.parametrize("kind, most", [("nothing", 0.0), ("dust", np.inf), ("a ball", 1.6)])
-def test_no_ray_that_meets_something_is_taken_to_miss_it(kind, most):
-    """And of rays past a ball, most are known to miss it."""
-    shape = (23, 40, 31)  # no multiple of a block
-    cell, rng = (0.05, 0.04, 0.06), np.random.default_rng(0)
-    half = np.float32(np.multiply(cell, shape) / 2)
-    away = np.moveaxis(np.indices(shape), 0, -1) * cell + np.divide(cell, 2) - half
-    possible = {
-        "nothing": np.zeros(shape, bool),
-        "dust": rng.uniform(size=shape) < 1e-3,
-        "a ball": np.linalg.norm(away, axis=-1) < 0.4,
-    }[kind]
-    grid = jaxnerf.create_grid(-half, half, possible, assumed=1.0)
-    rays = rays_past_origin(7, 4000)
-
-    @jax.jit
-    def ask(grid, rays):
-        samples = marching.samples_in_box(None, grid, rays, step=0.01, cell=cell)
-        meets = (samples.delta > 0) & occupancy.occupied_at(grid, rays, samples.t)
-        return meets.any(axis=-1), marching.may_meet(grid, rays, cell=cell), (samples.delta > 0).any(axis=-1)
-
-    meets, may, enters = map(np.asarray, ask(grid, rays))
-    assert not (meets & ~may).any() and not (may & ~enters).any()
-    assert may.sum() <= most * meets.sum()
-    for name in ("origins", "directions", "near", "far"):
-        unknown = dataclasses.replace(rays, **{name: np.full_like(getattr(rays, name), np.nan)})
-        assert ask(grid, unknown)[1].all(), name
-    everywhere = dataclasses.replace(grid, contracted=True)
-    assert marching.may_meet(everywhere, rays, cell=cell).all()
-
-
 def test_a_cell_that_was_empty_comes_back_when_its_density_grows():
     """Long after the start, too, when neighbours no longer count."""
     field = Field(None, lambda params, x, viewdirs: (jnp.where(x[..., 0] > 0, params, 0.0), x))

@@ -1,6 +1,5 @@
 """The volume renderer, for any scene that is a function (x, viewdirs) -> (density, rgb)."""
 
-import dataclasses
 import functools
 import math
 
@@ -162,28 +161,6 @@ def render_hierarchical(
     return first, render_samples(fine, rays, samples, background=background)
 
 
-def render_nothing(rays, *, background=None):
-    """Returns what rays see where there is nothing.
-
-    Args:
-        rays: Rays [...].
-        background: see render_samples.
-
-    Returns:
-        Rendering [...] without weights: the background's colour, depth far, and 0.
-    """
-    shape = rays.near.shape
-    behind = jnp.zeros(3) if background is None else jnp.asarray(background)
-    return Rendering(
-        rgb=jnp.broadcast_to(behind, (*shape, 3)),
-        opacity=jnp.zeros(shape),
-        depth=rays.far,
-        disparity=jnp.zeros(shape),
-        weights=None,
-        dropped=jnp.zeros(shape, jnp.int32),
-    )
-
-
 def render_image(render, rays, *, chunk):
     """Returns a whole image, rendered in chunks of one compiled shape.
 
@@ -209,64 +186,12 @@ def render_image(render, rays, *, chunk):
     return _joined(parts, shape=shape)
 
 
-def render_chosen(render, rays, chosen, otherwise, *, chunk):
-    """Returns a whole image of which only some rays are rendered, those that may see something.
-
-    Args:
-        render, rays, chunk: see render_image; but the last chunk is filled up with rays of no length, which
-            cost least.
-        chosen: [H, W] bool, which rays are rendered.
-        otherwise: Rendering [H, W] without weights, of the others; see render_nothing.
-
-    Returns:
-        Rendering [H, W] without weights.
-
-    Raises:
-        ValueError: if chunk < 1, or on another shape of chosen.
-    """
-    if chunk < 1:
-        raise ValueError(f"render_chosen: chunk {chunk}, wanted at least 1")
-    if chosen.shape != rays.near.shape:
-        raise ValueError(f"render_chosen: chosen {chosen.shape}, wanted {rays.near.shape} as the rays")
-    order, whole = _order(chosen), jax.tree.map(jnp.copy, otherwise)  # a copy, as it is written into
-    for start in range(0, int(chosen.sum()), chunk):
-        places, part = _chosen_of(rays, order, start, chunk=chunk)
-        whole = _with_part(whole, places, without_weights(render(part)))
-    return whole
-
-
-# All jitted: op by op they would take longer than a small picture's rays.
+# Both jitted: op by op they would take longer than a small picture's rays.
 @functools.partial(jax.jit, static_argnames="chunk")
 def _chunk_of(rays, start, *, chunk):
     """Returns Rays [chunk], those of rays [...] from start on, or copies of the last."""
     axes, index = rays.near.ndim, jnp.minimum(start + jnp.arange(chunk), rays.near.size - 1)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[axes:])[index], rays)
-
-
-@jax.jit
-def _order(chosen):
-    """Returns [N], the places of the rays that are chosen [...]; those of no ray after them."""
-    return jnp.flatnonzero(chosen, size=chosen.size, fill_value=chosen.size)
-
-
-@functools.partial(jax.jit, static_argnames="chunk")
-def _chosen_of(rays, order, start, *, chunk):
-    """Returns places [chunk], those in order from start on, and the Rays there: of no length for no ray."""
-    axes = rays.near.ndim
-    places = order.at[start + jnp.arange(chunk)].get(mode="fill", fill_value=order.size)
-    part = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[axes:]).at[places].get(mode="clip"), rays)
-    return places, dataclasses.replace(part, far=jnp.where(places < order.size, part.far, part.near))
-
-
-@functools.partial(jax.jit, donate_argnums=0)
-def _with_part(whole, places, part):
-    """Returns the Rendering [...] with the Rendering [N] at places [N] in it."""
-
-    def put(leaf, new):
-        flat = leaf.reshape(-1, *new.shape[1:])
-        return flat.at[places].set(new, mode="drop").reshape(leaf.shape)
-
-    return jax.tree.map(put, whole, part)
 
 
 @functools.partial(jax.jit, static_argnames="shape")

@@ -6,8 +6,9 @@ import functools
 import jax
 import numpy as np
 
-from jaxnerf.core.rendering import render_chosen, render_image
+from jaxnerf.core.rendering import render_image
 from jaxnerf.engine import memory, parallel
+from jaxnerf.engine.unseen import render_chosen
 
 _CPU_CHUNK = 2**12  # rays that are rendered at once where there is room for them
 _LARGEST_CHUNK = 2**16  # of an accelerator

@@ -2,13 +2,10 @@
 
 import math
 
-import jax
 import jax.numpy as jnp
 
 from jaxnerf.core import occupancy
 from jaxnerf.core.sampling import samples_from_edges, stepped_edges
-
-_BLOCK = 2  # cells a side: of the blocks that tell what a ray may meet
 
 
 def samples_in_box(key, grid, rays, *, step, cell, stretch=1.0):
@@ -32,36 +29,6 @@ def samples_in_box(key, grid, rays, *, step, cell, stretch=1.0):
     count = _whole_words(math.hypot(*sides) / step + 1)
     edges = stepped_edges(key, inside.near, inside.far, step=stretch * step / speed, num_segments=count)
     return samples_from_edges(None, edges)
-
-
-def may_meet(grid, rays, *, cell):
-    """Returns [...], False where no sample of a ray can lie in an occupied cell.
-
-    Blocks of cells are asked at a few places along the ray, so of the rays that pass nearby many are True,
-    and all where space is contracted. A ray that is NaN may meet anything, and shows.
-
-    Args:
-        grid, rays, cell: see samples_in_box.
-    """
-    if grid.contracted:
-        return jnp.ones(rays.near.shape, bool)
-    blocks = _blocks_around(grid.occupied)
-    inside = occupancy.cut_to_box(grid, rays)
-    length = inside.far - inside.near
-    sides = [size * count for size, count in zip(cell, grid.occupied.shape, strict=True)]
-    # No point of a ray is further than a block from a place, but for rounding.
-    count = math.ceil(math.hypot(*sides) / (1.99 * _BLOCK * min(cell)))
-
-    def ask(index, met):
-        t, flat = inside.near + length * ((index + 0.5) / count), 0
-        for axis, (size, wide) in enumerate(zip(cell, blocks.shape, strict=True)):
-            place = (rays.origins[..., axis] + t * rays.directions[..., axis] - grid.lower[axis]) / size
-            flat = flat * wide + jnp.clip((place / _BLOCK).astype(jnp.int32), 0, wide - 1)
-        return met | blocks.reshape(-1)[flat]
-
-    met = jax.lax.fori_loop(0, count, ask, jnp.zeros(rays.near.shape, bool))
-    numbers = (rays.origins.sum(axis=-1), rays.directions.sum(axis=-1), rays.near, rays.far)
-    return (met & (length > 0)) | jnp.isnan(sum(numbers))
 
 
 def samples_everywhere(key, grid, rays, t_step, steps_of_room):
@@ -93,17 +60,6 @@ def samples_everywhere(key, grid, rays, t_step, steps_of_room):
     nearest, scale = nearest[..., None], scale[..., None]
     edges = nearest + scale * jnp.tan(edges / scale)
     return samples_from_edges(None, jnp.clip(edges, rays.near[..., None], rays.far[..., None]))
-
-
-def _blocks_around(occupied):
-    """Returns which blocks hold an occupied cell, or have one among their 26 neighbours."""
-    blocks = occupied
-    for axis in range(3):
-        sizes = [(3 * _BLOCK, _BLOCK) if i == axis else (1, 1) for i in range(3)]
-        around = [(_BLOCK, _BLOCK + -occupied.shape[i] % _BLOCK) if i == axis else (0, 0) for i in range(3)]
-        window, strides = zip(*sizes, strict=True)
-        blocks = jax.lax.reduce_window(blocks, False, jax.lax.bitwise_or, window, strides, around)
-    return blocks
 
 
 def _whole_words(count):

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from jaxnerf.core import occupancy
 from jaxnerf.core.packing import render_packed
-from jaxnerf.core.rendering import render_nothing
 from jaxnerf.engine.extraction import crop_grid, rays_to_look, visible_grid
-from jaxnerf.engine.marching import may_meet, samples_in_box
+from jaxnerf.engine.marching import samples_in_box
 from jaxnerf.engine.models import Model
+from jaxnerf.engine.unseen import may_meet, render_nothing
 
 _STEP_IN_FOG = 3.0  # times the step
 

@@ -89,7 +89,8 @@ def make_revive(model, optimizer, seed):
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), state.step), 2**32 - 3)
         fresh = model.init(key)
         anew = {name: jax.tree.map(lambda _, name=name: name in names, tree) for name, tree in fresh.items()}
-        forgets = optax.tree.map_params(
+        # As init makes it: moments of 0, but an average begins at the parameters.
+        begins = optax.tree.map_params(
             optimizer, lambda _, anew: anew, state.opt_state, anew, transform_non_params=lambda _: False
         )
         forgotten = dict.fromkeys((f"dead_{name}" for name in names), jnp.zeros((), jnp.int32))
@@ -98,7 +99,7 @@ def make_revive(model, optimizer, seed):
             state,
             params={name: (fresh if name in names else state.params)[name] for name in fresh},
             opt_state=jax.tree.map(
-                lambda old, new, anew: new if anew else old, state.opt_state, optimizer.init(fresh), forgets
+                lambda old, new, anew: new if anew else old, state.opt_state, optimizer.init(fresh), begins
             ),
             grid=None if model.space is None else model.space.create(state.grid.possible),
             counters={**state.counters, **forgotten, "revived": revived},

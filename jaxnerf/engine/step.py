@@ -71,7 +71,7 @@ def make_train_step(model, optimizer, draw):
             updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
             return optax.apply_updates(state.params, updates), opt_state
 
-        # To select between old and new, array by array, would take as long as the update itself twice over.
+        # A branch: to select between old and new, array by array, takes about as long as the update itself.
         params, opt_state = jax.lax.cond(finite, descend, lambda: (state.params, state.opt_state))
         missed = (~finite).astype(jnp.int32)
         errors = (metrics["mse_coarse"], metrics["mse"])[-len(grads) :]
