@@ -12,6 +12,6 @@ def get_config():
     # A ReLU that has died cannot come back, and this learning rate is high.
     network.density_activation, network.density_bias = "softplus", -1.0
     train = config.train
-    train.batch_size, train.max_steps, train.lr_steps = 320, 24_000, 20_000
+    train.batch_size, train.max_steps, train.lr_steps = 320, 30_000, 30_000
     train.lr_init, train.lr_final, train.epsilon = 8e-3, 3e-4, 1e-8
     return config

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import oracle
+from helpers import assert_same
+from jaxnerf.fields.grid import grid_field
 from jaxnerf.fields.mlp import mlp_field
 
 
@@ -155,3 +157,38 @@ def test_bfloat16_is_for_the_layers_alone():
 def test_an_unknown_activation_is_named():
     with pytest.raises(ValueError, match="density_activation is 'tanh', wanted one of .*relu"):
         mlp_field(density_activation="tanh")
+
+
+FIELDS = {
+    "mlp": mlp_field(depth=2, width=16, view_width=8, num_freqs=3),
+    "grid": grid_field(lower=(-1, -1, -1), upper=(1, 1, 1), resolutions=(8,), width=16, view_width=8),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("rays, samples, directions", [(16, 64, 1), (16, 64, 64), (512, 1, 1)])
+def test_rows_that_collide_in_the_cache_are_parted_and_none_can_tell(name, rays, samples, directions):
+    """Answers and slopes for 512 samples or 1024 are those of two parts, which collide nowhere."""
+    field, rng = FIELDS[name], np.random.default_rng(0)
+    x, pull = rng.uniform(-1, 1, (2, rays, samples, 3)).astype(np.float32)
+    viewdirs = rng.normal(size=(rays, directions, 3)).astype(np.float32)
+    params = jax.jit(field.init)(jax.random.key(0))
+
+    @jax.jit
+    def ask(params, x, viewdirs, pull):
+        def total(params, x):
+            density, rgb = field.apply(params, x, viewdirs)
+            return (pull * (density[..., None] + rgb)).sum(), (density, rgb)
+
+        return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(params, x)
+
+    (_, answers), (slopes, moves) = ask(params, x, viewdirs, pull)
+    axis = 0 if rays > 1 else 1
+    first = [
+        np.split(value, [7], axis) if value.shape[axis] > 1 else (value, value)
+        for value in (x, viewdirs, pull)
+    ]
+    parts = [ask(params, *part) for part in zip(*first, strict=True)]
+    assert_same(answers, jax.tree.map(lambda *p: jnp.concatenate(p, axis), *(part[0][1] for part in parts)))
+    assert_same(moves, jnp.concatenate([part[1][1] for part in parts], axis))
+    assert_same(slopes, jax.tree.map(jnp.add, *(part[1][0] for part in parts)))

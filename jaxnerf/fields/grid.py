@@ -9,7 +9,7 @@ import numpy as np
 from flax import linen
 
 from jaxnerf.core.structs import check_shapes
-from jaxnerf.fields.mlp import Dense, Field
+from jaxnerf.fields.mlp import Dense, Field, ask
 
 _glorot = linen.initializers.glorot_uniform()
 
@@ -42,7 +42,7 @@ def grid_field(**options):
         return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
 
     def apply(params, x, viewdirs):
-        density, rgb = network.apply({"params": params}, x, viewdirs)
+        density, rgb = ask(network, params, x, viewdirs)
         return jnp.exp(jnp.minimum(density, _LARGEST)), jax.nn.sigmoid(rgb)
 
     return Field(init, apply)
