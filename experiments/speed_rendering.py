@@ -117,6 +117,7 @@ def _timed(frame, chosen):
     median = statistics.median(seconds)
     if median * SIDE**2 / frames[0][..., 0].size > LONGEST:
         return frames, median, None
+    frame(chosen[0], SIDE)  # compiles, as what looks for the rays to render has the frame's size
     started = time.perf_counter()
     frame(chosen[0], SIDE)
     return frames, median, time.perf_counter() - started

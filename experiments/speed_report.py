@@ -81,19 +81,20 @@ def _reached(runs, bar):
 
 
 def rendering(kept):
-    """Returns the lines of the settings tried; those that nothing beats in time and RMS error are bold."""
+    """Returns the lines of the run's own settings, in bold, and of those that nothing beats."""
+    own, skipping = kept["rows"][0], kept["rows"][0]["settings"]["skip_empty"]
     front = [cost for cost, _ in pareto_front([(row["seconds"], -row["rms"]) for row in kept["rows"]])]
     cells = []
     for row in sorted(kept["rows"], key=lambda row: row["seconds"]):
+        if row is not own and row["seconds"] not in front:
+            continue
         names = [f"{name} {value}" for name, value in row["settings"].items() if name != "skip_empty"]
-        names += (
-            [] if row["settings"]["skip_empty"] == kept["rows"][0]["settings"]["skip_empty"] else ["other"]
-        )
+        names += [] if row["settings"]["skip_empty"] == skipping else ["skipping afterwards"]
         text = ", ".join(names)
         large = "-" if row["seconds_800"] is None else f"{row['seconds_800']:.2f}"
         cells.append(
             (
-                f"**{text}**" if row["seconds"] in front else text,
+                f"**{text}**" if row is own else text,
                 f"{row['seconds']:.3f}",
                 large,
                 f"{row['psnr']:.3f}",
@@ -115,8 +116,9 @@ def rendering(kept):
     ]
     return [
         f"Rendering {kept['frames']} test views of {kept['workdir']} (step {kept['step']}); errors against "
-        f"its own rendering with samples 4 and stop 0; bold: the Pareto front. {kept['machine']}, matrix "
-        f"product {statistics.mean(kept['gflops']):.0f} GFLOP/s.",
+        f"its own rendering with samples 4 and stop 0. Of {len(kept['rows'])} settings the run's own, bold, "
+        f"and those that none beats in both time and RMS error. {kept['machine']}, matrix product "
+        f"{statistics.mean(kept['gflops']):.0f} GFLOP/s.",
         *(f"{note}." for note in kept["notes"]),
         "",
         *table.markdown(heads, cells),

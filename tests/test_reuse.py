@@ -1,11 +1,12 @@
 """The public functions inside other people's JAX code, and without anything but jax."""
 
 import functools
+import importlib.metadata
+import os
 import re
 import shutil
 import subprocess
 import sys
-import venv
 
 import jax
 import jax.numpy as jnp
@@ -134,36 +135,49 @@ def test_the_hierarchy_composes_with_keys_a_ray(cameras):
     assert_same([rgb[2] for rgb in whole], one)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def bare(tmp_path_factory):
-    """A python that has jax and this package's wheel, and nothing else."""
+    """Runs python, with given arguments, where there are this package's wheel, jax and what jax requires."""
     folder = tmp_path_factory.mktemp("bare")
-    source = folder / "source"  # a build leaves files behind, so it works on a copy
-    source.mkdir()
+    source, packages = folder / "source", folder / "packages"
+    source.mkdir()  # a build leaves files behind, so it works on a copy
     for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     shutil.copytree(ROOT / "jaxnerf", source / "jaxnerf", ignore=shutil.ignore_patterns("__pycache__"))
-    venv.create(folder / "venv", with_pip=True)
-    python = folder / "venv" / "bin" / "python"
-    pip = [python, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([*pip, "wheel", source, "--no-deps", "-w", folder], check=True)
-    subprocess.run([*pip, "install", f"jax=={jax.__version__}"], check=True)
-    subprocess.run([*pip, "install", "--no-deps", *folder.glob("jaxnerf-*.whl")], check=True)
-    return python
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "install", source, "--no-deps", f"--target={packages}"], check=True)
+    for name in _required_by("jax"):
+        files = importlib.metadata.files(name)
+        for top in {file.parts[0] for file in files if file.parts[0] not in ("..", "__pycache__")}:
+            (packages / top).symlink_to(importlib.metadata.distribution(name).locate_file(top))
+
+    def run(*arguments):
+        command = [sys.executable, "-S", *map(str, arguments)]  # -S: without the packages of this python
+        environment = {**os.environ, "PYTHONPATH": str(packages)}
+        return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+    return run
+
+
+def _required_by(name):
+    """Returns the names of a distribution and of all that it requires, extras left out."""
+    names = {name}
+    for line in importlib.metadata.requires(name) or ():
+        if "extra ==" not in line:
+            names |= _required_by(re.match(r"[\w.-]+", line).group())
+    return names
 
 
 def test_the_readmes_first_example_needs_jax_alone(bare, tmp_path):
     found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (tmp_path / "example.py").write_text(found.group(1))
-    result = subprocess.run([bare, "example.py"], cwd=tmp_path, capture_output=True, text=True)
+    result = bare(tmp_path / "example.py")
     assert result.returncode == 0, result.stderr
     assert "(100, 100, 3)" in result.stdout
     for name in ("flax", "absl", "imageio", "ml_collections", "optax", "orbax", "PIL"):
-        assert subprocess.run([bare, "-c", f"import {name}"], capture_output=True).returncode == 1, name
-    place = subprocess.run(
-        [bare, "-c", "import jaxnerf; print(jaxnerf.__file__)"], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert str(bare.parent.parent) in place.stdout
+        assert bare("-c", f"import {name}").returncode == 1, name
+    place = bare("-c", "import jaxnerf; print(jaxnerf.__file__)")
+    assert "packages/jaxnerf/" in place.stdout, place.stderr
 
 
 def test_importing_it_loads_none_of_the_rest():
