@@ -166,9 +166,9 @@ FIELDS = {
 
 
 @pytest.mark.parametrize("name", FIELDS)
-@pytest.mark.parametrize("rays, samples, directions", [(16, 64, 1), (16, 64, 64), (512, 1, 1)])
+@pytest.mark.parametrize("rays, samples, directions", [(16, 64, 1), (16, 64, 64), (512, 1, 1), (2, 512, 1)])
 def test_rows_that_collide_in_the_cache_are_parted_and_none_can_tell(name, rays, samples, directions):
-    """Answers and slopes for 512 samples or 1024 are those of two parts, which collide nowhere."""
+    """Answers and slopes for 512 samples or 1024 are those of the first ray and of the others."""
     field, rng = FIELDS[name], np.random.default_rng(0)
     x, pull = rng.uniform(-1, 1, (2, rays, samples, 3)).astype(np.float32)
     viewdirs = rng.normal(size=(rays, directions, 3)).astype(np.float32)
@@ -183,12 +183,9 @@ def test_rows_that_collide_in_the_cache_are_parted_and_none_can_tell(name, rays,
         return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(params, x)
 
     (_, answers), (slopes, moves) = ask(params, x, viewdirs, pull)
-    axis = 0 if rays > 1 else 1
-    first = [
-        np.split(value, [7], axis) if value.shape[axis] > 1 else (value, value)
-        for value in (x, viewdirs, pull)
-    ]
-    parts = [ask(params, *part) for part in zip(*first, strict=True)]
-    assert_same(answers, jax.tree.map(lambda *p: jnp.concatenate(p, axis), *(part[0][1] for part in parts)))
-    assert_same(moves, jnp.concatenate([part[1][1] for part in parts], axis))
-    assert_same(slopes, jax.tree.map(jnp.add, *(part[1][0] for part in parts)))
+    first, rest = ([value[rows] for value in (x, viewdirs, pull)] for rows in (slice(1), slice(1, None)))
+    parts = [ask(params, *part) for part in (first, rest)]
+    close = {"rtol": 1e-5, "atol": 1e-5}
+    assert_same(answers, jax.tree.map(lambda *some: jnp.concatenate(some), *(part[0][1] for part in parts)))
+    assert_same(moves, jnp.concatenate([part[1][1] for part in parts]), **close)
+    assert_same(slopes, jax.tree.map(jnp.add, *(part[1][0] for part in parts)), **close)

@@ -12,7 +12,7 @@ from jaxnerf.core.encoding import encode_planes
 from jaxnerf.core.sampling import normal
 
 _COLLIDING = 512  # float32 numbers, 2 KiB
-_ASIDE = 32  # samples
+_ASIDE, _FEW = 32, 16  # samples; rays, of which one more would be much
 DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
 
 
@@ -132,16 +132,17 @@ def ask(network, params, x, viewdirs):
     Rows of features that are a multiple of 2 KiB long share few places of a CPU's cache, by which a product
     takes up to twice as long: then it is asked for one ray more, or for a few samples.
     """
-    shape = x.shape[:-1]
-    count = math.prod(shape)
-    if not count or count % _COLLIDING:
+    *leading, samples = shape = x.shape[:-1]
+    rays = math.prod(leading)
+    if not rays * samples or rays * samples % _COLLIDING:
         return network.apply({"params": params}, x, viewdirs)
-    by_ray = viewdirs.shape[-2] < shape[-1]
-    rays, samples = (count // shape[-1], shape[-1]) if by_ray else (1, count)
-    viewdirs = jnp.broadcast_to(viewdirs, (*shape[:-1], viewdirs.shape[-2], 3))
-    more = ((0, 1), (0, 0), (0, 0)) if by_ray else ((0, 0), (0, _ASIDE), (0, 0))
-    x, viewdirs = (jnp.pad(value.reshape(rays, -1, 3), more) for value in (x, viewdirs))
-    density, rgb = network.apply({"params": params}, x, viewdirs)
+    more = (0, _ASIDE) if rays < _FEW else (1, 0)
+
+    def pad(vectors):
+        vectors = jnp.broadcast_to(vectors, (*leading, *vectors.shape[-2:])).reshape(rays, -1, 3)
+        return jnp.pad(vectors, [(0, more[0]), (0, more[1] * (vectors.shape[1] > 1)), (0, 0)])
+
+    density, rgb = network.apply({"params": params}, pad(x), pad(viewdirs))
     return density[:rays, :samples].reshape(shape), rgb[:rays, :samples].reshape(*shape, 3)
 
 
