@@ -129,8 +129,8 @@ class Dense(linen.Module):
 def ask(network, params, x, viewdirs):
     """Returns a network's [..., S] and [..., S, 3] for x [..., S, 3] and viewdirs [..., 1 or S, 3].
 
-    Rows of features that are a multiple of 2 KiB long share few places of a CPU's cache, by which a product
-    takes up to twice as long: then it is asked for one ray more, or for a few samples.
+    Rows of features that are a multiple of 2 KiB long share few places of a CPU's cache, which slows each
+    product down: then it is asked for one ray more, or, of few rays, for a few samples more of each.
     """
     *leading, samples = shape = x.shape[:-1]
     rays = math.prod(leading)
