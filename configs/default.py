@@ -104,6 +104,9 @@ def get_config():
                 "beta1": 0.9,
                 "beta2": 0.999,
                 "epsilon": 1e-8,
+                # > 0: matrices of layers move by Muon in place of Adam, in a step by this times the learning
+                # rate (root mean square); 0.2 is about what Adam moves them by
+                "muon": 0.0,
                 # > 0: what is rendered are parameters averaged over about the last power-th of all steps
                 "average_power": 0.0,
                 "log_every": 100,  # steps

@@ -13,9 +13,9 @@ import numpy as np
 import optax
 
 from jaxnerf.data import batches
-from jaxnerf.engine.averaging import averaged
 from jaxnerf.engine.fit import OUTSIDE, SIZES
 from jaxnerf.engine.models import Model, hierarchical_model
+from jaxnerf.engine.optimizer import make_optimizer
 from jaxnerf.engine.packed import packed_model, skip_empty_afterwards
 from jaxnerf.engine.scenes import background_of, load_views, settle
 from jaxnerf.engine.space import contracted_field, make_space
@@ -52,7 +52,7 @@ def build(config):
         ValueError: names the field that holds what cannot be built.
     """
     model = build_model(config)
-    schedule = _schedule(config.train)
+    optimizer, schedule = make_optimizer(config.train)
     options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
     batching = {"batching": config.train.batching}
 
@@ -66,7 +66,7 @@ def build(config):
         raise ValueError(f"train.batching is {config.train.batching!r}, wanted one of {batches.BATCHINGS}")
     return Experiment(
         model=model,
-        optimizer=_optimizer(config.train, schedule),
+        optimizer=optimizer,
         schedule=schedule,
         load_views=functools.partial(load_views, config.data),
         draw=draw,
@@ -234,19 +234,3 @@ def _survey(config, model, views):
         )
     seed = np.uint32(config.seed % 2**32)
     return possible, TrainData(seed, dataclasses.replace(views, mask=None), live, cells)  # live has the mask
-
-
-def _optimizer(train, schedule):
-    adam = optax.adam(schedule, train.beta1, train.beta2, train.epsilon)
-    power = train.get("average_power", 0.0)
-    if power < 0:
-        raise ValueError(f"train.average_power is {power}, wanted more than 0, or 0 for none")
-    return averaged(adam, power) if power else adam
-
-
-def _schedule(train):
-    ratio = train.lr_final / train.lr_init
-    decay = optax.exponential_decay(train.lr_init, train.lr_steps, ratio, end_value=train.lr_final)
-    if not train.warmup_steps:
-        return decay
-    return lambda step: decay(step) * jnp.minimum(1.0, (step + 1) / train.warmup_steps)

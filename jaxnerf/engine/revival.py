@@ -91,7 +91,12 @@ def make_revive(model, optimizer, seed):
         anew = {name: jax.tree.map(lambda _, name=name: name in names, tree) for name, tree in fresh.items()}
         # As init makes it: moments of 0, but an average begins at the parameters.
         begins = optax.tree.map_params(
-            optimizer, lambda _, anew: anew, state.opt_state, anew, transform_non_params=lambda _: False
+            optimizer,
+            lambda old, anew: old if _is_masked(old) else anew,
+            state.opt_state,
+            anew,
+            transform_non_params=lambda _: False,
+            is_leaf=_is_masked,
         )
         forgotten = dict.fromkeys((f"dead_{name}" for name in names), jnp.zeros((), jnp.int32))
         revived = state.counters["revived"] + len(names)
@@ -110,3 +115,8 @@ def make_revive(model, optimizer, seed):
         return jax.jit(revive, static_argnums=1, out_shardings=places)(state, names)
 
     return placed
+
+
+def _is_masked(part):
+    """Returns whether this stands for parameters that another part of the optimiser moves."""
+    return isinstance(part, optax.MaskedNode)

@@ -25,6 +25,7 @@ SINCE = {
     "data.world": None,
     "data.num_views": 0,
     "train.average_power": 0.0,
+    "train.muon": 0.0,
     "space.outside": "nothing",
     "coarse.encode": True,
     "fine.encode": True,
