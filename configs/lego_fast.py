@@ -15,6 +15,7 @@ def get_config():
     train = config.train
     train.batch_size, train.max_steps, train.lr_steps = 512, 0, 0
     train.lr_init, train.lr_final, train.warmup_steps = 5e-3, 1.5e-4, 50
+    train.muon = 0.6
     train.beta2, train.epsilon = 0.99, 1e-15  # a feature that is rarely seen moves as far as any other
     train.average_power = 10.0
     train.log_every, train.save_every = 200, 4000

@@ -1,16 +1,14 @@
 """The renderer that asks only where there is something: the samples of many rays, packed into one pool."""
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxnerf.core import compositing, occupancy, rendering
+from jaxnerf.core import bits, compositing, lanes, occupancy, rendering
 from jaxnerf.core.structs import Rendering, check_shapes
 
 _HARDLY = 1e-3  # of the light
-_AT_LEAST = 4  # samples of a ray asked in a row: fewer make more rounds, more are asked in vain
 
 
 def render_packed(scene, grid, rays, samples, *, capacity, stop=0.0, background=None):
@@ -20,14 +18,15 @@ def render_packed(scene, grid, rays, samples, *, capacity, stop=0.0, background=
     with the skipping and the early stop of arXiv:2201.05989).
 
     Args:
-        scene: see render_samples; it is asked for [1, K, 3] positions with as many directions.
+        scene: see render_samples; it is asked for [1, K, 3] positions with as many directions, or, with a
+            stop, for a few in a row of many rays.
         grid: Grid, outside whose box there is nothing. None where the samples are masked already.
         rays: Rays [...].
         samples: Samples [..., S]; rules "segments" and "points".
         capacity: K >= 1, the size of the pool.
         stop: 0 asks all samples at once; those that do not fit are left out and counted. Greater than 0,
-            the pool is filled again and again with the next samples of the rays that still let more than
-            this through: none is left out, and where colours are in [0, 1] the colour is within stop of the
+            as many as fit are asked again and again, the next ones of rays that still let more than this
+            through: none is left out, and where colours are in [0, 1] the colour is within stop of the
             whole one. That is for rendering: it has no reverse mode.
         background: see render_samples.
 
@@ -39,13 +38,14 @@ def render_packed(scene, grid, rays, samples, *, capacity, stop=0.0, background=
     """
     shape = rays.near.shape
     rays, samples = _checked("render_packed", rays, samples, capacity)
-    queue = _queue(grid, rays, samples)
-    ask = functools.partial(_ask, scene, rays, samples)
+    words = _words(grid, rays, samples)
     if stop > 0:
-        sums, dropped = _until_stopped(queue, ask, capacity, stop), jnp.zeros_like(queue.count)
+        options = {"capacity": capacity, "stop": stop}
+        sums = lanes.sum_until_stopped("render_packed", scene, rays, samples, words, **options)
+        dropped = jnp.zeros_like(rays.near, jnp.int32)
     else:
-        slot = jnp.arange(capacity)
-        sums = ask(_fill(queue, slot, slot < queue.ends[-1]))
+        queue, slot = _queue(words), jnp.arange(capacity)
+        sums = _ask(scene, rays, samples, _fill(queue, slot, slot < queue.ends[-1]))
         dropped = queue.count - jnp.clip(capacity - _first(queue), 0, queue.count)
     return _rendering(sums, dropped, rays.far, shape, background)
 
@@ -71,7 +71,7 @@ def needed_samples(scene, grid, rays, samples, *, error, capacity, background=No
     """
     name, shape = "needed_samples", samples.t.shape
     rays, samples = _checked(name, rays, samples, capacity)
-    queue = _queue(grid, rays, samples)
+    queue = _queue(_words(grid, rays, samples))
 
     def ask_round(index, answers):
         slot = index * capacity + jnp.arange(capacity)
@@ -124,15 +124,6 @@ class _Pool(NamedTuple):
     used: jax.Array  # [K] bool, False for the room that is left
 
 
-class _Sums(NamedTuple):
-    """What the samples asked so far add up to, for each ray."""
-
-    optical_depth: jax.Array  # [B]
-    rgb: jax.Array  # [B, 3]
-    depth: jax.Array  # [B] sum of w t
-    disparity: jax.Array  # [B] sum of w / t
-
-
 def _checked(function, rays, samples, capacity):
     """Returns Rays [B] and Samples [B, S] of any leading axes; ValueError on what cannot be packed."""
     if samples.rule == "gauss":
@@ -146,14 +137,14 @@ def _checked(function, rays, samples, capacity):
     return jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[leading:]), (rays, samples))
 
 
-def _queue(grid, rays, samples):
+def _words(grid, rays, samples):
+    """Returns [B, W], which samples count."""
     kept = ~(samples.delta <= 0)
-    if grid is not None:
-        kept &= occupancy.occupied_at(grid, rays, samples.t)
-    kept = jnp.pad(kept, ((0, 0), (0, -kept.shape[-1] % 32))).reshape(kept.shape[0], -1, 32)
-    # Compacting words in place of samples is what makes this cheap: a scatter of all would take longest.
-    words = (kept * (jnp.uint32(1) << jnp.arange(32, dtype=jnp.uint32))[None, None]).sum(-1, dtype=jnp.uint32)
-    sizes = jax.lax.population_count(words).astype(jnp.int32)
+    return bits.pack(kept if grid is None else kept & occupancy.occupied_at(grid, rays, samples.t))
+
+
+def _queue(words):
+    sizes = bits.count(words)
     return _Queue(words.reshape(-1), jnp.cumsum(sizes.reshape(-1)), sizes.sum(-1))
 
 
@@ -166,21 +157,10 @@ def _fill(queue, place, used):
     """Returns the Pool of the samples at places [K] in the queue."""
     word = jnp.searchsorted(queue.ends, place, side="right", method="scan_unrolled")
     word = jnp.minimum(word, queue.words.size - 1)
-    bits = queue.words[word]
-    before = queue.ends[word] - jax.lax.population_count(bits).astype(jnp.int32)
+    flags = queue.words[word]
+    before = queue.ends[word] - bits.count(flags)
     width = queue.words.size // queue.count.size
-    return _Pool(word % width * 32 + _nth_bit(bits, place - before), word // width, used)
-
-
-def _nth_bit(words, n):
-    """Returns the place of the n-th bit that is set, the lowest being n = 0."""
-    place = jnp.zeros_like(n)
-    for half in (16, 8, 4, 2, 1):
-        low = (words >> place.astype(jnp.uint32)) & jnp.uint32(2**half - 1)
-        count = jax.lax.population_count(low).astype(jnp.int32)
-        above = n >= count
-        n, place = n - jnp.where(above, count, 0), place + jnp.where(above, half, 0)
-    return place
+    return _Pool(word % width * 32 + bits.nth(flags, place - before), word // width, used)
 
 
 def _answers(function, scene, rays, samples, pool):
@@ -194,7 +174,7 @@ def _answers(function, scene, rays, samples, pool):
 
 
 def _ask(scene, rays, samples, pool):
-    """Returns the Sums of a pool, as if nothing lay before it."""
+    """Returns the Sums [B] of a pool."""
     t, density, rgb = _answers("render_packed", scene, rays, samples, pool)
     delta = jnp.where(pool.used, samples.delta[pool.ray, pool.source], 0)
     length = rendering.world_length(delta[:, None], rays.directions[pool.ray])[:, 0]
@@ -203,57 +183,24 @@ def _ask(scene, rays, samples, pool):
     colours = [rgb[:, axis] * weights for axis in range(3)]
     parts = [optical_depth, *colours, weights * t, compositing.share_over(weights, t)]
     sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), pool.ray, rays.near.size, indices_are_sorted=True)
-    return _Sums(sums[:, 0], sums[:, 1:4], sums[:, 4], sums[:, 5])
-
-
-def _until_stopped(queue, ask, capacity, stop):
-    """Returns the Sums of all rays, each asked until no more than stop passes, or to its end."""
-
-    first = _first(queue)
-
-    def fill(done, taken):
-        ends = jnp.cumsum(taken)
-        ray = jnp.repeat(jnp.arange(taken.size), taken, total_repeat_length=capacity)
-        slot = jnp.arange(capacity)
-        return _fill(queue, (first + done - (ends - taken))[ray] + slot, slot < ends[-1])
-
-    def waits(done, sums):
-        return (done < queue.count) & (jnp.exp(-sums.optical_depth) > stop)
-
-    def step(state):
-        done, sums = state
-        waiting = waits(done, sums)
-        # A few samples of each ray, as the next may not be needed; the last rays wait where all is taken.
-        quota = jnp.maximum(capacity // jnp.maximum(waiting.sum(), 1), _AT_LEAST)
-        taken = jnp.where(waiting, jnp.minimum(queue.count - done, quota), 0)
-        taken = jnp.clip(capacity - (jnp.cumsum(taken) - taken), 0, taken)
-        more = ask(fill(done, taken))
-        light = jnp.exp(-sums.optical_depth)
-        return done + taken, _Sums(
-            optical_depth=sums.optical_depth + more.optical_depth,
-            rgb=sums.rgb + light[:, None] * more.rgb,
-            depth=sums.depth + light * more.depth,
-            disparity=sums.disparity + light * more.disparity,
-        )
-
-    done = jnp.zeros_like(queue.count)
-    zeros = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(lambda: ask(fill(done, done))),
+    return lanes.Sums(
+        passing=jnp.exp(-sums[:, 0]),
+        opacity=-jnp.expm1(-sums[:, 0]),
+        rgb=sums[:, 1:4],
+        depth=sums[:, 4],
+        disparity=sums[:, 5],
     )
-    return jax.lax.while_loop(lambda state: waits(*state).any(), step, (done, zeros))[1]
 
 
 def _rendering(sums, dropped, far, shape, background):
-    passing = jnp.exp(-sums.optical_depth)
     rgb = sums.rgb
     if background is not None:
         behind = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), (*shape, 3)).reshape(-1, 3)
-        rgb = rgb + passing[:, None] * behind
+        rgb = rgb + sums.passing[:, None] * behind
     flat = Rendering(
         rgb=rgb,
-        opacity=-jnp.expm1(-sums.optical_depth),
-        depth=sums.depth + compositing.share_of(passing, far),
+        opacity=sums.opacity,
+        depth=sums.depth + compositing.share_of(sums.passing, far),
         disparity=sums.disparity,
         weights=None,
         dropped=dropped,

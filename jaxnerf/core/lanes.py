@@ -1,0 +1,107 @@
+"""Rays that are asked until they stop, in lanes: where a ray has ended, its lane takes the next one."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxnerf.core import bits, compositing, rendering
+
+_IN_A_ROW = 4  # samples of a ray asked at once: fewer make more rounds, more are asked in vain
+
+
+class Sums(NamedTuple):
+    """What the samples of rays add up to."""
+
+    passing: jax.Array  # [B] what no sample stops
+    opacity: jax.Array  # [B] 1 - passing, with all its digits
+    rgb: jax.Array  # [B, 3]
+    depth: jax.Array  # [B] sum of w t
+    disparity: jax.Array  # [B] sum of w / t
+
+
+class _Lanes(NamedTuple):
+    """What L lanes are at."""
+
+    ray: jax.Array  # [L] int32; B: none
+    done: jax.Array  # [L] int32, samples of it that were asked
+    sums: jax.Array  # [7, L], the columns of Sums
+
+
+def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
+    """Returns the Sums of rays, each asked from near to far until no more than stop passes, or to its end.
+
+    Args:
+        function: whose errors these are.
+        scene: see render_samples; it is asked for [L, N, 3] positions with [L, 1, 3] directions.
+        rays: Rays [B].
+        samples: Samples [B, S].
+        words: [B, W] uint32, which samples count, see bits.pack.
+        capacity: samples asked at once, L N at most.
+        stop: > 0.
+    """
+    ray_count = rays.near.size
+    lane_count = max(min(capacity // _IN_A_ROW, ray_count), 1)
+    row = jnp.arange(capacity // lane_count)[None]
+    up_to = jnp.cumsum(bits.count(words), axis=-1)
+    count = up_to[:, -1]
+    # Long rays come first, or a few lanes would go on for long where all others have ended.
+    order = jnp.argsort(-count // row.size)
+    waiting = (count > 0).sum()
+    start = jnp.zeros((7, 1)).at[0].set(1)
+
+    def take(lanes, taken):
+        """Returns the Lanes, of which those without a ray take the next, and how many are taken then."""
+        free = lanes.ray == ray_count
+        place = taken + jnp.cumsum(free) - free
+        following = jnp.where(place < waiting, order.at[place].get(mode="clip"), ray_count)
+        ray, done = jnp.where(free, following, lanes.ray), jnp.where(free, 0, lanes.done)
+        return _Lanes(ray, done, jnp.where(free[None], start, lanes.sums)), taken + free.sum()
+
+    def ask(lanes):
+        """Returns [7, L] of the next samples, as if nothing lay before them."""
+        ray = jnp.minimum(lanes.ray, ray_count - 1)
+        n = lanes.done[:, None] + row
+        used = (n < count[ray, None]) & (lanes.ray < ray_count)[:, None]
+        word = (up_to[ray, None] <= n[..., None]).sum(axis=-1)
+        word = jnp.minimum(word, words.shape[-1] - 1)
+        flags, end = words[ray[:, None], word], up_to[ray[:, None], word]
+        source = 32 * word + bits.nth(flags, n - end + bits.count(flags))
+        t, delta = (jnp.where(used, leaf[ray[:, None], source], 0) for leaf in (samples.t, samples.delta))
+        own = jax.tree.map(lambda leaf: leaf[ray], rays)
+        x = rendering.positions(own, t)
+        density, rgb = scene(x, own.viewdirs[:, None])
+        rendering.check_answer(function, density, rgb, x)
+        density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
+        length = rendering.world_length(delta, own.directions)
+        weights = compositing.weights_from_density(density, length)
+        return jnp.stack(
+            [
+                compositing.transmittance(density, length),
+                compositing.opacity(density, length),
+                *compositing.composite(weights, rgb).T,
+                compositing.share_of(weights, t).sum(axis=-1),
+                compositing.expected_disparity(weights, t),
+            ]
+        )
+
+    def step(state):
+        lanes, taken, ended = state
+        lanes, taken = take(lanes, taken)
+        more, light = ask(lanes), lanes.sums[:1]
+        sums = jnp.concatenate([light * more[:1], lanes.sums[1:] + light * more[1:]])
+        done = lanes.done + row.size
+        ends = (done >= count.at[lanes.ray].get(mode="clip")) | ~(sums[0] > stop)  # NaN ends, and shows
+        ended = ended.at[:, jnp.where(ends, lanes.ray, ray_count)].set(sums, mode="drop")
+        return _Lanes(jnp.where(ends, ray_count, lanes.ray), done, sums), taken, ended
+
+    def goes_on(state):
+        lanes, taken, _ = state
+        return (taken < waiting) | (lanes.ray < ray_count).any()
+
+    nobody = jnp.full(lane_count, ray_count)
+    lanes = _Lanes(nobody, jnp.zeros_like(nobody), jnp.broadcast_to(start, (7, lane_count)))
+    ended = jnp.broadcast_to(start, (7, ray_count))
+    ended = jax.lax.while_loop(goes_on, step, (lanes, jnp.zeros_like(waiting), ended))[2]
+    passing, opacity, *rgb, depth, disparity = ended
+    return Sums(passing, opacity, jnp.stack(rgb, axis=-1), depth, disparity)
