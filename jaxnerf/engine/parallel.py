@@ -69,7 +69,7 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     hosts.check_same("data or configuration", data)
     data = place(data, everywhere)
     with ThreadPoolExecutor(1) as pool:
-        made = pool.submit(make)
+        made = pool.submit(_to_plain_code(make, devices[0]))
         if mode == "pmap" and jax.process_count() > 1:  # whose pmap JAX compiles at its first call only
             compiled = _with_state_everywhere(jitted, everywhere)
         else:
@@ -94,6 +94,12 @@ def _sharded(train_step, mesh):
         check_vma=False,
     )
     return jax.jit(sharded, donate_argnums=0)
+
+
+def _to_plain_code(function, device):
+    """Returns a jitted function that runs once: to make its code fast would take longer than to run it."""
+    plain = {"xla_backend_optimization_level": 0} if device.platform == "cpu" else None
+    return jax.jit(function, compiler_options=plain)
 
 
 def _with_state_everywhere(run, everywhere):
