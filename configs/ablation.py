@@ -2,7 +2,7 @@
 
 Two networks alike, half as deep and a fifth as wide. As pixels are eight times as large, an eighth of the
 samples, which are then as many pixels apart, and three octaves less. Softplus and the learning rate are
-those of lego_small.py.
+those of lego_small.py; the paper's Adam moves all of it.
 """
 
 from configs import lego_small
@@ -18,5 +18,5 @@ def get_config():
     config.sampling.rule = "segments"
     train = config.train
     train.max_steps, train.lr_steps, train.max_seconds = 1000, 1000, 0.0
-    train.save_every = 250
+    train.save_every, train.muon = 250, 0.0
     return config

@@ -95,7 +95,7 @@ def report(scores, *, again, four, drift, paper_drift, steps):
         same = f"{again.differ:,} of {again.count:,} parameters differ, by up to {again.largest:.1e}"
     listed = ", ".join(f"{value:.2f}" for value in scores.values())
     return [
-        f"`quickstart.py` for {steps:,} steps:",
+        f"`quickstart.py` by Adam alone for {steps:,} steps:",
         "",
         f"- the same seed in two processes: {same};",
         f"- {len(scores)} seeds: {mean:.2f} +- {deviation:.2f} dB ({listed});",
@@ -114,7 +114,7 @@ def _drifted(drift):
 
 def train(folder, seed, steps, adam):
     """Trains and scores a run, with a checkpoint at DRIFT. adam: "own", or "paper": its first DRIFT steps."""
-    changes = {"train.save_every": DRIFT, "train.keep": 10**6}
+    changes = {"train.save_every": DRIFT, "train.keep": 10**6, "train.muon": 0.0}  # by the paper's Adam alone
     if adam == "paper":
         paper = paired_runs.configuration("default").train
         changes |= {"train.max_steps": DRIFT, **{f"train.{name}": paper[name] for name in _PAPER_ADAM}}

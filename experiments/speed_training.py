@@ -24,6 +24,11 @@ _EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "space.masks": False,
 _EMBEDDED["space.step"] = 0.03
 _FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.background": "none"}
 _FERN |= {"space.masks": False, "space.step": 2 / 133, "fine.num_freqs": 7}
+_ADAM = {
+    "train.muon": 0.0,
+    "train.lr_init": 8e-3,
+    "train.lr_final": 3e-4,
+}  # whose best rate is half of Muon's
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
 CURVES = {
     "grid": _curve("lego_fast", (15, 30, 45, 60, 90, 120, 180, 300)),
@@ -31,6 +36,7 @@ CURVES = {
     "grid 200": _curve("lego_fast", (30, 60, 100, 180, 360), **{"data.factor": 4}),
     "grid 400": _curve("lego_fast", (60, 150, 300, 600), **{"data.factor": 2}),
     "small network": _curve("lego_mlp_fast", (30, 60, 120, 240, 480)),
+    "small network by Adam": _curve("lego_mlp_fast", (30, 60, 120, 240, 480), **_ADAM),
     "small network everywhere": _curve("lego_mlp_fast", (120, 480), **_DENSE),
     "embedded": _curve("lego_mlp_fast", (60, 180), **_EMBEDDED),
     "embedded everywhere": _curve("lego_mlp_fast", (60, 180), **_EMBEDDED | _DENSE),
