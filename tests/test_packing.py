@@ -134,6 +134,14 @@ def test_what_stops_early_is_within_its_bound_and_drops_nothing(rays, samples, s
     np.testing.assert_allclose(got.rgb[still], want.rgb[still], atol=1e-6)
 
 
+@pytest.mark.parametrize("capacity", [1, 30])
+def test_lanes_fewer_than_rays_leave_nothing_out(rays, samples, capacity):
+    """In all outputs, and whichever lane a ray is in: one takes them all, or seven some each."""
+    grid = checked_grid()
+    got = packed(grid, rays, samples, capacity=capacity, stop=1e-30)
+    assert_close(got, packed(grid, rays, samples, capacity=RAYS * SEGMENTS), atol=2e-6)
+
+
 def test_a_small_pool_asks_for_less_than_all():
     """Behind a wall nothing is asked once the pool has come to it."""
     asked = []

@@ -48,21 +48,12 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
     # Long rays come first, or a few lanes would go on for long where all others have ended.
     order = jnp.argsort(-count // row.size)
     waiting = (count > 0).sum()
-    start = jnp.zeros((7, 1)).at[0].set(1)
 
-    def take(lanes, taken):
-        """Returns the Lanes, of which those without a ray take the next, and how many are taken then."""
-        free = lanes.ray == ray_count
-        place = taken + jnp.cumsum(free) - free
-        following = jnp.where(place < waiting, order.at[place].get(mode="clip"), ray_count)
-        ray, done = jnp.where(free, following, lanes.ray), jnp.where(free, 0, lanes.done)
-        return _Lanes(ray, done, jnp.where(free[None], start, lanes.sums)), taken + free.sum()
-
-    def ask(lanes):
-        """Returns [7, L] of the next samples, as if nothing lay before them."""
-        ray = jnp.minimum(lanes.ray, ray_count - 1)
-        n = lanes.done[:, None] + row
-        used = (n < count[ray, None]) & (lanes.ray < ray_count)[:, None]
+    def ask(ray, done):
+        """Returns [7, L] of the next samples of rays [L], as if nothing lay before them."""
+        n = done[:, None] + row
+        used = n < count.at[ray, None].get(mode="fill", fill_value=0)
+        ray = jnp.minimum(ray, ray_count - 1)
         word = (up_to[ray, None] <= n[..., None]).sum(axis=-1)
         word = jnp.minimum(word, words.shape[-1] - 1)
         flags, end = words[ray[:, None], word], up_to[ray[:, None], word]
@@ -85,10 +76,22 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
             ]
         )
 
+    nobody = jnp.full(lane_count, ray_count)
+    none_done = jnp.zeros_like(nobody)
+    start = jnp.zeros((7, 1), jax.eval_shape(ask, nobody, none_done).dtype).at[0].set(1)
+
+    def take(lanes, taken):
+        """Returns the Lanes, of which those without a ray take the next, and how many are taken then."""
+        free = lanes.ray == ray_count
+        place = taken + jnp.cumsum(free) - free
+        following = jnp.where(place < waiting, order.at[place].get(mode="clip"), ray_count)
+        ray, done = jnp.where(free, following, lanes.ray), jnp.where(free, 0, lanes.done)
+        return _Lanes(ray, done, jnp.where(free[None], start, lanes.sums)), taken + free.sum()
+
     def step(state):
         lanes, taken, ended = state
         lanes, taken = take(lanes, taken)
-        more, light = ask(lanes), lanes.sums[:1]
+        more, light = ask(lanes.ray, lanes.done), lanes.sums[:1]
         sums = jnp.concatenate([light * more[:1], lanes.sums[1:] + light * more[1:]])
         done = lanes.done + row.size
         ends = (done >= count.at[lanes.ray].get(mode="clip")) | ~(sums[0] > stop)  # NaN ends, and shows
@@ -99,8 +102,7 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
         lanes, taken, _ = state
         return (taken < waiting) | (lanes.ray < ray_count).any()
 
-    nobody = jnp.full(lane_count, ray_count)
-    lanes = _Lanes(nobody, jnp.zeros_like(nobody), jnp.broadcast_to(start, (7, lane_count)))
+    lanes = _Lanes(nobody, none_done, jnp.broadcast_to(start, (7, lane_count)))
     ended = jnp.broadcast_to(start, (7, ray_count))
     ended = jax.lax.while_loop(goes_on, step, (lanes, jnp.zeros_like(waiting), ended))[2]
     passing, opacity, *rgb, depth, disparity = ended
