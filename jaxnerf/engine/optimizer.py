@@ -45,7 +45,8 @@ def with_muon(optimizer, schedule, size):
 
 def _labels(params):
     def label(path, leaf):
-        return "muon" if path[-1].key == "kernel" and min(leaf.shape) >= _FEWEST else "other"
+        matrix = getattr(path[-1], "key", None) == "kernel" and leaf.ndim == 2
+        return "muon" if matrix and min(leaf.shape) >= _FEWEST else "other"
 
     return jax.tree_util.tree_map_with_path(label, params)
 
