@@ -50,31 +50,11 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
     waiting = (count > 0).sum()
 
     def ask(ray, done):
-        """Returns [7, L] of the next samples of rays [L], as if nothing lay before them."""
         n = done[:, None] + row
         used = n < count.at[ray, None].get(mode="fill", fill_value=0)
         ray = jnp.minimum(ray, ray_count - 1)
-        word = (up_to[ray, None] <= n[..., None]).sum(axis=-1)
-        word = jnp.minimum(word, words.shape[-1] - 1)
-        flags, end = words[ray[:, None], word], up_to[ray[:, None], word]
-        source = 32 * word + bits.nth(flags, n - end + bits.count(flags))
-        t, delta = (jnp.where(used, leaf[ray[:, None], source], 0) for leaf in (samples.t, samples.delta))
-        own = jax.tree.map(lambda leaf: leaf[ray], rays)
-        x = rendering.positions(own, t)
-        density, rgb = scene(x, own.viewdirs[:, None])
-        rendering.check_answer(function, density, rgb, x)
-        density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
-        length = rendering.world_length(delta, own.directions)
-        weights = compositing.weights_from_density(density, length)
-        return jnp.stack(
-            [
-                compositing.transmittance(density, length),
-                compositing.opacity(density, length),
-                *compositing.composite(weights, rgb).T,
-                compositing.share_of(weights, t).sum(axis=-1),
-                compositing.expected_disparity(weights, t),
-            ]
-        )
+        own, some = _nth_samples(rays, samples, words, up_to, ray, n, used)
+        return _sum_part(function, scene, own, some, used)
 
     nobody = jnp.full(lane_count, ray_count)
     none_done = jnp.zeros_like(nobody)
@@ -107,3 +87,33 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
     ended = jax.lax.while_loop(goes_on, step, (lanes, jnp.zeros_like(waiting), ended))[2]
     passing, opacity, *rgb, depth, disparity = ended
     return Sums(passing, opacity, jnp.stack(rgb, axis=-1), depth, disparity)
+
+
+def _nth_samples(rays, samples, words, up_to, ray, n, used):
+    """Returns Rays [L], those of lanes, and t and delta [L, N] of each one's n-th samples that count."""
+    word = jnp.minimum((up_to[ray, None] <= n[..., None]).sum(axis=-1), words.shape[-1] - 1)
+    ray = ray[:, None]
+    flags, end = words[ray, word], up_to[ray, word]
+    source = 32 * word + bits.nth(flags, n - end + bits.count(flags))
+    t, delta = (jnp.where(used, leaf[ray, source], 0) for leaf in (samples.t, samples.delta))
+    return jax.tree.map(lambda leaf: leaf[ray[:, 0]], rays), (t, delta)
+
+
+def _sum_part(function, scene, rays, samples, used):
+    """Returns [7, L], the columns of Sums of a few samples in a row, as if nothing lay before them."""
+    t, delta = samples
+    x = rendering.positions(rays, t)
+    density, rgb = scene(x, rays.viewdirs[:, None])
+    rendering.check_answer(function, density, rgb, x)
+    density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
+    length = rendering.world_length(delta, rays.directions)
+    weights = compositing.weights_from_density(density, length)
+    return jnp.stack(
+        [
+            compositing.transmittance(density, length),
+            compositing.opacity(density, length),
+            *compositing.composite(weights, rgb).T,
+            compositing.share_of(weights, t).sum(axis=-1),
+            compositing.expected_disparity(weights, t),
+        ]
+    )
