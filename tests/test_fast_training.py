@@ -46,6 +46,7 @@ def tiny_config():
     train = config.train
     train.batch_size, train.lr_steps, train.warmup_steps = BATCH, STEPS, 10
     train.lr_init, train.lr_final, train.beta2, train.epsilon = 2e-2, 2e-3, 0.99, 1e-15
+    train.muon = 0.15  # of so high a rate, as much as lego_fast.py has
     return config
 
 

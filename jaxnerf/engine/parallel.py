@@ -69,7 +69,7 @@ def compile_step(train_step, state, data, *, batch_size, block_size=0, samples_p
     hosts.check_same("data or configuration", data)
     data = place(data, everywhere)
     with ThreadPoolExecutor(1) as pool:
-        made = pool.submit(_to_plain_code(make, devices[0]))
+        made = pool.submit(_to_plain_code(state, devices[0]) if callable(state) else make)
         if mode == "pmap" and jax.process_count() > 1:  # whose pmap JAX compiles at its first call only
             compiled = _with_state_everywhere(jitted, everywhere)
         else:
