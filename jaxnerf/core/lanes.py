@@ -31,6 +31,8 @@ class _Lanes(NamedTuple):
 def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
     """Returns the Sums of rays, each asked from near to far until no more than stop passes, or to its end.
 
+    What would pass a ray that is stopped is taken to look like all that it has met: such a ray is opaque.
+
     Args:
         function: whose errors these are.
         scene: see render_samples; it is asked for [L, N, 3] positions with [L, 1, 3] directions.
@@ -74,7 +76,9 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
         more, light = ask(lanes.ray, lanes.done), lanes.sums[:1]
         sums = jnp.concatenate([light * more[:1], lanes.sums[1:] + light * more[1:]])
         done = lanes.done + row.size
-        ends = (done >= count.at[lanes.ray].get(mode="clip")) | ~(sums[0] > stop)  # NaN ends, and shows
+        stops = ~(sums[0] > stop)  # NaN stops, and shows
+        ends = stops | (done >= count.at[lanes.ray].get(mode="clip"))
+        sums = jnp.where(stops & (sums[1] > 0), _made_whole(sums), sums)
         ended = ended.at[:, jnp.where(ends, lanes.ray, ray_count)].set(sums, mode="drop")
         return _Lanes(jnp.where(ends, ray_count, lanes.ray), done, sums), taken, ended
 
@@ -87,6 +91,11 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
     ended = jax.lax.while_loop(goes_on, step, (lanes, jnp.zeros_like(waiting), ended))[2]
     passing, opacity, *rgb, depth, disparity = ended
     return Sums(passing, opacity, jnp.stack(rgb, axis=-1), depth, disparity)
+
+
+def _made_whole(sums):
+    """Returns sums [7, L] of stopped rays: what still passes is taken to look like the rest."""
+    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:] / sums[1:2]])
 
 
 def _nth_samples(rays, samples, words, up_to, ray, n, used):

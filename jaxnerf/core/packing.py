@@ -26,8 +26,9 @@ def render_packed(scene, grid, rays, samples, *, capacity, stop=0.0, background=
         capacity: K >= 1, the size of the pool.
         stop: 0 asks all samples at once; those that do not fit are left out and counted. Greater than 0,
             as many as fit are asked again and again, the next ones of rays that still let more than this
-            through: none is left out, and where colours are in [0, 1] the colour is within stop of the
-            whole one. That is for rendering: it has no reverse mode.
+            through: none is left out. What is behind a stopped ray is taken to look like what it has met:
+            where colours are in [0, 1] the colour is within stop of the whole one, and so is the opacity,
+            which is 1. That is for rendering: it has no reverse mode.
         background: see render_samples.
 
     Returns:

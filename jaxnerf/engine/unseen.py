@@ -32,10 +32,11 @@ def may_meet(grid, rays, *, cell):
     count = math.ceil(math.hypot(*sides) / (1.99 * _BLOCK * min(cell)))
 
     def ask(index, met):
-        t, flat = inside.near + length * ((index + 0.5) / count), 0
+        t, places = inside.near + length * ((index + 0.5) / count), []
         for axis, (size, wide) in enumerate(zip(cell, blocks.shape, strict=True)):
             place = (rays.origins[..., axis] + t * rays.directions[..., axis] - grid.lower[axis]) / size
-            flat = flat * wide + jnp.clip((place / _BLOCK).astype(jnp.int32), 0, wide - 1)
+            places.append(jnp.clip((place / _BLOCK).astype(jnp.int32), 0, wide - 1))
+        flat = occupancy.flat_index(places, blocks.shape)
         return met | blocks.reshape(-1)[flat]
 
     met = jax.lax.fori_loop(0, count, ask, jnp.zeros(rays.near.shape, bool))
