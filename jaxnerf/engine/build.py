@@ -195,7 +195,7 @@ def _space(config, field):
 def samples_at_once(config):
     """Returns how many samples a picture's rounds ask where empty space is skipped."""
     # On a CPU activations stay in the cache; an accelerator is slow with little to do.
-    return config.eval.samples_at_once or (2**12 if jax.default_backend() == "cpu" else 2**17)
+    return config.eval.samples_at_once or (2**10 if jax.default_backend() == "cpu" else 2**17)
 
 
 def _view_options(config):

@@ -4,6 +4,7 @@ import functools
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jaxnerf.data.batches import random_rays
 from jaxnerf.engine import build, fit, workdir
@@ -54,7 +55,9 @@ def open_run(folder, config=None, *, data_dir=None, settings=None):
 
     @functools.cache
     def template():
-        return create_state(trained, experiment.optimizer, experiment.seed)
+        # Only shapes count, and zeros need no compiling.
+        shapes = jax.eval_shape(lambda: create_state(trained, experiment.optimizer, experiment.seed))
+        return jax.tree.map(lambda leaf: jax.device_put(np.zeros(leaf.shape, leaf.dtype)), shapes)
 
     @jax.jit
     def render(weights, rays):
