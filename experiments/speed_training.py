@@ -24,6 +24,10 @@ _EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "space.masks": False,
 _EMBEDDED["space.step"] = 0.03
 _FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.background": "none"}
 _FERN |= {"space.masks": False, "space.step": 2 / 133, "fine.num_freqs": 7}
+_FOX = {"data.format": "transforms", "data.dir": "fox"}
+# No look ever finds a cell empty, nothing is hidden, and the same pool takes all steps of fewer rays.
+_NO_LOOKS = {"space.update_every": 10**9, "space.hide_beyond": 0.0, "space.fog_until": 0}
+_NO_LOOKS |= {"space.samples_per_ray": 243, "train.batch_size": 43}
 # At the rate that lego_mlp_fast.py had before Muon.
 _ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4}
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
@@ -39,6 +43,8 @@ CURVES = {
     "embedded everywhere": _curve("lego_mlp_fast", (60, 180), **_EMBEDDED | _DENSE),
     "fern": _curve("lego_mlp_fast", (120, 300), **_FERN),
     "fern everywhere": _curve("lego_mlp_fast", (120, 300), **_FERN | _DENSE),
+    "fox": _curve("capture", (60, 120), **_FOX),
+    "fox everywhere": _curve("capture", (60, 120), **_FOX | _NO_LOOKS),
     "dense": _curve("lego_small", (60, 120, 300, 600)),
     "paper": _curve("default", (600, 1800), **_PAPER),
 }

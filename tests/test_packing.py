@@ -130,8 +130,9 @@ def test_what_stops_early_is_within_its_bound_and_drops_nothing(rays, samples, s
     got, want = packed(full_grid(), rays, samples, capacity=capacity, stop=stop), dense(rays, samples)
     assert np.abs(got.rgb - want.rgb).max() <= stop + 1e-6
     assert np.abs(got.opacity - want.opacity).max() <= stop + 1e-6 and not got.dropped.any()
-    still = 1 - got.opacity > stop
-    np.testing.assert_allclose(got.rgb[still], want.rgb[still], atol=1e-6)
+    stopped = got.opacity > 1 - 1e-6
+    assert stopped.any() == (stop > 1e-3) and (got.depth <= want.depth + 1e-5)[stopped].all()
+    np.testing.assert_allclose(got.rgb[~stopped], want.rgb[~stopped], atol=1e-6)
 
 
 @pytest.mark.parametrize("capacity", [1, 30])
