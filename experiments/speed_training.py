@@ -26,7 +26,7 @@ _FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.back
 _FERN |= {"space.masks": False, "space.step": 2 / 133, "fine.num_freqs": 7}
 _FOX = {"data.format": "transforms", "data.dir": "fox"}
 # No look ever finds a cell empty, nothing is hidden, and the same pool takes all steps of fewer rays.
-_NO_LOOKS = {"space.update_every": 10**9, "space.hide_beyond": 0.0, "space.fog_until": 0}
+_NO_LOOKS = {"space.update_every": 10**8, "space.hide_beyond": 0.0, "space.fog_until": 0}
 _NO_LOOKS |= {"space.samples_per_ray": 243, "train.batch_size": 43}
 # At the rate that lego_mlp_fast.py had before Muon.
 _ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4}
