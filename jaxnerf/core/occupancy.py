@@ -208,7 +208,7 @@ def flat_index(places, shape):
     """Returns the indices [...] among all cells of a shape (X, Y, Z) of places, three times [...] int32.
 
     It is a sum over a stack, as XLA ends a loop there on a CPU: where one loop finds cells and looks into
-    them, both take four times as long.
+    them, none of that is vectorised.
     """
     strides = jnp.array([shape[1] * shape[2], shape[2], 1]).reshape(3, *(1,) * places[0].ndim)
     return (jnp.stack(places) * strides).sum(axis=0)
