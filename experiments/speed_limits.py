@@ -106,15 +106,14 @@ def _rounds(model, weights, rays, options, capacity):
 
 
 def field_flops(params):
-    """Returns the operations of one sample: twice the multiply-adds of its products and interpolations."""
+    """Returns the operations of one sample: twice the multiply-adds of its products and interpolations.
+
+    The bottleneck is none of them: it is multiplied with the next layer, once for all samples.
+    """
     sizes = [
         leaf.size
         for path, leaf in jax.tree.leaves_with_path(params)
-        if leaf.ndim == 2 and not _is_table(path)
+        if leaf.ndim == 2 and not {"table", "bottleneck"} & {part.key for part in path}
     ]
     corners = 8 * params["kernel"].shape[0] if "table" in params else 0
     return 2 * (sum(sizes) + corners)
-
-
-def _is_table(path):
-    return path[-1].key == "table"

@@ -47,6 +47,7 @@ CURVES = {
     "fox everywhere": _curve("capture", (60, 120), **_FOX | _NO_LOOKS),
     "dense": _curve("lego_small", (60, 120, 300, 600)),
     "paper": _curve("default", (600, 1800), **_PAPER),
+    "paper skipping": _curve("default", (600, 1800), **_PAPER, **{"space.skip_empty": True}),
 }
 SEEDED = "grid"  # the curve that is run with several seeds
 

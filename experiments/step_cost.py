@@ -150,7 +150,7 @@ def _layers(network):
         layers["skip"] = (encoded, width)
     layers["density"] = (width, 1)
     if network.use_viewdirs:
-        layers |= {"bottleneck": (width, width), "view": (width, network.view_width)}
+        layers["view"] = (width, network.view_width)  # with the bottleneck, as no activation parts them
     return layers | {"rgb": (network.view_width if network.use_viewdirs else width, 3)}
 
 
@@ -167,7 +167,7 @@ def _products(kernels, x, blocks, layout):
             if layer == depth - 3 and "skip" in kernels:
                 hidden = hidden + product(kernels["skip"], x)
         density = product(kernels["density"], hidden)
-        for name in ("bottleneck", "view", "rgb"):
+        for name in ("view", "rgb"):
             hidden = product(kernels[name], hidden) if name in kernels else hidden
         return density, hidden
 

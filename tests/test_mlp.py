@@ -114,6 +114,18 @@ def test_without_view_directions_there_is_nothing_for_them():
         np.testing.assert_array_equal(a, b)
 
 
+def test_layers_with_no_activation_between_them_cost_no_sample_two_products():
+    width, view_width, samples = 64, 32, 2**12
+    field = mlp_field(depth=2, width=width, view_width=view_width, num_freqs=1, num_view_freqs=1)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    x, viewdirs = (jax.ShapeDtypeStruct((1, count, 3), jnp.float32) for count in (samples, 1))
+    flops = jax.jit(field.apply).lower(params, x, viewdirs).cost_analysis()["flops"]
+    products = samples * (9 * width + width**2 + width + width * view_width + 3 * view_width)
+    products += 9 * view_width + width**2 * view_width + width * view_width
+    others = flops - 2 * products
+    assert 0 < others < samples * width**2, "a product for each sample is more than there should be"
+
+
 @pytest.mark.parametrize("options", [{}, {"key": True}, {"density_noise": 1.0}])
 def test_noise_that_is_off_is_absent(options):
     assert "random_bits" not in _jaxpr(**options)

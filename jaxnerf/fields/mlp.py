@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen
 
 from jaxnerf.core.encoding import encode_planes
@@ -95,34 +96,51 @@ class MLP(linen.Module):
             # The direction is encoded and multiplied once a ray, and broadcast over its samples.
             directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
             directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
-            bottleneck = Dense(self.width, name="bottleneck")(*hidden).reshape(-1, *shape)
-            view = Dense(self.view_width, name="view")(bottleneck, directions)
+            bottleneck = Affine(self.width, name="bottleneck")(self.width)
+            features = hidden[0].reshape(-1, *shape)
+            view = Dense(self.view_width, name="view")(features, directions, before=bottleneck)
             hidden = (jax.nn.relu(view).reshape(self.view_width, -1),)
         rgb = Dense(3, name="rgb")(*hidden).astype(dtype)
         return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 
-class Dense(linen.Module):
+class Affine(linen.Module):
+    """The parameters of an affine layer."""
+
+    features: int
+
+    @linen.compact
+    def __call__(self, size):
+        """Returns kernel [size, features] and bias [features]."""
+        kernel = self.param("kernel", linen.initializers.glorot_uniform(), (size, self.features))
+        return kernel, self.param("bias", linen.initializers.zeros_init(), (self.features,))
+
+
+class Dense(Affine):
     """An affine layer on the concatenation of its inputs, which is never made.
 
     The kernel has a row a feature of the concatenation, so weights and initialisation are those of the
     plain layer.
     """
 
-    features: int
+    def __call__(self, *inputs, before=None):
+        """Returns [features, ...] for inputs [D_i, ...], whose axes of length 1 are broadcast.
 
-    @linen.compact
-    def __call__(self, *inputs):
-        """Returns [features, ...] for inputs [D_i, ...], whose axes of length 1 are broadcast."""
-        total_size = sum(value.shape[0] for value in inputs)
-        kernel = self.param("kernel", linen.initializers.glorot_uniform(), (total_size, self.features))
-        bias = self.param("bias", linen.initializers.zeros_init(), (self.features,))
-        first = 0
+        before: kernel [D_0, E] and bias [E] of an affine layer that the first input goes through. With no
+        activation between them, two layers are one, whose kernel costs less than a layer of all samples.
+        """
+        sizes = [value.shape[0] for value in inputs]
+        if before:
+            sizes[0] = before[1].size
+        kernel, bias = super().__call__(sum(sizes))
+        blocks = jnp.split(kernel, np.cumsum(sizes)[:-1])
+        if before:
+            first, highest = blocks[0], jax.lax.Precision.HIGHEST
+            bias = bias + jnp.matmul(before[1], first, precision=highest)
+            blocks[0] = jnp.matmul(before[0], first, precision=highest)
         total = bias.astype(inputs[0].dtype).reshape(-1, *(1,) * (inputs[0].ndim - 1))
-        for value in inputs:
-            rows = jax.lax.slice_in_dim(kernel, first, first + value.shape[0]).astype(value.dtype)
-            total = total + jnp.tensordot(rows, value, axes=(0, 0))
-            first += value.shape[0]
+        for rows, value in zip(blocks, inputs, strict=True):
+            total = total + jnp.tensordot(rows.astype(value.dtype), value, axes=(0, 0))
         return total
 
 
