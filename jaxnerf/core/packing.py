@@ -155,9 +155,10 @@ def _first(queue):
 
 
 def _fill(queue, place, used):
-    """Returns the Pool of the samples at places [K] in the queue."""
-    word = jnp.searchsorted(queue.ends, place, side="right", method="scan_unrolled")
-    word = jnp.minimum(word, queue.words.size - 1)
+    """Returns the Pool of the samples at places [K] in the queue, each the next after the one before."""
+    # How many words have ended up to a place: counted from place to place, rather than searched for each.
+    ended = jnp.zeros_like(place).at[jnp.maximum(queue.ends - place[0], 0)].add(1, mode="drop")
+    word = jnp.minimum(jnp.cumsum(ended), queue.words.size - 1)
     flags = queue.words[word]
     before = queue.ends[word] - bits.count(flags)
     width = queue.words.size // queue.count.size
