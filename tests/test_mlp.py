@@ -177,8 +177,10 @@ FIELDS = {
 }
 
 
-@pytest.mark.parametrize("name", FIELDS)
-@pytest.mark.parametrize("rays, samples, directions", [(16, 64, 1), (16, 64, 64), (512, 1, 1), (2, 512, 1)])
+@pytest.mark.parametrize(
+    "name, rays, samples, directions",
+    [("mlp", 16, 64, 1), ("mlp", 16, 64, 64), ("mlp", 512, 1, 1), ("mlp", 2, 512, 1), ("grid", 2, 512, 1)],
+)
 def test_rows_that_collide_in_the_cache_are_parted_and_none_can_tell(name, rays, samples, directions):
     """Answers and slopes for 512 samples or 1024 are those of the first ray and of the others."""
     field, rng = FIELDS[name], np.random.default_rng(0)
