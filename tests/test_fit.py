@@ -70,6 +70,15 @@ def test_all_that_is_open_is_filled_and_said(fitted, views):
     assert f"a pixel covers {PIXEL:.4g}" in "".join(lines)
 
 
+@pytest.mark.parametrize("field", ["grid", "mlp"])
+@pytest.mark.parametrize("seen", [True, False])
+def test_whether_colour_depends_on_the_direction_is_said(views, field, seen):
+    config = an_open(field)
+    (config.fine if field == "mlp" else config.features).use_viewdirs = seen
+    said = [line for line in fit_config(config, views)[1] if "colour by direction" in line]
+    assert len(said) == 1 and said[0].startswith("kept" if seen else "left out")
+
+
 def test_what_is_given_stays_as_it_was(views):
     given = an_open()
     before = given.to_json_best_effort()

@@ -70,6 +70,10 @@ def fit_config(config, views):
         lines.append(f"training    {train.max_steps:,} steps, by the size of the images")
     train.lr_steps = train.lr_steps or train.max_steps
     lines.append("left out    coarse network and importance points: the cells say where to ask")
+    if (config.fine if config.field == "mlp" else config.features).use_viewdirs:
+        lines.append("kept        colour by direction: only training tells, see experiments/scene_needs.py")
+    else:
+        lines.append("left out    colour by direction: use_viewdirs is off")
     return config, lines
 
 
