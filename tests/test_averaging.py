@@ -18,6 +18,7 @@ from jaxnerf.engine.state import create_state
 from runs import smoke_config
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 ADAM = optax.adam(0.1, 0.9, 0.99)
 
 

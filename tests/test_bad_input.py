@@ -18,6 +18,7 @@ from jaxnerf.engine.records import read_rows
 from runs import SMOKE_FLAGS, run, smoke_config
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 SCENE = ("--config.data.format=blender", "--config.data.dir=nowhere")
 

@@ -11,6 +11,7 @@ from jaxnerf.engine.load import newest_step, open_run
 from runs import run
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 
 @pytest.fixture(scope="module")

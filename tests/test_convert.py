@@ -32,7 +32,7 @@ from published import as_flax, as_state_dict, random_layers
 from runs import run, smoke_config
 
 pytest_plugins = ["engine_fixtures"]
-pytestmark = pytest.mark.usefixtures("compiled_once")
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 SMALL = {"depth": 2, "width": 16, "skip": 0, "view_width": 8, "freqs": (4, 2)}  # configs/smoke.py
 

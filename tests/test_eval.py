@@ -22,6 +22,7 @@ from jaxnerf.engine.watch import watch
 from runs import smoke_config, start
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 
 @pytest.fixture(scope="module")

@@ -195,14 +195,6 @@ def toy_field():
 
 
 @pytest.fixture(scope="module")
-def unoptimized(compiled_once):
-    """Compiles in two thirds of the time what runs for a dozen steps."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
-@pytest.fixture(scope="module")
 def toy():
     """An Experiment of the toy field, 64 rays a step in blocks of 16, with a pool far too small for them."""
     config = tiny_config()

@@ -23,6 +23,7 @@ from jaxnerf.engine.state import create_state
 from runs import ROOT, smoke_config
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 
 @pytest.fixture

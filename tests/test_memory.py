@@ -21,6 +21,7 @@ from runs import smoke_config
 from test_step import OPTIMIZER, toy_draw, toy_model
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 
 def out_of_memory():

@@ -16,6 +16,7 @@ from jaxnerf.engine.frames import render_path
 from runs import run as run_program
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 POSE = np.array([[1, 0, 0, 0.1], [0, 0, -1, -4.0], [0, 1, 0, 0.2], [0, 0, 0, 1]])
 

@@ -18,6 +18,7 @@ from jaxnerf.engine.loop import train_and_evaluate
 from runs import SMOKE_FLAGS, smoke_config, start
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 
 def weights(folder, step):

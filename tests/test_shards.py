@@ -15,6 +15,7 @@ from jaxnerf.engine.load import open_run
 from runs import run as run_program
 
 pytest_plugins = ["engine_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 
 @pytest.fixture(scope="module")
