@@ -44,7 +44,7 @@ def entries(folder):
     return sorted(folder.rglob("*-cache"))
 
 
-def test_a_kept_program_gives_the_same_numbers(trained, tmp_path):
+def test_a_kept_program_gives_the_same_numbers(trained, unoptimized, tmp_path):
     hits = []
     listen = lambda name, **_: hits.append(name) if name.endswith("/cache_hits") else None  # noqa: E731
     jax.monitoring.register_event_listener(listen)

@@ -39,7 +39,7 @@ def views(experiment):
 
 
 @pytest.fixture(scope="module")
-def runs(compiled_once, experiment, views):
+def runs(unoptimized, experiment, views):
     """Ten steps of configs/smoke.py on one device and on four; device_matrix.py has pmap, too."""
     model, optimizer = experiment.model, experiment.optimizer
     step = make_train_step(model, optimizer, experiment.draw)
