@@ -50,10 +50,12 @@ def _shared(tmp_path_factory):
 def _options(**options):
     """Sets options of JAX here and in processes that are started."""
     old = {name: jax.config.values[name] for name in options}
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in options.items():
-            patch.setenv(name.upper(), str(value))
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in options.items():
+                patch.setenv(name.upper(), str(value))
+                jax.config.update(name, value)
+            yield
+    finally:
+        for name, value in old.items():
             jax.config.update(name, value)
-        yield
-    for name, value in old.items():
-        jax.config.update(name, value)
