@@ -60,6 +60,8 @@ MACHINES = (
 def step_flops(parameters, evaluations, rays):
     """Returns the FLOP of a step: two a parameter and evaluation forward, twice that backward.
 
+    At most: a bottleneck, which the network multiplies with the next layer once for all samples, counts, too.
+
     Args:
         parameters: of each network.
         evaluations: a ray, of each network.
