@@ -205,7 +205,7 @@ def test_wrong_arguments():
         look(jax.random.key(0), full_grid(), np.zeros((2, 2), np.int32))
 
 
-def test_a_grid_keeps_marked_cells_and_their_neighbours():
+def test_a_grid_keeps_marked_cells():
     grid, rays = full_grid(4.0, (8, 8, 8)), rays_past_origin(0, 64)
     t = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=64)
     chosen = np.abs(t - 4) < 0.1
@@ -217,8 +217,32 @@ def test_a_grid_keeps_marked_cells_and_their_neighbours():
     want[tuple(cells.T)] = True
     np.testing.assert_array_equal(marked, want)
     kept = occupancy.keep_cells(grid, marked)
-    assert kept.occupied[marked].all() and marked.sum() < kept.occupied.sum() < grid.occupied.sum()
+    assert kept.occupied[marked].all() and kept.occupied.sum() < grid.occupied.sum()
     assert (kept.mean[~kept.occupied] == -1).all()
+
+
+def test_a_grid_keeps_what_is_between_two_marked_cells():
+    """Of as many rays as there are, one may have passed on either side."""
+    marked = np.zeros((4, 4, 4), bool)
+    marked[[0, 2], 0, 0] = marked[3, [1, 3], 3] = marked[0, 3, [0, 2]] = True
+    want = marked.copy()
+    want[1, 0, 0] = want[3, 2, 3] = want[0, 3, 1] = True
+    kept = occupancy.keep_cells(full_grid(4.0, (4, 4, 4)), jnp.asarray(marked))
+    np.testing.assert_array_equal(kept.occupied, want)
+    assert not occupancy.keep_cells(kept, jnp.ones((4, 4, 4), bool)).occupied[~want].any()
+
+
+@pytest.mark.parametrize("per_cell", [False, True])
+def test_fog_is_what_is_at_most_as_dense_as_its_cells_threshold(per_cell):
+    grid = full_grid(4.0, (2, 2, 2))
+    threshold = np.arange(8, dtype=np.float32).reshape(2, 2, 2) if per_cell else 3.0
+    density = np.float32([2.0, 3.0, 3.5, 7.0, 8.0, np.nan])
+    x = np.float32([[-2, -2, 2], [-2, 2, 2], [-2, 2, 2], [2, 2, 2], [2, 2, 2], [2, 2, 2]])
+    scene = occupancy.without_fog(lambda x, viewdirs: (density, x), grid, threshold)
+    want = [2, 0, 3.5, 0, 8, np.nan] if per_cell else [0, 0, 3.5, 7, 8, np.nan]
+    clear, rgb = scene(x, x)
+    np.testing.assert_array_equal(clear, np.float32(want))
+    np.testing.assert_array_equal(rgb, x)
 
 
 def test_without_spread_only_dense_cells_count():

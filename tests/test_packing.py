@@ -10,7 +10,7 @@ import pytest
 
 import jaxnerf
 from helpers import all_finite, assert_same, checked_grid, compiled, full_grid, rays_past_origin
-from jaxnerf.core import compositing, occupancy, packing
+from jaxnerf.core import compositing, lanes, occupancy, packing
 from jaxnerf.fields import analytic
 
 RAYS, SEGMENTS = 24, 40
@@ -314,3 +314,10 @@ def test_needed_samples_names_what_it_cannot_pack(rays, samples, wrong):
         given["samples"] = dataclasses.replace(samples, rule="gauss")
     with pytest.raises(ValueError, match="needed_samples"):
         packing.needed_samples(scene, full_grid(), rays, error=0.1, **given)
+
+
+@pytest.mark.parametrize("most", [7, 2**31 - 1])
+def test_long_rays_come_first_whatever_their_number(most):
+    count = np.random.default_rng(0).integers(0, 8, 100).astype(np.int32)
+    order = lanes._longest_first(jnp.asarray(count), most)
+    np.testing.assert_array_equal(order, np.argsort(-count, kind="stable"))

@@ -134,8 +134,13 @@ def mark_cells(marked, grid, rays, t, chosen):
 
 
 def keep_cells(grid, marked):
-    """Returns the Grid with only the cells that are marked [X, Y, Z], and their neighbours, occupied."""
-    occupied = grid.occupied & _widen(marked)
+    """Returns the Grid with only the cells that are marked [X, Y, Z], or between two that are, occupied."""
+    between = marked
+    for axis in range(3):
+        around = jnp.pad(marked, [(1, 1) if i == axis else (0, 0) for i in range(3)])
+        before, after = (jax.lax.slice_in_dim(around, i, i + marked.shape[axis], axis=axis) for i in (0, 2))
+        between |= before & after
+    occupied = grid.occupied & between
     return dataclasses.replace(grid, mean=jnp.where(occupied, grid.mean, -1), occupied=occupied)
 
 
@@ -197,11 +202,28 @@ def restrict_scene(scene, grid):
 
     def restricted(x, viewdirs):
         density, rgb = scene(x, viewdirs)
-        places = [(x[..., i] - grid.lower[i]) * _cells_per_unit(grid, i) for i in range(3)]
-        index, inside = _cell(grid, places)
+        index, inside = _cell_around(grid, x)
         return jnp.where(inside & grid.occupied.reshape(-1)[index], density, 0), rgb
 
     return restricted
+
+
+def without_fog(scene, grid, threshold):
+    """Returns a scene with nothing where its density is at most a threshold; what is NaN stays.
+
+    Args:
+        scene: see render_samples.
+        grid: Grid, whose cells the threshold is of.
+        threshold: see update_grid.
+    """
+    threshold = jnp.asarray(threshold, jnp.float32)
+
+    def clear(x, viewdirs):
+        density, rgb = scene(x, viewdirs)
+        least = threshold.reshape(-1)[_cell_around(grid, x)[0]] if threshold.ndim else threshold
+        return jnp.where(density <= least, 0, density), rgb
+
+    return clear
 
 
 def flat_index(places, shape):
@@ -235,6 +257,11 @@ def _along(grid, rays, t):
 
 def _cells_per_unit(grid, axis):
     return grid.occupied.shape[axis] / (grid.upper[axis] - grid.lower[axis])
+
+
+def _cell_around(grid, x):
+    """Returns _cell of positions x [..., 3]."""
+    return _cell(grid, [(x[..., i] - grid.lower[i]) * _cells_per_unit(grid, i) for i in range(3)])
 
 
 def _cell(grid, places):

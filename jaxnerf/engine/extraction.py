@@ -20,8 +20,9 @@ def rays_to_look(space):
 def visible_grid(scene, space, rays, *, samples_at_once, background):
     """Returns the Grid of the cells of a Space where a scene is dense and that shows.
 
-    Kept is what the rays need to differ by less than half a step of 8 bits, and the neighbours of that. A
-    network trained along whole rays has plenty of white fog before white, and of matter inside of things.
+    Kept is what the rays need to differ by less than half a step of 8 bits, and what lies between two such
+    cells. A network trained along whole rays has plenty of white fog before white, of fog thinner than the
+    threshold before all that is dense, and of matter inside of things.
 
     Args:
         scene: see render_samples.
@@ -33,11 +34,12 @@ def visible_grid(scene, space, rays, *, samples_at_once, background):
     bounds = (jnp.asarray(bound, jnp.float32) for bound in (space.lower, space.upper))
     options = {"threshold": space.threshold, "contracted": space.contracted}
     grid = occupancy.grid_of_scene(jax.random.key(0), scene, *bounds, space.shape, **options)
+    clear = occupancy.without_fog(scene, grid, space.threshold)
 
     def look(marked, rays):
         samples = samples_in_box(None, grid, rays, step=space.step, cell=space.cell)
         options = {"error": _INVISIBLE, "capacity": samples_at_once, "background": background}
-        needed = needed_samples(scene, grid, rays, samples, **options)
+        needed = needed_samples(clear, grid, rays, samples, **options)
         return occupancy.mark_cells(marked, grid, rays, samples.t, needed), None
 
     parts = jax.tree.map(lambda leaf: leaf.reshape(-1, _AT_ONCE, *leaf.shape[1:]), rays)

@@ -94,12 +94,14 @@ def render_chosen(render, rays, chosen, otherwise, *, chunk):
 
 def _blocks_around(occupied):
     """Returns which blocks hold an occupied cell, or have one among their 26 neighbours."""
-    blocks = occupied
+    # Slices, each or-ed with the others: reduce_window takes four times as long on a CPU.
+    blocks, reach = occupied, 3 * _BLOCK
     for axis in range(3):
-        sizes = [(3 * _BLOCK, _BLOCK) if i == axis else (1, 1) for i in range(3)]
         around = [(_BLOCK, _BLOCK + -occupied.shape[i] % _BLOCK) if i == axis else (0, 0) for i in range(3)]
-        window, strides = zip(*sizes, strict=True)
-        blocks = jax.lax.reduce_window(blocks, False, jax.lax.bitwise_or, window, strides, around)
+        wide = jnp.pad(blocks, around)
+        ends = wide.shape[axis] - reach + 1
+        cells = (jax.lax.slice_in_dim(wide, i, ends + i, stride=_BLOCK, axis=axis) for i in range(reach))
+        blocks = functools.reduce(jnp.bitwise_or, cells)
     return blocks
 
 
