@@ -85,10 +85,11 @@ def row(setting, seconds, faster, score):
 def parsed(setting):
     """Returns the fields of config.eval that a setting names."""
     kinds = {"samples": float, "stop": float, "chunk": int, "samples_at_once": int}
-    given = setting.split("/")
-    if len(given) != len(kinds):
-        raise ValueError(f"--settings has {setting!r}, wanted {'/'.join(kinds)}")
-    return {name: kind(value) for (name, kind), value in zip(kinds.items(), given, strict=True)}
+    try:
+        pairs = zip(kinds.items(), setting.split("/"), strict=True)
+        return {name: kind(value) for (name, kind), value in pairs}
+    except ValueError as error:
+        raise ValueError(f"--settings has {setting!r}, wanted numbers as {'/'.join(kinds)}") from error
 
 
 def renderer(run, weights, chunk):

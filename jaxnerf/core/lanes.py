@@ -96,7 +96,7 @@ def sum_until_stopped(function, scene, rays, samples, words, *, capacity, stop):
 def _longest_first(count, most):
     """Returns the order [B] of rays by count [B], or a few lanes would go on where all others have ended.
 
-    A sort of numbers that hold the ray's own too: argsort takes six times as long on a CPU.
+    A sort of numbers that hold the ray's own too: argsort takes several times as long on a CPU.
     """
     rays = count.size
     if rays * (most + 1) > 2**32:  # which they are too many for

@@ -94,7 +94,7 @@ def render_chosen(render, rays, chosen, otherwise, *, chunk):
 
 def _blocks_around(occupied):
     """Returns which blocks hold an occupied cell, or have one among their 26 neighbours."""
-    # Slices, each or-ed with the others: reduce_window takes four times as long on a CPU.
+    # Slices, each or-ed with the others: reduce_window takes several times as long on a CPU.
     blocks, reach = occupied, 3 * _BLOCK
     for axis in range(3):
         around = [(_BLOCK, _BLOCK + -occupied.shape[i] % _BLOCK) if i == axis else (0, 0) for i in range(3)]
