@@ -11,7 +11,7 @@ def get_config():
     config.data.dir = "lego"
     config.data.pixel_offset = 0.0  # the code looks through pixel corners; the paper says nothing
     config.sampling.rule = "points"
-    config.sampling.importance_floor = 1e-5  # the code's padding; the paper has none
+    config.sampling.importance_padding = 1e-5  # the code's padding; the paper has none
     train = config.train
     train.batch_size = 1024  # the code; the paper says 4096 rays
     train.batching = "single_image"  # the code; the paper draws from all pixels of the set

@@ -1,6 +1,4 @@
-"""Photographs of one's own, by --data_dir alone: format, world and sizes follow from the capture."""
-
-from ml_collections import config_dict
+"""A dataset of one's own, by --data_dir alone: format, world and sizes are inferred from it."""
 
 from configs import lego_fast
 
@@ -9,13 +7,12 @@ def get_config():
     """Returns the configuration; ten minutes on a CPU core."""
     config = lego_fast.get_config()
     data = config.data
-    data.format, data.dir, data.factor, data.width = "auto", "", 0, 200
-    data.background, data.ndc = "", config_dict.placeholder(bool)
-    space = config.space
-    # Nothing is known to be empty at first, and what is faint in photographs is fog that no view needs.
-    space.outside, space.threshold, space.samples_per_ray = "", 0.03, 27
+    data.format, data.dir, data.factor, data.width = "auto", "", "auto", 200
+    data.background, data.ndc = "auto", "auto"
+    # Without alpha nothing is known to be empty at first, and faint matter in photographs is mostly fog.
+    config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 27.0
     train = config.train
-    # What of lego_fast.py was tried on lego alone stays as the README's captures were trained.
-    config.features.view_width, config.eval.samples, train.average_power = 128, 1.0, 0.0
+    # These differ from lego_fast.py, whose values were chosen on lego alone.
+    config.hash_grid.view_width, config.eval.sample_multiplier, train.averaging_power = 128, 1.0, 0.0
     train.batch_size, train.max_steps, train.lr_steps, train.max_seconds = 384, 12_000, 12_000, 600.0
     return config

@@ -1,6 +1,6 @@
-"""Lego at 100 x 100 in minutes on one CPU core: feature grids, asked only where there is something.
+"""Lego at 100 x 100 in minutes on one CPU core: a hash grid under the occupancy sampler.
 
-Sizes follow from cameras, masks and images; the rest was chosen on views held out of the training set.
+Sizes are inferred from cameras, alpha and images; the rest was chosen on views held out of the training set.
 """
 
 from configs import default
@@ -10,16 +10,16 @@ def get_config():
     """Returns the configuration."""
     config = default.get_config()
     config.data.format, config.data.dir, config.data.factor = "blender", "lego", 8
-    config.field, config.space.skip_empty = "grid", True
-    config.features.view_width = 64
+    config.field, config.sampler = "hash_grid", "occupancy"
+    config.hash_grid.view_width = 64
     train = config.train
-    train.batch_size, train.max_steps, train.lr_steps = 512, 0, 0
+    train.batch_size, train.max_steps, train.lr_steps = 512, "auto", "auto"
     train.lr_init, train.lr_final, train.warmup_steps = 5e-3, 1.5e-4, 50
     train.muon = 0.6
-    train.beta2, train.epsilon = 0.99, 1e-15  # a feature that is rarely seen moves as far as any other
-    train.average_power = 10.0
+    train.beta2, train.epsilon = 0.99, 1e-15  # a feature that is rarely hit moves as far as any other
+    train.averaging_power = 10.0
     train.log_every, train.save_every = 200, 4000
-    config.space.hide_from = 300
-    config.eval.samples = 1.5  # no jitter averages over a step there, so steps are finer
-    config.eval.chunk = 8192  # enough rays to fill pools, not many more than see something in a small picture
+    config.occupancy.occlusion_start_step = 300
+    config.eval.sample_multiplier = 1.5  # no jitter averages over a step in images, so steps are finer
+    config.eval.chunk = 8192  # fills the sample buffer, and is not much more than a small image needs
     return config

@@ -1,4 +1,4 @@
-"""Lego at 100 x 100 by the paper's kind of network alone, small, and asked only where there is something."""
+"""Lego at 100 x 100: a small network of the paper's kind under the occupancy sampler, without a hash grid."""
 
 from configs import lego_fast
 
@@ -8,7 +8,7 @@ def get_config():
     config = lego_fast.get_config()
     config.field = "mlp"
     network = config.fine
-    network.depth, network.width, network.view_width, network.num_freqs = 4, 64, 32, 0
+    network.depth, network.width, network.view_width, network.num_freqs = 4, 64, 32, "auto"
     # A ReLU that has died cannot come back, and this learning rate is high.
     network.density_activation, network.density_bias = "softplus", -1.0
     train = config.train

@@ -13,7 +13,7 @@ def get_config():
     config.data.ndc = True
     config.data.pixel_offset = 0.0  # the code looks through pixel corners; the paper says nothing
     config.sampling.rule = "points"
-    config.sampling.importance_floor = 1e-5  # the code's padding; the paper has none
+    config.sampling.importance_padding = 1e-5  # the code's padding; the paper has none
     config.sampling.density_noise = 1.0  # Appendix A: noise of unit variance for real scenes
     train = config.train
     train.batch_size = 4096

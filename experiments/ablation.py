@@ -20,7 +20,7 @@ import table  # which defines --readme
 from ablation_variants import COMPLETE, variants, workdir_name
 from absl import flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 SCENES = {
     "lego": {"data.format": "blender", "data.dir": "lego", "data.factor": 8},
@@ -117,10 +117,10 @@ def _steps(kept, count, base):
 
 
 def _save(path, kept):
-    from jaxnerf.engine.workdir import write_text
+    from jaxnerf.training.workdir import write_text
 
     write_text(path, json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    app.run(main, stopped="and kept what was finished; the same command goes on from there")
+    cli.run(main, stopped="and kept what was finished; the same command goes on from there")

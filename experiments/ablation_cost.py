@@ -7,9 +7,9 @@ import jax
 import speed_machine
 import speed_step
 from ablation_variants import COMPLETE
-
 from jaxnerf.data.subset import evenly, select_views
-from jaxnerf.engine import build
+
+from jaxnerf.training import build
 
 _ROUNDS, _STEPS = 7, 8  # of timings of all variants in turn; steps timed together
 

@@ -9,7 +9,7 @@ from ablation_report import to_complete
 from ablation_variants import COMPLETE, workdir_name
 from PIL import Image, ImageDraw
 
-from jaxnerf.engine import pictures
+from jaxnerf.evaluation import pictures
 
 _SIDE, _LABEL, _COLUMNS = 150, 16, 6  # px of a picture, px above it, pictures in a row
 _VIEW = "002"  # of the test views
@@ -56,9 +56,7 @@ def plot(kept, path):
     from matplotlib import pyplot
 
     scenes = kept["scenes"]
-    figure, axes = pyplot.subplots(
-        len(scenes), 2, figsize=(12, 4.2 * len(scenes)), layout="constrained", squeeze=False
-    )
+    figure, axes = pyplot.subplots(len(scenes), 2, figsize=(12, 4.2 * len(scenes)), layout="constrained", squeeze=False)
     for (left, right), (scene, about) in zip(axes, scenes.items(), strict=True):
         names = [name for name in about["runs"] if name != COMPLETE][::-1]
         for height, name in enumerate(names):

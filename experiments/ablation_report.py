@@ -18,9 +18,7 @@ def report(kept):
             f"run, seeds {', '.join(map(str, seeds))}. Figures are means +- standard deviation over seeds. "
             f"Times: {kept.get('machine', 'not measured')}.",
             "",
-            *table.markdown(
-                HEADS, [row(name, about, kept.get("cost", {}).get(name)) for name in about["runs"]]
-            ),
+            *table.markdown(HEADS, [row(name, about, kept.get("cost", {}).get(name)) for name in about["runs"]]),
             "",
             agreement(about),
             "",
@@ -35,9 +33,7 @@ def agreement(about):
         if name != COMPLETE:
             found.setdefault(verdict(to_complete(name, about)), []).append(name)
     parts = [f"{what}: {', '.join(names)}" for what, names in found.items() if what != "-"]
-    return (
-        f"In the paper's Table 2, which has no row on stratification, all are worse. Here {'; '.join(parts)}."
-    )
+    return f"In the paper's Table 2, which has no row on stratification, all are worse. Here {'; '.join(parts)}."
 
 
 def row(name, about, cost):
@@ -61,8 +57,7 @@ def to_complete(name, about):
     if name == COMPLETE:
         return []
     scores = [
-        {int(seed): run["psnr"] for seed, run in about["runs"].get(which, {}).items()}
-        for which in (name, COMPLETE)
+        {int(seed): run["psnr"] for seed, run in about["runs"].get(which, {}).items()} for which in (name, COMPLETE)
     ]
     return paired_runs.differences(*scores)
 

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import planting
 
-from jaxnerf.data import inspect_photos, inspection
+from jaxnerf.capture_check import images as images_module
+from jaxnerf.capture_check import report as report_module
 
 SCENES = {"lego": "lego", "fern": "fern", "fox": "fox", "can": "can", "can as LLFF": "can"}
 
@@ -59,7 +60,7 @@ def defects(scene):
 
 def read_once():
     """Returns inspect_photos._read such that what was seen in a photograph stands for every link to it."""
-    kept, read = {}, inspect_photos._read
+    kept, read = {}, images_module._read
 
     def remembered(frame):
         stat = frame.image.resolve().stat()
@@ -74,7 +75,7 @@ def read_once():
 def check(folder, wanted, flags):
     """Returns (verdict, lines) on a planted folder."""
     try:
-        report = inspection.inspect(folder, **flags)
+        report = report_module.inspect(folder, **flags)
     except ValueError as error:
         line = str(error)
         return ("found by the reader" if wanted and wanted in line else "OTHER ERROR"), [line]
@@ -91,7 +92,7 @@ def check(folder, wanted, flags):
 
 
 def main(names):
-    inspect_photos._read = read_once()
+    images_module._read = read_once()
     for scene in names or SCENES:
         print(f"{scene}")
         for name, (wanted, plant, flags) in defects(scene).items():

@@ -3,7 +3,7 @@
     python experiments/collapse.py [--seeds=20] [--steps=600] [--out=runs/collapse] [--readme=README.md]
 
 Trains the embedded scene with a network that invites it (ReLU density, eight narrow layers without a skip, a
-high learning rate), each seed with train.revive=0 and with the default. Prints a row a run, then the
+high learning rate), each seed with train.max_reinits=0 and with the default. Prints a row a run, then the
 table; --out keeps both as collapse.json; --readme replaces the table between <!-- collapse --> and
 <!-- end of collapse -->. A run has collapsed when its network is dead at the end.
 """
@@ -26,19 +26,29 @@ from absl import flags
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent))  # for configs
 
 from configs import default
-from jaxnerf import app, pixel_grid, psnr
-from jaxnerf.data.batches import draw_batch
-from jaxnerf.engine import parallel, revival, workdir
-from jaxnerf.engine.build import build
-from jaxnerf.engine.evaluate import reference
-from jaxnerf.engine.state import create_state
-from jaxnerf.engine.step import make_train_step
+from jaxnerf import pixel_grid, psnr
+from jaxnerf.data.ray_batches import draw_batch
+from jaxnerf.evaluation.evaluate import reference
+from jaxnerf.runtime import cli, devices
+from jaxnerf.training import dead_networks as dead_networks_module
+from jaxnerf.training import workdir
+from jaxnerf.training.build import build
+from jaxnerf.training.state import create_state
+from jaxnerf.training.step import make_train_step
 
 _SEEDS = flags.DEFINE_integer("seeds", 20, "Runs each way.", lower_bound=1)
 _STEPS = flags.DEFINE_integer("steps", 600, "Of a run.", lower_bound=1)
 _OUT = flags.DEFINE_string("out", None, "Folder that collapse.json goes to.")
 MARKS = ("<!-- collapse -->", "<!-- end of collapse -->")
-HEADS = ("train.revive", "runs", "of one colour at the end", "begun anew", "found at step", "PSNR", "worst")
+HEADS = (
+    "train.max_reinits",
+    "runs",
+    "of one colour at the end",
+    "begun anew",
+    "found at step",
+    "PSNR",
+    "worst",
+)
 
 
 def main(argv):
@@ -47,7 +57,7 @@ def main(argv):
     study = Study(_STEPS.value)
     rows = []
     for seed in range(_SEEDS.value):
-        for allowed in (0, default.get_config().train.revive):
+        for allowed in (0, default.get_config().train.max_reinits):
             rows.append(study.run(seed, allowed))
             print(json.dumps(rows[-1]), flush=True)
     lines = table.markdown(HEADS, [summary(group) for group in both(rows)]) + ["", same(rows)]
@@ -88,7 +98,7 @@ class Study:
             return draw_batch(seed, step, positions, views)
 
         self._create = jax.jit(lambda seed: create_state(model, optimizer, seed))
-        self._step, _, self._data = parallel.compile_step(
+        self._step, _, self._data = devices.compile_step(
             make_train_step(model, optimizer, draw),
             functools.partial(self._create, 0),
             (self._experiment.load_views("train"), None, jnp.int32(0)),
@@ -101,21 +111,23 @@ class Study:
     def run(self, seed, allowed):
         """Returns what became of a seed, as numbers, where dead networks begin anew so many times."""
         options = SimpleNamespace(**{**vars(self._experiment.train), "revive": allowed})
-        look = revival.make_look(self._experiment._replace(seed=seed, train=options), f"seed {seed}")
+        look = dead_networks_module.make_reinitializer(
+            self._experiment._replace(seed=seed, train=options), f"seed {seed}"
+        )
         state, data = self._create(seed), (*self._data[:2], jnp.int32(seed))
         started, found, counted = time.perf_counter(), [], 0
         for step in range(1, options.max_steps + 1):
             state, metrics = look(step, *self._step(state, data))
-            if step % revival.LOOK_EVERY == 0 and int(metrics["revived"]) > counted:
-                found, counted = [*found, step], int(metrics["revived"])
-        dead = revival.dead_networks(metrics)
+            if step % dead_networks_module.LOOK_EVERY == 0 and int(metrics["num_reinits"]) > counted:
+                found, counted = [*found, step], int(metrics["num_reinits"])
+        dead = dead_networks_module.dead_networks(metrics)
         leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state.params)]
         return {
             "seed": seed,
             "revive": allowed,
             "psnr": self._score(state.params),
             "dead": dead,
-            "revived": counted,
+            "num_reinits": counted,
             "found": found,
             "seconds": time.perf_counter() - started,
             "parameters": hashlib.sha256(b"".join(leaves)).hexdigest(),
@@ -141,7 +153,7 @@ def summary(rows):
         str(rows[0]["revive"]),
         str(len(rows)),
         str(sum(bool(row["dead"]) for row in rows)),
-        f"{sum(row['revived'] for row in rows)} times in {sum(row['revived'] > 0 for row in rows)} runs",
+        f"{sum(row['num_reinits'] for row in rows)} times in {sum(row['num_reinits'] > 0 for row in rows)} runs",
         f"{statistics.median(found):g} (first {min(found)}, last {max(found)})" if found else "-",
         f"{statistics.median(scores):.2f} dB",
         f"{min(scores):.2f} dB",
@@ -150,13 +162,12 @@ def summary(rows):
 
 def same(rows):
     """Returns the sentence about the runs that had no need of it."""
-    pairs = [pair for pair in zip(*both(rows), strict=True) if not pair[1]["revived"]]
+    pairs = [pair for pair in zip(*both(rows), strict=True) if not pair[1]["num_reinits"]]
     equal = sum(a["parameters"] == b["parameters"] for a, b in pairs)
     return (
-        f"Of {len(pairs)} runs in which no network died, {equal} end with the same parameters both ways, "
-        "bit for bit."
+        f"Of {len(pairs)} runs in which no network died, {equal} end with the same parameters both ways, bit for bit."
     )
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from jaxnerf.core.paths import look_at
-from jaxnerf.core.structs import Camera
+from jaxnerf.core.poses import look_at
+from jaxnerf.core.types import Camera
 from jaxnerf.data.synthetic import render_views
 
 _DISTANCE = 4.0  # of every camera from the origin, world units
@@ -40,9 +40,7 @@ def main():
     parser.add_argument("--views", type=int, default=1000, help="of the training split; the test has 1 in 8")
     parser.add_argument("--size", type=int, default=800, help="px, of the files")
     parser.add_argument("--rendered", type=int, default=50, help="px, before they are enlarged")
-    parser.add_argument(
-        "--workdir", type=pathlib.Path, help="train 200 steps there in place of making the scene"
-    )
+    parser.add_argument("--workdir", type=pathlib.Path, help="train 200 steps there in place of making the scene")
     options = parser.parse_args()
     if options.workdir:
         print(measured(options.out, options.workdir))
@@ -57,9 +55,7 @@ def measured(folder, workdir):
     flags = (f"--data_dir={folder}", f"--workdir={workdir}", "--config.data.factor=1")
     flags += ("--config.train.max_steps=200", "--config.train.log_every=1")
     rows, started = workdir / "metrics.jsonl", time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "jaxnerf.train", "--config=configs/lego_fast.py", *flags]
-    )
+    process = subprocess.Popen([sys.executable, "-m", "jaxnerf.train", "--config=configs/lego_fast.py", *flags])
     while process.poll() is None and not (rows.is_file() and rows.stat().st_size):
         time.sleep(0.05)
     first, ticks = (
@@ -123,8 +119,7 @@ def _write(path, image, size, seed):
     values = np.float32(image) / 65535
     values[..., :3] *= values[..., 3:]
     planes = [
-        np.asarray(Image.fromarray(values[..., channel]).resize((size, size), Image.BICUBIC))
-        for channel in range(4)
+        np.asarray(Image.fromarray(values[..., channel]).resize((size, size), Image.BICUBIC)) for channel in range(4)
     ]
     alpha = np.clip(planes[3], 0, 1)
     straight = np.stack(planes[:3], axis=-1) / np.maximum(alpha, 1e-3)[..., None]

@@ -13,7 +13,7 @@ import table
 from absl import flags
 from ml_collections import config_flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent))  # configurations import configs
 
@@ -25,8 +25,7 @@ _MINUTES = flags.DEFINE_list("minutes", ["2", "5", "10"], "Of training, ascendin
 def main(argv):
     """Trains and scores at each of the times."""
     del argv
-    from jaxnerf.engine.evaluate import evaluate
-    from jaxnerf.engine.loop import train_and_evaluate
+    from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
 
     config = _CONFIG.value
     for minutes in map(float, _MINUTES.value):
@@ -38,4 +37,4 @@ def main(argv):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

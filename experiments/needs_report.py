@@ -7,7 +7,7 @@ import pprint
 import scene_parts
 import table
 
-from jaxnerf.engine.workdir import write_text
+from jaxnerf.training.workdir import write_text
 
 HEADS = ("left off", "loss, dB", "up to, dB", "training time saved", "parameters saved", "verdict")
 
@@ -26,9 +26,7 @@ def write(out, config, found, settings, *, readme=None, table_name="needs"):
     lines = page(found, settings)
     plain = {"settings": settings, "complete": found.complete._asdict(), "overrides": found.overrides}
     plain["parts"] = {name: trial._asdict() | cost._asdict() for name, (trial, cost) in found.parts.items()}
-    plain["tried"] = [
-        {"left_off": names, **cost._asdict(), "kept": kept} for names, cost, kept in found.tried
-    ]
+    plain["tried"] = [{"left_off": names, **cost._asdict(), "kept": kept} for names, cost, kept in found.tried]
     write_text(out / "needs.json", json.dumps(plain, indent=2) + "\n")
     write_text(out / "needs.md", "\n".join(lines) + "\n")
     write_text(out / "needed.py", configuration(config, found, settings))

@@ -45,15 +45,14 @@ def run(config, folder, *, split=None):
         return done
     import jax
 
-    from jaxnerf.engine.evaluate import score_run
-    from jaxnerf.engine.load import open_run
-    from jaxnerf.engine.loop import train_and_evaluate
-    from jaxnerf.engine.workdir import write_text
+    from jaxnerf.evaluation.evaluate import score_run, train_and_evaluate
+    from jaxnerf.evaluation.restore import restore_run
+    from jaxnerf.training.workdir import write_text
 
     if not train_and_evaluate(config, folder, views=read_views(config, "train")):
         return None
     views = read_views(config, split or config.eval.split)
-    results = score_run(open_run(folder), folder, split=split, overwrite=True, views=views)
+    results = score_run(restore_run(folder), folder, split=split, overwrite=True, views=views)
     asked = {"config": _plain(config), "split": split}
     write_text(pathlib.Path(folder) / _FILE, json.dumps({"asked": asked, "results": results}) + "\n")
     jax.clear_caches()  # of a step and a renderer that no other run has
@@ -86,7 +85,7 @@ def read_views(config, split):
 def _read_views(data, split):
     from ml_collections import ConfigDict
 
-    from jaxnerf.engine import build
+    from jaxnerf.training import build
 
     return build.load_views(ConfigDict(json.loads(data)), split)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from jaxnerf.data import copies
+from jaxnerf.data.images import downscaled_copies
 
 _SWAP_YZ = np.diag([1.0, -1.0, -1.0])
 _LLFF = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # our axes by the file's: down, right, backwards
@@ -24,7 +24,7 @@ def copy(source, target, *, without=()):
         if path.is_dir() or any(part in without for part in place.parts):
             continue
         place.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix.lower() in copies.IMAGES:
+        if path.suffix.lower() in downscaled_copies.IMAGES:
             place.symlink_to(path.resolve())
         else:
             shutil.copyfile(path, place)
@@ -34,7 +34,7 @@ def copy(source, target, *, without=()):
 def images(folder):
     """Returns the photographs that training would read, by name."""
     for place in ("images", "images_4", "images_8", "train"):
-        if found := copies.image_files(Path(folder) / place):
+        if found := downscaled_copies.image_files(Path(folder) / place):
             return found
     raise ValueError(f"{folder} has no images")
 

@@ -20,8 +20,9 @@ import numpy as np
 import quadrature_report
 from absl import flags
 
-from jaxnerf import Rays, app, render_hierarchical, render_rays
+from jaxnerf import Rays, render_hierarchical, render_rays
 from jaxnerf.fields import analytic
+from jaxnerf.runtime import cli
 
 flags.DEFINE_integer("rays", 256, "Rays a medium.")
 flags.DEFINE_integer("largest", 1536, "Evaluations at the end of the doubling, which begins at 12.")
@@ -120,4 +121,4 @@ def measure(calls, repeats):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

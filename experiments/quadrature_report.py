@@ -17,7 +17,7 @@ import jax
 import table
 from absl import flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 flags.DEFINE_string("out", "runs/quadrature", "Folder of the measured figures.")
 _PLOT = flags.DEFINE_string("plot", None, "PNG to draw; out/quadrature.png when not given.")
@@ -76,12 +76,9 @@ def closed_table(closed):
             curve = select(rows, medium=medium, rule=rule, sampling=sampling)
             needs = [need(curve, bound) for bound in BOUNDS]
             costs = [
-                "never" if row is None else f"{row['evaluations']} ({row['microseconds']:.1f} us)"
-                for row in needs
+                "never" if row is None else f"{row['evaluations']} ({row['microseconds']:.1f} us)" for row in needs
             ]
-            line.append(
-                f"{round(order(curve), 1) + 0.0:.1f}: " + ("never" if needs[0] is None else ", ".join(costs))
-            )
+            line.append(f"{round(order(curve), 1) + 0.0:.1f}: " + ("never" if needs[0] is None else ", ".join(costs)))
         cells.append(line)
     last = [select(rows, medium=medium, rule="gauss", sampling="uniform")[-1] for medium in media]
     floors = [f"{row['medium']} {row['rms32']:.0e}" for row in last if row["rms"] < 0.1 * row["rms32"]]
@@ -207,4 +204,4 @@ def draw(studies, path):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

@@ -20,7 +20,7 @@ import numpy as np
 import optax
 
 import jaxnerf
-from jaxnerf.fields import showcase  # the subject; any other scene would do
+from jaxnerf.fields import still_life  # the subject; any other scene would do
 
 DEGREES, SHARE = 2.0, 0.05  # how far the camera is off at first
 ENOUGH = 0.1, 0.002  # and at most in the end, in degrees and as a share
@@ -35,7 +35,7 @@ def main(argv=None):
     parser.add_argument("--size", type=int, default=48, help="of the photograph, px")
     parser.add_argument("--every", type=int, default=10, help="steps between lines")
     flags = parser.parse_args(argv)
-    scene, photograph = showcase.scene, through(showcase.scene, 384)
+    scene, photograph = still_life.still_life, through(still_life.still_life, 384)
     if flags.workdir:
         scene, photograph = jaxnerf.load_scene(flags.workdir)
     render = through(scene, 96)

@@ -18,9 +18,10 @@ import table
 from absl import flags
 from PIL import Image
 
-from jaxnerf import app
-from jaxnerf.engine import pictures, records
-from jaxnerf.engine.workdir import write_text
+from jaxnerf.evaluation import pictures
+from jaxnerf.runtime import cli
+from jaxnerf.training import metric_log
+from jaxnerf.training.workdir import write_text
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the page.", required=True)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier page.")
@@ -66,9 +67,7 @@ def write_report(folders, out, *, overwrite=False):
     if not runs:
         raise ValueError(f"nothing to report: {'; '.join(unread) or 'no workdir given'}")
     widest = max(run.strip.shape[1] for run in runs)
-    strips = [
-        np.pad(r.strip, ((0, 0), (0, widest - r.strip.shape[1]), (0, 0)), constant_values=255) for r in runs
-    ]
+    strips = [np.pad(r.strip, ((0, 0), (0, widest - r.strip.shape[1]), (0, 0)), constant_values=255) for r in runs]
     pictures.write_whole(out / "pictures.png", np.concatenate(strips))
     plotted = _plot(runs, out / "psnr.png")
     write_text(page, "\n".join(_page(runs, unread, plotted)) + "\n")
@@ -90,7 +89,7 @@ def read_run(folder):
         name=folder.name,
         rows=[table.row(path) for path in paths],
         scored=sorted((found["training_seconds"], found["psnr"]) for found in results),
-        training=[(row["seconds"], row["psnr_fine"]) for row in records.read_rows(folder)],
+        training=[(row["seconds"], row["psnr_fine"]) for row in metric_log.read_rows(folder)],
         about=_about(results[-1]),
         strip=_strip(paths[-1].parent),
     )
@@ -163,4 +162,4 @@ def _about(results):
 
 
 if __name__ == "__main__":
-    app.run(main, positional=True)
+    cli.run(main, positional=True)

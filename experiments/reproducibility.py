@@ -22,7 +22,7 @@ import paired_runs
 import table  # which defines --readme
 from absl import flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 DRIFT = 50  # steps
 MARKS = ("<!-- reproducibility -->", "<!-- end of reproducibility -->")
@@ -114,7 +114,11 @@ def _drifted(drift):
 
 def train(folder, seed, steps, adam):
     """Trains and scores a run, with a checkpoint at DRIFT. adam: "own", or "paper": its first DRIFT steps."""
-    changes = {"train.save_every": DRIFT, "train.keep": 10**6, "train.muon": 0.0}  # by the paper's Adam alone
+    changes = {
+        "train.save_every": DRIFT,
+        "train.max_to_keep": 10**6,
+        "train.muon": 0.0,
+    }  # by the paper's Adam alone
     if adam == "paper":
         paper = paired_runs.configuration("default").train
         changes |= {"train.max_steps": DRIFT, **{f"train.{name}": paper[name] for name in _PAPER_ADAM}}
@@ -150,11 +154,11 @@ def _parameters(folder, step):
     """Returns all parameters of a run at a step, [N]."""
     import jax
 
-    from jaxnerf.engine.load import open_run
+    from jaxnerf.evaluation.restore import restore_run
 
-    leaves = jax.tree.leaves(jax.device_get(open_run(folder).weights(step)[0]))
+    leaves = jax.tree.leaves(jax.device_get(restore_run(folder).weights(step)[0]))
     return np.concatenate([leaf.ravel() for leaf in leaves])
 
 
 if __name__ == "__main__":
-    app.run(main, stopped="and kept what was finished; the same command goes on from there")
+    cli.run(main, stopped="and kept what was finished; the same command goes on from there")

@@ -18,8 +18,8 @@ import scaling_model
 import table
 from absl import flags
 
-from jaxnerf import app
-from jaxnerf.engine.workdir import write_text
+from jaxnerf.runtime import cli
+from jaxnerf.training.workdir import write_text
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the tables.", required=True)
 _CONFIG = flags.DEFINE_string("config", "configs/quickstart.py", "Of the run whose step is measured.")
@@ -129,9 +129,7 @@ def draw(kept, path):
     flops, size = scaling_model.step_flops(**PAPER), scaling_model.gradient_bytes(sum(PAPER["parameters"]))
     for index, machine in enumerate(scaling_model.MACHINES):
         for grow, style in ((False, "o-"), (True, "s--")):
-            values = [
-                scaling_model.predict(machine, n, flops=flops, size=size, grow=grow)[2] for n in _COUNTS
-            ]
+            values = [scaling_model.predict(machine, n, flops=flops, size=size, grow=grow)[2] for n in _COUNTS]
             label = machine.name + (", batch grown" if grow else "")
             axes[1].plot(_COUNTS, values, style, color=f"C{index}", label=label)
     axes[1].set(xscale="log", xlabel="devices, on paper", ylabel="efficiency", ylim=(0, 1.05))
@@ -140,4 +138,4 @@ def draw(kept, path):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

@@ -76,11 +76,7 @@ def all_reduce_seconds(machine, devices, size):
     groups = math.ceil(devices / inside)
     seconds = 2 * (inside - 1) / inside * size / machine.fast + 2 * (inside - 1) * machine.latency
     # Each device of a group carries its part of the sum to the other groups.
-    return (
-        seconds
-        + 2 * (groups - 1) / groups * size / inside / machine.slow
-        + 2 * (groups - 1) * machine.latency
-    )
+    return seconds + 2 * (groups - 1) / groups * size / inside / machine.slow + 2 * (groups - 1) * machine.latency
 
 
 def predict(machine, devices, *, flops, size, grow=False):

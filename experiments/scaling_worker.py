@@ -9,18 +9,20 @@ import time
 import jax
 import scaling_model
 
-from jaxnerf.engine import build, fit, hosts, parallel
-from jaxnerf.engine.state import create_state
-from jaxnerf.engine.step import make_train_step
+from jaxnerf.runtime import devices
+from jaxnerf.runtime import processes as processes_module
+from jaxnerf.training import auto_config, build
+from jaxnerf.training.state import create_state
+from jaxnerf.training.step import make_train_step
 
 
 def main(file, steps, port, processes, index):
     """Arguments as scaling.measure gives them."""
     processes = int(processes)
     options = {"coordinator": f"127.0.0.1:{port}", "num_processes": processes, "process_id": int(index)}
-    with hosts.cluster(**(options if processes > 1 else {"multihost": False})):
+    with processes_module.cluster(**(options if processes > 1 else {"multihost": False})):
         row = _measure(file, int(steps))
-        if hosts.is_first():
+        if processes_module.is_first():
             print(json.dumps(row), flush=True)
 
 
@@ -28,16 +30,16 @@ def _measure(file, steps):
     spec = importlib.util.spec_from_file_location("config", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    config, _ = fit.fit_data(module.get_config())
+    config, _ = auto_config.resolve_data(module.get_config())
     views = build.load_views(config.data, "train")
-    config, _ = fit.fit_config(config, views)
+    config, _ = auto_config.resolve_sizes(config, views)
     experiment = build.build(config)
-    possible, data = experiment.survey(views)
-    state = create_state(experiment.model, experiment.optimizer, experiment.seed, possible)
+    valid, data = experiment.survey(views)
+    state = create_state(experiment.model, experiment.optimizer, experiment.seed, valid)
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
     rays, started = experiment.train.batch_size, time.perf_counter()
-    run, state, data = parallel.compile_step(
+    run, state, data = devices.compile_step(
         step,
         state,
         data,

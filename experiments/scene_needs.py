@@ -23,7 +23,7 @@ import scene_parts
 from absl import flags
 from ml_collections import config_flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "The complete model.", lock_config=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
@@ -71,7 +71,7 @@ def main(argv):
         wrong = f"--only={unknown[0]}" if unknown else f"--seeds={','.join(_SEEDS.value)}"
         raise ValueError(f"{wrong}: wanted two seeds at least, and parts of {', '.join(scene_parts.PARTS)}")
     out = pathlib.Path(_OUT.value)
-    config = app.use_data(_CONFIG.value, _DATA_DIR.value)
+    config = cli.use_data(_CONFIG.value, _DATA_DIR.value)
     complete, alpha = short(config, _STEPS.value)
     found = search(complete, alpha, out / "runs", seeds=seeds, loss=_LOSS.value, names=_ONLY.value)
     settings = {"loss": _LOSS.value, "steps": _STEPS.value, "seeds": seeds}
@@ -81,15 +81,16 @@ def main(argv):
 
 def short(config, steps):
     """Returns the configuration of a short run without open sizes, and whether its photographs have alpha."""
-    from jaxnerf.engine import fit, scenes
+    from jaxnerf.data import dataset
+    from jaxnerf.training import auto_config
 
     config = scene_parts.changed(config, {"train.max_steps": steps, "train.lr_steps": steps})
     config.train.max_seconds, config.train.save_every = 0.0, steps
     config.data.hold_out = config.data.hold_out or 8
     config.eval.at_end = False
-    config, _ = fit.fit_data(config)
-    views = scenes.load_views(config.data, "train")
-    return fit.fit_config(config, views)[0], views.pixels.shape[-1] == 4
+    config, _ = auto_config.resolve_data(config)
+    views = dataset.load_views(config.data, "train")
+    return auto_config.resolve_sizes(config, views)[0], views.pixels.shape[-1] == 4
 
 
 def search(complete, alpha, folder, *, seeds, loss, names):
@@ -106,10 +107,7 @@ def search(complete, alpha, folder, *, seeds, loss, names):
     changes = {name: scene_parts.without(name, complete, alpha=alpha) for name in names}
     changes = {"complete": {}} | {name: change for name, change in changes.items() if change}
     # Seed by seed, so that runs that are compared lie close together in time.
-    rows = [
-        {name: _run(complete, change, folder / name, seed) for name, change in changes.items()}
-        for seed in seeds
-    ]
+    rows = [{name: _run(complete, change, folder / name, seed) for name, change in changes.items()} for seed in seeds]
     trials = {name: _trial(change, seeds, [row[name] for row in rows]) for name, change in changes.items()}
     base = trials.pop("complete")
     parts = {name: (trial, compare(base, trial)) for name, trial in trials.items()}
@@ -177,13 +175,10 @@ def _trial(overrides, seeds, results):
     return Trial(
         overrides,
         {seed: result["psnr"] for seed, result in zip(seeds, results, strict=True)},
-        {
-            seed: 1000 * result["training_seconds"] / result["step"]
-            for seed, result in zip(seeds, results, strict=True)
-        },
+        {seed: 1000 * result["training_seconds"] / result["step"] for seed, result in zip(seeds, results, strict=True)},
         results[0]["parameters"],
     )
 
 
 if __name__ == "__main__":
-    app.run(main, stopped="and saved; the same command goes on from there")
+    cli.run(main, stopped="and saved; the same command goes on from there")

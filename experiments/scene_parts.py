@@ -12,7 +12,7 @@ def coarse_network(config, alpha):
     """One network along equal steps, which takes the other's samples, too."""
     del alpha
     sampling = config.sampling
-    if config.space.skip_empty or not sampling.num_fine:
+    if config.sampler == "occupancy" or not sampling.num_fine:
         return {}
     return {"sampling.num_coarse": sampling.num_coarse + sampling.num_fine, "sampling.num_fine": 0}
 
@@ -21,8 +21,8 @@ def frequencies(config, alpha):
     """Two octaves less of the position; the finest level less of feature grids."""
     del alpha
     if _has_features(config):
-        levels = tuple(config.features.resolutions)
-        return {"features.resolutions": levels[:-1]} if len(levels) > 1 else {}
+        levels = tuple(config.hash_grid.resolutions)
+        return {"hash_grid.resolutions": levels[:-1]} if len(levels) > 1 else {}
     names = [name for name in _sections(config) if config[name].num_freqs > 2]
     return {f"{name}.num_freqs": config[name].num_freqs - 2 for name in names}
 
@@ -40,7 +40,7 @@ def width(config, alpha):
 def depth(config, alpha):
     """Half the layers; of feature grids, those of colour."""
     del alpha
-    key = "features.view_depth" if _has_features(config) else "fine.depth"
+    key = "hash_grid.view_depth" if _has_features(config) else "fine.depth"
     section, field = key.split(".")
     layers = config[section][field]
     return {key: layers // 2} if layers > 1 else {}
@@ -49,15 +49,15 @@ def depth(config, alpha):
 def features(config, alpha):
     """Half the features of a vertex."""
     del alpha
-    count = config.features.features
-    return {"features.features": count // 2} if _has_features(config) and count > 1 else {}
+    count = config.hash_grid.features
+    return {"hash_grid.features": count // 2} if _has_features(config) and count > 1 else {}
 
 
 def samples(config, alpha):
     """Half the samples; where empty space is skipped, steps of twice the length."""
     del alpha
-    if config.space.skip_empty:
-        return {"space.step": 2 * config.space.step}
+    if config.sampler == "occupancy":
+        return {"occupancy.step_size": 2 * config.occupancy.step_size}
     names = [name for name in ("num_coarse", "num_fine") if config.sampling[name] >= 4]
     # Gauss points come in pairs.
     return {f"sampling.{name}": config.sampling[name] // 4 * 2 for name in names}
@@ -72,8 +72,8 @@ def precision(config, alpha):
 
 def background(config, alpha):
     """Nothing behind the scene or around its box. (Behind alpha there must be a colour.)"""
-    if config.space.skip_empty and config.space.outside == "contracted":
-        return {"space.outside": "nothing"}
+    if config.sampler == "occupancy" and config.occupancy.contracted:
+        return {"occupancy.contracted": False}
     return {} if alpha or config.data.background == "none" else {"data.background": "none"}
 
 
@@ -114,7 +114,7 @@ def changed(config, overrides):
 def _sections(config):
     if _has_features(config):
         return ("features",)
-    both = config.sampling.num_fine and not config.space.skip_empty
+    both = config.sampling.num_fine and config.sampler != "occupancy"
     return ("coarse", "fine") if both else ("fine",)
 
 
@@ -124,4 +124,4 @@ def _counting(config):
 
 
 def _has_features(config):
-    return config.space.skip_empty and config.field == "grid"
+    return config.sampler == "occupancy" and config.field == "hash_grid"

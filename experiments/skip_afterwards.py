@@ -19,10 +19,11 @@ import speed_machine
 import table
 from absl import flags
 
-from jaxnerf import app, pixel_grid, psnr
-from jaxnerf.engine import workdir
-from jaxnerf.engine.evaluate import reference
-from jaxnerf.engine.load import newest_step, open_run
+from jaxnerf import pixel_grid, psnr
+from jaxnerf.evaluation.evaluate import reference
+from jaxnerf.evaluation.restore import newest_step, restore_run
+from jaxnerf.runtime import cli
+from jaxnerf.training import workdir
 
 flags.DEFINE_string("workdir", None, "Folder of a run trained along whole rays.", required=True)
 flags.DEFINE_list(
@@ -35,20 +36,20 @@ flags.DEFINE_integer("views", 9, "How many, spread over the split.", lower_bound
 flags.DEFINE_integer("repeats", 5, "Renderings of each view.", lower_bound=1)
 FLAGS = flags.FLAGS
 MARKS = ("<!-- skipping -->", "<!-- end of skipping -->")
-HEADS = ("samples", "stop", "chunk", "at once", "s a frame", "times faster", "PSNR")
+HEADS = ("sample_multiplier", "early_stop_eps", "chunk", "at once", "s a frame", "times faster", "PSNR")
 
 
 def main(argv):
     """Measures, and prints the table."""
     del argv
     folder, config = FLAGS.workdir, workdir.read_config(FLAGS.workdir)
-    run = open_run(folder, config)
-    if run.experiment.model.space is not None:
+    run = restore_run(folder, config)
+    if run.experiment.model.grid_schedule is not None:
         raise ValueError(f"{folder}: skips empty space already; give a run trained along whole rays")
     step, settings = newest_step(run, folder), [parsed(setting) for setting in FLAGS.settings]
     renderers, weights = [renderer(run, run.weights(step), config.eval.chunk)], None
     for setting in settings:
-        skipping = open_run(folder, config, settings={"skip_empty": True} | setting)
+        skipping = restore_run(folder, config, settings={"bake_occupancy": True} | setting)
         weights = weights or skipping.weights(step)  # the grid is the same with all settings
         renderers.append(renderer(skipping, weights, setting["chunk"]))
     views = run.experiment.load_views(FLAGS.split)
@@ -84,7 +85,7 @@ def row(setting, seconds, faster, score):
 
 def parsed(setting):
     """Returns the fields of config.eval that a setting names."""
-    kinds = {"samples": float, "stop": float, "chunk": int, "samples_at_once": int}
+    kinds = {"sample_multiplier": float, "early_stop_eps": float, "chunk": int, "max_samples": int}
     try:
         pairs = zip(kinds.items(), setting.split("/"), strict=True)
         return {name: kind(value) for (name, kind), value in pairs}
@@ -112,4 +113,4 @@ def measure(run, views, chosen, renderers):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

@@ -13,9 +13,9 @@ import speed_machine
 import speed_step
 
 from jaxnerf import pixel_grid
-from jaxnerf.engine import build, workdir
-from jaxnerf.engine.load import newest_step, open_run
-from jaxnerf.engine.packed import view_packed
+from jaxnerf.evaluation.restore import newest_step, restore_run
+from jaxnerf.models.occupancy import render_with_grid
+from jaxnerf.training import build, workdir
 
 
 def measure(config, folder):
@@ -52,8 +52,8 @@ def _step_row(config):
 
 def _samples_per_ray(config):
     """Returns how often each field is asked in a step, a ray; room in the pool counts as asked."""
-    if config.space.skip_empty:
-        return {"fine": config.space.samples_per_ray}
+    if config.sampler == "occupancy":
+        return {"fine": config.occupancy.pool_samples_per_ray}
     coarse, fine = config.sampling.num_coarse, config.sampling.num_fine
     return {"coarse": coarse, "fine": coarse + fine} if fine else {"fine": coarse}
 
@@ -61,7 +61,7 @@ def _samples_per_ray(config):
 def _frame_row(folder):
     """Returns the row of the first scored view, in the run's own settings."""
     config = workdir.read_config(folder)
-    run = open_run(folder, config)
+    run = restore_run(folder, config)
     weights = run.weights(newest_step(run, folder))
     options, model = run.experiment.eval, run.experiment.model
     views = run.experiment.load_views(options.split)
@@ -70,13 +70,13 @@ def _frame_row(folder):
     rays = jax.tree.map(lambda leaf: leaf.reshape(height * width, *leaf.shape[2:]), rays)
     flops = run.render.lower(weights, rays).compile().cost_analysis()["flops"]
     asked = {name: rays.near.size * count for name, count in _samples_per_ray(config).items()}
-    if model.space is not None:
-        capacity = build.samples_at_once(config)
-        rounds = _rounds(model, weights, rays, options, capacity)
-        one, far = jnp.zeros((1, capacity, 3)), jnp.ones((1, capacity, 3))
+    if model.grid_schedule is not None:
+        max_samples = build.max_samples(config)
+        rounds = _rounds(model, weights, rays, options, max_samples)
+        one, far = jnp.zeros((1, max_samples, 3)), jnp.ones((1, max_samples, 3))
         scene = jax.jit(lambda params, *places: model.scene(params, weights[1])(*places))
         flops += (rounds - 1) * scene.lower(weights[0], one, far).compile().cost_analysis()["flops"]
-        asked = {"fine": rounds * capacity}
+        asked = {"fine": rounds * max_samples}
     sample_flops = {name: field_flops(weights[0][name]) for name in asked}
     return {
         "what": f"frame of {width} x {height}, all rays at once",
@@ -88,18 +88,22 @@ def _frame_row(folder):
     }
 
 
-def _rounds(model, weights, rays, options, capacity):
+def _rounds(model, weights, rays, options, max_samples):
     """Returns how often the field is asked for a full pool while rays are rendered."""
     params, grid = weights
-    rounds, scene, space = [], model.scene(params, grid), model.space
+    rounds, scene, schedule = [], model.scene(params, grid), model.grid_schedule
 
     def counted(x, viewdirs):
         jax.debug.callback(lambda: rounds.append(1))
         return scene(x, viewdirs)
 
-    sizes = {"step": space.step / options.samples, "cell": space.cell, "stop": options.stop}
+    sizes = {
+        "step": schedule.step_size / options.sample_multiplier,
+        "cell": schedule.cell,
+        "early_stop_eps": options.early_stop_eps,
+    }
     jax.block_until_ready(
-        jax.jit(lambda rays: view_packed(counted, grid, rays, capacity=capacity, **sizes))(rays)
+        jax.jit(lambda rays: render_with_grid(counted, grid, rays, max_samples=max_samples, **sizes))(rays)
     )
     jax.effects_barrier()
     return len(rounds)

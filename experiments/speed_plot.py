@@ -34,18 +34,14 @@ def _training(axis, kept):
         small += [] if other else line
     if small:
         front = pareto_front(small)
-        axis.plot(
-            *zip(*front, strict=True), color="0.8", linewidth=7, zorder=0, label="Pareto front, 100x100"
-        )
+        axis.plot(*zip(*front, strict=True), color="0.8", linewidth=7, zorder=0, label="Pareto front, 100x100")
     shapes = iter("*pPXDhds<>^v8H" * 3)
     for entry in speed_published.TRAINING:
         published = entry["kind"] == "published"
         text = f"{entry['kind']}: {entry['name']}, {entry['what']}, hardware: {entry['hardware']}"
         style = {"s": 80, "facecolors": "none", "edgecolors": "k"} if published else {"s": 25, "color": "0.5"}
         marker = next(shapes) if published else "x"
-        axis.scatter(
-            entry["seconds"], entry["psnr"], marker=marker, label=text if published else None, **style
-        )
+        axis.scatter(entry["seconds"], entry["psnr"], marker=marker, label=text if published else None, **style)
     before = [entry for entry in speed_published.TRAINING if entry["kind"] != "published"]
     axis.scatter(
         [],

@@ -9,9 +9,9 @@ import numpy as np
 import speed_machine
 
 from jaxnerf import pixel_grid, psnr
-from jaxnerf.engine import workdir
-from jaxnerf.engine.evaluate import reference
-from jaxnerf.engine.load import newest_step, open_run
+from jaxnerf.evaluation.evaluate import reference
+from jaxnerf.evaluation.restore import newest_step, restore_run
+from jaxnerf.training import workdir
 
 SAMPLES = (4.0, 2.0, 1.0, 0.7, 0.5, 0.35)
 STOPS = (0.0, 1e-3, 1e-2, 3e-2, 1e-1)
@@ -19,7 +19,7 @@ CHUNKS = (1024, 4096, 16384)
 TYPES = ("float32", "bfloat16")
 SIDE = 800  # px, of the frame that is timed for its time alone
 LONGEST = 60.0  # s, that such a frame may be expected to take; else it is left out
-KEYS = ("samples", "stop", "chunk", "compute_dtype", "skip_empty")
+KEYS = ("sample_multiplier", "early_stop_eps", "chunk", "compute_dtype", "bake_occupancy")
 
 
 def measure(kept, save, folder, view_count):
@@ -31,13 +31,13 @@ def measure(kept, save, folder, view_count):
         view_count: how many views.
     """
     config = workdir.read_config(folder)
-    run = open_run(folder, config)
+    run = restore_run(folder, config)
     step = newest_step(run, folder)
     name = {"workdir": str(folder), "step": step, "frames": view_count, "machine": speed_machine.describe()}
     if any(kept.get(key) != value for key, value in name.items()):
         kept.clear()
         kept.update(name, rows=[], notes=[], gflops=[])
-    wanted, kept["notes"] = settings(config, run.experiment.model.space is not None)
+    wanted, kept["notes"] = settings(config, run.experiment.model.grid_schedule is not None)
     done = [row["settings"] for row in kept["rows"]]
     wanted = [setting for setting in wanted if setting not in done]
     if not wanted:
@@ -46,7 +46,13 @@ def measure(kept, save, folder, view_count):
     views = run.experiment.load_views(run.experiment.eval.split)
     chosen = np.unique(np.linspace(0, len(views.offset) - 1, view_count).astype(int))
     truths = [np.asarray(reference(views, index)) for index in chosen]
-    exact = {"samples": 4.0, "stop": 0.0, "chunk": 1024, "compute_dtype": "float32", "skip_empty": False}
+    exact = {
+        "sample_multiplier": 4.0,
+        "early_stop_eps": 0.0,
+        "chunk": 1024,
+        "compute_dtype": "float32",
+        "bake_occupancy": False,
+    }
     exact_frame = _renderer(folder, config, exact, step, views)
     exact_frames = [exact_frame(index) for index in chosen]
     for setting in wanted:
@@ -73,17 +79,20 @@ def settings(config, skips):
     """
     learned = "features" if config.get("field") == "grid" else "fine"
     dtype = config[learned].get("compute_dtype", "float32")
-    own = (config.eval.samples, config.eval.stop, config.eval.chunk, dtype, not skips)
+    own = (config.eval.sample_multiplier, config.eval.early_stop_eps, config.eval.chunk, dtype, not skips)
     own = dict(zip(KEYS, own, strict=True))
     tried, notes = [own], []
     if not skips:
-        tried.insert(0, own | {"skip_empty": False})
+        tried.insert(0, own | {"bake_occupancy": False})
     tried += [own | {"chunk": chunk} for chunk in CHUNKS]
     if "compute_dtype" in config[learned]:
         tried += [own | {"compute_dtype": dtype} for dtype in TYPES]
     else:
         notes.append(f"precision: left out, as the {config.field} field has none to choose")
-    tried += [own | {"samples": samples, "stop": stop} for samples, stop in itertools.product(SAMPLES, STOPS)]
+    tried += [
+        own | {"sample_multiplier": samples, "early_stop_eps": stop}
+        for samples, stop in itertools.product(SAMPLES, STOPS)
+    ]
     return [setting for place, setting in enumerate(tried) if setting not in tried[:place]], notes
 
 
@@ -92,7 +101,11 @@ def _renderer(folder, config, setting, step, views):
     config = config.copy_and_resolve_references()
     for name in ("coarse", "fine"):
         config[name].compute_dtype = setting["compute_dtype"]
-    run = open_run(folder, config, settings={key: setting[key] for key in ("samples", "stop", "skip_empty")})
+    run = restore_run(
+        folder,
+        config,
+        settings={key: setting[key] for key in ("sample_multiplier", "early_stop_eps", "bake_occupancy")},
+    )
     weights = run.weights(step)
 
     def frame(index, side=None):

@@ -26,11 +26,7 @@ def training(kept):
         if not any(curve["runs"].values()):
             continue
         for point in medians(curve["runs"]):
-            spread = (
-                f" ({min(point['seeds']):.2f} to {max(point['seeds']):.2f})"
-                if len(point["seeds"]) > 1
-                else ""
-            )
+            spread = f" ({min(point['seeds']):.2f} to {max(point['seeds']):.2f})" if len(point["seeds"]) > 1 else ""
             rows.append(
                 (
                     name,
@@ -82,14 +78,14 @@ def _reached(runs, bar):
 
 def rendering(kept):
     """Returns the lines of the run's own settings, in bold, and of those that nothing beats."""
-    own, skipping = kept["rows"][0], kept["rows"][0]["settings"]["skip_empty"]
+    own, skipping = kept["rows"][0], kept["rows"][0]["settings"]["bake_occupancy"]
     front = [cost for cost, _ in pareto_front([(row["seconds"], -row["rms"]) for row in kept["rows"]])]
     cells = []
     for row in sorted(kept["rows"], key=lambda row: row["seconds"]):
         if row is not own and row["seconds"] not in front:
             continue
-        names = [f"{name} {value}" for name, value in row["settings"].items() if name != "skip_empty"]
-        names += [] if row["settings"]["skip_empty"] == skipping else ["skipping afterwards"]
+        names = [f"{name} {value}" for name, value in row["settings"].items() if name != "bake_occupancy"]
+        names += [] if row["settings"]["bake_occupancy"] == skipping else ["skipping afterwards"]
         text = ", ".join(names)
         large = "-" if row["seconds_800"] is None else f"{row['seconds_800']:.2f}"
         cells.append(
@@ -160,9 +156,7 @@ def cost(kept):
     for what in dict.fromkeys(row["what"] for row in kept["rows"]):
         rows = [row for row in kept["rows"] if row["what"] == what]
         for row in rows:
-            cells.append(
-                (what, f"{row['value']:,}", f"{1e3 * row['seconds']:.1f}", f"{row['bytes'] / 1e6:.1f}")
-            )
+            cells.append((what, f"{row['value']:,}", f"{1e3 * row['seconds']:.1f}", f"{row['bytes'] / 1e6:.1f}"))
         if len(rows) > 1:
             values = [row["value"] for row in rows]
             slopes = [slope(values, [row[key] for row in rows]) for key in ("seconds", "bytes")]

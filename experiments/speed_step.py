@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import speed_machine
-
 from jaxnerf.data.subset import select_views
-from jaxnerf.engine import build, parallel
-from jaxnerf.engine.fit import fit_config
-from jaxnerf.engine.state import create_state
-from jaxnerf.engine.step import TrainData, make_train_step
+
+from jaxnerf.runtime import devices
+from jaxnerf.training import build
+from jaxnerf.training.auto_config import resolve_sizes
+from jaxnerf.training.state import create_state
+from jaxnerf.training.step import TrainData, make_train_step
 
 PERIOD = 64  # steps timed together, so that looks at the grid are among them
 RAYS, ROOM, FACTORS, VIEWS = (256, 512, 1024, 2048), (0.5, 1, 2), (8, 4, 2), (25, 50, 100)
@@ -38,23 +39,18 @@ class Step(NamedTuple):
 
 def compiled(config, views):
     """Returns the Step of a configuration on one device."""
-    config, _ = fit_config(config, views)
+    config, _ = resolve_sizes(config, views)
     experiment = build.build(config)
-    possible, data = experiment.survey(views)
-    state = create_state(experiment.model, experiment.optimizer, experiment.seed, possible)
+    valid, data = experiment.survey(views)
+    state = create_state(experiment.model, experiment.optimizer, experiment.seed, valid)
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     rays, platform = config.train.batch_size, jax.default_backend()
-    block = config.train.block_size or parallel.default_block(rays, experiment.samples_per_ray, platform)
-    positions = jnp.asarray(parallel.split_positions(rays, 1, block)[0])
+    block = config.train.microbatch_size or devices.default_microbatch(rays, experiment.samples_per_ray, platform)
+    positions = jnp.asarray(devices.split_positions(rays, 1, block)[0])
 
     def count_flops():
         without_looks = data._replace(cells=None if data.cells is None else data.cells[:0])
-        return (
-            jax.jit(step)
-            .lower(state, without_looks, positions.reshape(1, -1))
-            .compile()
-            .cost_analysis()["flops"]
-        )
+        return jax.jit(step).lower(state, without_looks, positions.reshape(1, -1)).compile().cost_analysis()["flops"]
 
     run = jax.jit(step, donate_argnums=0).lower(state, data, positions).compile()
     return Step(config, run, state, jax.device_put(data), positions, count_flops)
@@ -83,10 +79,8 @@ def measure(kept, save, config):
     """Measures the step for each size of its work; what is kept is not measured again."""
     kept.setdefault("machine", speed_machine.describe())
     rows = kept.setdefault("rows", [])
-    read = functools.cache(
-        lambda factor: build.load_views(_changed(config, {"data.factor": factor}).data, "train")
-    )
-    for what, changes, count in _cases(fit_config(config, read(config.data.factor))[0]):
+    read = functools.cache(lambda factor: build.load_views(_changed(config, {"data.factor": factor}).data, "train"))
+    for what, changes, count in _cases(resolve_sizes(config, read(config.data.factor))[0]):
         if any((row["what"], row["changes"], row["views"]) == (what, changes, count) for row in rows):
             continue
         changed = _changed(config, changes)
@@ -96,7 +90,7 @@ def measure(kept, save, config):
         step = compiled(changed, views)
         value = {
             "rays": changed.train.batch_size,
-            "samples a ray": changed.space.samples_per_ray,
+            "samples a ray": changed.occupancy.pool_samples_per_ray,
             "pixels a view": int(np.prod(views.size[0])),
             "views": len(views.offset),
         }[what]
@@ -111,8 +105,11 @@ def _cases(fitted):
     for rays in RAYS:
         yield "rays", {"train.batch_size": rays}, 0
     for share in ROOM:
-        space = {"samples_per_ray": share * fitted.space.samples_per_ray, "step": fitted.space.step / share}
-        yield "samples a ray", {f"space.{key}": value for key, value in space.items()}, 0
+        schedule = {
+            "samples_per_ray": share * fitted.occupancy.pool_samples_per_ray,
+            "step": fitted.occupancy.step_size / share,
+        }
+        yield "samples a ray", {f"space.{key}": value for key, value in schedule.items()}, 0
     for factor in FACTORS:
         yield "pixels a view", {"data.factor": factor}, 0
     for count in VIEWS:

@@ -6,9 +6,8 @@ import time
 
 import speed_machine
 
-from jaxnerf.engine import records, workdir
-from jaxnerf.engine.evaluate import evaluate
-from jaxnerf.engine.loop import train_and_evaluate
+from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.training import metric_log, workdir
 
 
 def _curve(config, seconds, **overrides):
@@ -17,23 +16,27 @@ def _curve(config, seconds, **overrides):
 
 # The small network along whole rays: samples 0.03 apart where rays go from 2 to 6, and the octaves that
 # engine.fit chooses for these images where it knows a box.
-_DENSE = {"space.skip_empty": False, "sampling.num_fine": 0, "sampling.num_coarse": 133}
+_DENSE = {"sampler": "hierarchical", "sampling.num_fine": 0, "sampling.num_coarse": 133}
 _DENSE["fine.num_freqs"] = 7
 # Where nothing is known to be empty: no alpha, and octaves and steps as far apart with skipping as without.
-_EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "space.masks": False, "fine.num_freqs": 7}
-_EMBEDDED["space.step"] = 0.03
+_EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "occupancy.use_alpha": False, "fine.num_freqs": 7}
+_EMBEDDED["occupancy.step_size"] = 0.03
 _FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.background": "none"}
-_FERN |= {"space.masks": False, "space.step": 2 / 133, "fine.num_freqs": 7}
+_FERN |= {"occupancy.use_alpha": False, "occupancy.step_size": 2 / 133, "fine.num_freqs": 7}
 _FOX = {"data.format": "transforms", "data.dir": "fox"}
 # No look ever finds a cell empty, nothing is hidden, and the same pool takes all steps of fewer rays.
-_NO_LOOKS = {"space.update_every": 10**8, "space.hide_beyond": 0.0, "space.fog_until": 0}
-_NO_LOOKS |= {"space.samples_per_ray": 243, "train.batch_size": 43}
+_NO_LOOKS = {
+    "occupancy.update_every": 10**8,
+    "occupancy.max_optical_depth": 0.0,
+    "occupancy.long_steps_until": 0,
+}
+_NO_LOOKS |= {"occupancy.pool_samples_per_ray": 243, "train.batch_size": 43}
 # At the rate that lego_mlp_fast.py had before Muon.
 _ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4}
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
 CURVES = {
     "grid": _curve("lego_fast", (15, 30, 45, 60, 90, 120, 180, 300)),
-    "grid without alpha": _curve("lego_fast", (30, 60, 90, 180, 300), **{"space.masks": False}),
+    "grid without alpha": _curve("lego_fast", (30, 60, 90, 180, 300), **{"occupancy.use_alpha": False}),
     "grid 200": _curve("lego_fast", (30, 60, 100, 180, 360), **{"data.factor": 4}),
     "grid 400": _curve("lego_fast", (60, 150, 300, 600), **{"data.factor": 2}),
     "small network": _curve("lego_mlp_fast", (30, 60, 120, 240, 480)),
@@ -47,7 +50,7 @@ CURVES = {
     "fox everywhere": _curve("capture", (60, 120), **_FOX | _NO_LOOKS),
     "dense": _curve("lego_small", (60, 120, 300, 600)),
     "paper": _curve("default", (600, 1800), **_PAPER),
-    "paper skipping": _curve("default", (600, 1800), **_PAPER, **{"space.skip_empty": True}),
+    "paper skipping": _curve("default", (600, 1800), **_PAPER, **{"sampler": "occupancy"}),
 }
 SEEDED = "grid"  # the curve that is run with several seeds
 
@@ -106,7 +109,7 @@ def run_to(stop, config, where, before):
     machine's speed just before and after it.
     """
     config.train.max_seconds = float(stop)
-    fresh = not records.read_rows(where)
+    fresh = not metric_log.read_rows(where)
     speed, started = [speed_machine.matrix_gflops()], time.perf_counter()
     if not train_and_evaluate(config, where):
         return None

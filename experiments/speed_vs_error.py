@@ -19,7 +19,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent))  # confi
 import table  # noqa: E402  which defines --readme
 from absl import flags  # noqa: E402
 
-from jaxnerf import app  # noqa: E402
+from jaxnerf.runtime import cli  # noqa: E402
 
 PARTS = ("training", "rendering", "limits", "cost")
 _OUT = flags.DEFINE_string("out", None, "Folder of what is measured.", required=True)
@@ -49,9 +49,7 @@ def main(argv):
         except KeyboardInterrupt:
             finished = False
         if not finished:
-            raise ValueError(
-                f"stopped; what was measured is in {out}, and the same command goes on from there"
-            )
+            raise ValueError(f"stopped; what was measured is in {out}, and the same command goes on from there")
     measured = {part: _read(out / f"{part}.json") for part in PARTS}
     lines = speed_report.report(measured)
     print("\n".join([*lines, "", *speed_report.published()]))
@@ -108,10 +106,10 @@ def _read(path):
 
 
 def _write(path, content):
-    from jaxnerf.engine.workdir import write_text
+    from jaxnerf.training.workdir import write_text
 
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

@@ -22,7 +22,8 @@ import numpy as np
 import table  # which defines --readme
 from absl import flags
 
-from jaxnerf import Rays, Samples, app, render_samples
+from jaxnerf import Rays, Samples, render_samples
+from jaxnerf.runtime import cli
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "tests"))
 
@@ -73,10 +74,7 @@ def family(name, cases, others):
         )
     # Its depth and disparity follow other conventions, which are no failures.
     naive_checks = [
-        check
-        for case in others
-        for check in case.run()
-        if not ({"depth", "disparity"} & set(check.what.split()))
+        check for case in others for check in case.run() if not ({"depth", "disparity"} & set(check.what.split()))
     ]
     return (
         name,
@@ -182,9 +180,7 @@ def _value_and_slopes(render):
         return sum((getattr(seen, name) * slope).sum() for name, slope in slopes.items()), seen
 
     run = jax.jit(jax.value_and_grad(total, has_aux=True))
-    return lambda given: run(
-        (given["density"], given["rgb"]), given["rays"], given["samples"], given["slopes"]
-    )
+    return lambda given: run((given["density"], given["rgb"]), given["rays"], given["samples"], given["slopes"])
 
 
 def _seconds(run, arrays):
@@ -194,4 +190,4 @@ def _seconds(run, arrays):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

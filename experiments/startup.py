@@ -20,7 +20,7 @@ import paired_runs
 import table  # which defines --readme
 from absl import flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 MARKS = ("<!-- startup -->", "<!-- end of startup -->")
 HEADS = ("config", "first start", "of it compiling", "second start", "another seed")
@@ -80,4 +80,4 @@ def start(config, cache, seed):
 
 
 if __name__ == "__main__":
-    app.run(main, stopped="and changed nothing")
+    cli.run(main, stopped="and changed nothing")

@@ -21,9 +21,10 @@ import jax
 import jax.numpy as jnp
 from absl import app, flags
 
-from jaxnerf.engine import build, parallel
-from jaxnerf.engine.state import create_state
-from jaxnerf.engine.step import make_train_step
+from jaxnerf.runtime import devices
+from jaxnerf.training import build
+from jaxnerf.training.state import create_state
+from jaxnerf.training.step import make_train_step
 
 _CONFIG = flags.DEFINE_string("config", "configs/blender_paper.py", "Run whose step is measured.")
 _REPEATS = flags.DEFINE_integer("repeats", 3, "Timings of each figure; the best counts.")
@@ -44,7 +45,7 @@ def main(argv):
     flags_set = os.environ.get("XLA_FLAGS", "")
     print(f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores, XLA_FLAGS={flags_set!r}")
     rays = config.train.batch_size
-    share = parallel.default_block(rays, experiment.samples_per_ray, jax.default_backend())
+    share = devices.default_microbatch(rays, experiment.samples_per_ray, jax.default_backend())
     chains = {
         (rows, layout): _chain(config, rows, layout)
         for layout in ("rows first", "features first")
@@ -78,9 +79,9 @@ def _experiment():
 def _compiled(experiment, views, block):
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
     state = functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed)
-    sizes = {"batch_size": experiment.train.batch_size, "block_size": block}
+    sizes = {"batch_size": experiment.train.batch_size, "microbatch_size": block}
     samples = experiment.samples_per_ray
-    return parallel.compile_step(step, state, (views, None), samples_per_ray=samples, mode="jit", **sizes)
+    return devices.compile_step(step, state, (views, None), samples_per_ray=samples, mode="jit", **sizes)
 
 
 def _step(experiment, views, block):
@@ -102,8 +103,7 @@ def _chain(config, rows, layout):
         sizes = _layers(network)
         keys = jax.random.split(jax.random.key(0), len(sizes))
         kernels = {
-            name: jax.random.normal(key, size) / 16
-            for key, (name, size) in zip(keys, sizes.items(), strict=True)
+            name: jax.random.normal(key, size) / 16 for key, (name, size) in zip(keys, sizes.items(), strict=True)
         }
         encoded = sizes["trunk_0"][0]
         x = jnp.ones((rows, encoded) if layout == "rows first" else (encoded, rows))

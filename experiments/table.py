@@ -11,8 +11,8 @@ import pathlib
 
 from absl import flags
 
-from jaxnerf import app
-from jaxnerf.engine.workdir import write_text
+from jaxnerf.runtime import cli
+from jaxnerf.training.workdir import write_text
 
 _README = flags.DEFINE_string("readme", None, "File whose table is replaced.")
 _TABLE = flags.DEFINE_string("table", "results", "Which table of that file.")
@@ -24,9 +24,7 @@ def main(argv):
     """Prints the table of the workdirs named on the command line."""
     paths = sorted(path for folder in argv[1:] for path in pathlib.Path(folder).glob("eval/*/results.json"))
     if not paths:
-        raise ValueError(
-            f"{argv[1:]}: no eval/*/results.json; run python -m jaxnerf.eval --workdir=... first"
-        )
+        raise ValueError(f"{argv[1:]}: no eval/*/results.json; run python -m jaxnerf.eval --workdir=... first")
     rows = [row(path) for path in sorted(paths, key=lambda path: (path.parts[:-2], int_prefix(path)))]
     lines = markdown(HEADS, rows)
     print("\n".join(lines))
@@ -71,4 +69,4 @@ def replace(readme, lines, marks=MARKS):
 
 
 if __name__ == "__main__":
-    app.run(main, positional=True)
+    cli.run(main, positional=True)

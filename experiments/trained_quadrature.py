@@ -19,11 +19,13 @@ import quadrature_report
 from absl import flags
 from quadrature import error, measure
 
-from jaxnerf import app, render_hierarchical, render_rays
-from jaxnerf.data.batches import pixel_colors
-from jaxnerf.engine import load, workdir
-from jaxnerf.engine.scenes import background_of
+from jaxnerf import render_hierarchical, render_rays
+from jaxnerf.data.dataset import background_of
+from jaxnerf.data.ray_batches import pixel_colors
+from jaxnerf.evaluation import restore
 from jaxnerf.fields.mlp import mlp_field
+from jaxnerf.runtime import cli
+from jaxnerf.training import workdir
 
 flags.DEFINE_list("workdir", None, "Folders of trained runs.", required=True)
 flags.DEFINE_integer("test_rays", 1024, "Rays, spread over the test views.")
@@ -47,8 +49,8 @@ def main(argv):
 def study(folder):
     """Returns the figures of one run."""
     config = workdir.read_config(folder)
-    run = load.open_run(folder, config)
-    step = load.newest_step(run, folder)
+    run = restore.restore_run(folder, config)
+    step = restore.newest_step(run, folder)
     params, _ = run.weights(step)
     rays, photographed = test_rays(run.experiment, FLAGS.test_rays)
     background = background_of(config.data)
@@ -106,9 +108,7 @@ def reference(config, params, rays, options):
         scene = functools.partial(field(config.fine, compute_dtype="float64").apply, params)
 
         def colours(number, rule="segments"):
-            return np.asarray(
-                jax.jit(functools.partial(in_blocks, [scene], number, options | {"rule": rule}))(rays)
-            )
+            return np.asarray(jax.jit(functools.partial(in_blocks, [scene], number, options | {"rule": rule}))(rays))
 
         number, truth = FLAGS.dense, colours(FLAGS.dense)
         while True:
@@ -141,4 +141,4 @@ def psnr(rgb, photographed):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

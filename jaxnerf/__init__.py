@@ -1,23 +1,32 @@
-"""Neural radiance fields as pure functions: rays, samples, weights, images, for any scene.
+"""Neural radiance fields as pure functions: rays, samples, weights and images of any scene.
 
 A scene is any function (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S], rgb [..., S, 3]).
-Importing this needs jax only; load_scene brings in the rest when it is called.
+Importing this package needs jax and jaxtyping only. What reads data or runs is imported when it is first used.
 """
 
+import importlib as _importlib
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, rays_from_pixels, undistort
-from jaxnerf.core.compositing import (
-    composite,
-    expected_depth,
-    expected_disparity,
-    transmittance,
-    weights_from_density,
-)
 from jaxnerf.core.encoding import positional_encoding
+from jaxnerf.core.losses import distortion_loss
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
-from jaxnerf.core.occupancy import Grid, create_grid, grid_of_scene, restrict_scene, update_grid
-from jaxnerf.core.packing import render_packed
-from jaxnerf.core.paths import look_at, turntable
-from jaxnerf.core.rendering import positions, render_hierarchical, render_image, render_rays, render_samples
+from jaxnerf.core.occupancy.grid import (
+    OccupancyGrid,
+    create_grid,
+    grid_from_scene,
+    mask_scene,
+    update_grid,
+)
+from jaxnerf.core.occupancy.packed import render_packed
+from jaxnerf.core.poses import look_at, turntable
+from jaxnerf.core.rendering import (
+    points_on_rays,
+    render_hierarchical,
+    render_image,
+    render_rays,
+    render_samples,
+)
 from jaxnerf.core.sampling import (
     importance_points,
     inverse_cdf,
@@ -27,27 +36,48 @@ from jaxnerf.core.sampling import (
     stepped_edges,
     uniform_edges,
 )
-from jaxnerf.core.structs import Batch, Camera, Rays, Rendering, Samples, SceneFn, Views
+from jaxnerf.core.types import Batch, Camera, PackedSamples, Rays, Rendering, Samples, SceneFn, Views
+from jaxnerf.core.volume_rendering import (
+    composite,
+    expected_depth,
+    expected_disparity,
+    transmittance,
+    weights_from_density,
+)
+from jaxnerf.registry import register_field, register_loss, register_reader, register_sampler
+
+if _TYPE_CHECKING:
+    from jaxnerf.data.dataset import load_dataset
+    from jaxnerf.data.ray_batches import draw_batch
+    from jaxnerf.evaluation.evaluate import train_and_evaluate
+    from jaxnerf.evaluation.restore import TrainedRun, load_scene, restore_run
+    from jaxnerf.fields.hash_grid import hash_grid_field
+    from jaxnerf.fields.mlp import mlp_field
+    from jaxnerf.fields.still_life import still_life
 
 __version__ = "0.1.0"
 
+_ON_DEMAND = {
+    "load_dataset": "jaxnerf.data.dataset",
+    "draw_batch": "jaxnerf.data.ray_batches",
+    "mlp_field": "jaxnerf.fields.mlp",
+    "hash_grid_field": "jaxnerf.fields.hash_grid",
+    "still_life": "jaxnerf.fields.still_life",
+    "load_scene": "jaxnerf.evaluation.restore",
+    "restore_run": "jaxnerf.evaluation.restore",
+    "TrainedRun": "jaxnerf.evaluation.restore",
+    "train_and_evaluate": "jaxnerf.evaluation.evaluate",
+}
 
-def load_scene(workdir):
-    """Returns a trained model for other code.
 
-    Args:
-        workdir: the folder that jaxnerf.train wrote.
+def __getattr__(name):
+    if name not in _ON_DEMAND:
+        raise AttributeError(f"module 'jaxnerf' has no attribute {name!r}")
+    return getattr(_importlib.import_module(_ON_DEMAND[name]), name)
 
-    Returns:
-        scene, the trained field as a function (x, viewdirs) -> (density, rgb); and render, a jitted
-        function Rays [...] -> Rendering [...] with the sampling and background it was trained for.
 
-    Raises:
-        ValueError: if the folder holds no finished checkpoint; names it.
-    """
-    from jaxnerf.engine.load import load_scene
-
-    return load_scene(workdir)
+def __dir__():
+    return sorted([*globals(), *_ON_DEMAND])
 
 
 __all__ = [
@@ -56,15 +86,20 @@ __all__ = [
     "turntable",
     # samples along rays
     "Samples", "uniform_edges", "stepped_edges", "samples_from_edges", "samples_from_points", "inverse_cdf",
-    "importance_points", "merge_edges", "positions",
+    "importance_points", "merge_edges", "points_on_rays",
     # from densities to colour
     "Rendering", "weights_from_density", "transmittance", "composite", "expected_depth", "expected_disparity",
-    # whole renderers
+    # renderers
     "SceneFn", "render_samples", "render_rays", "render_hierarchical", "render_image",
-    # only where there is something
-    "Grid", "create_grid", "update_grid", "grid_of_scene", "restrict_scene", "render_packed",
-    # encodings, metrics, data
-    "positional_encoding", "mse", "psnr", "ssim", "round_to_8_bits", "Views", "Batch",
-    # trained models
-    "load_scene",
+    # occupancy
+    "OccupancyGrid", "PackedSamples", "create_grid", "update_grid", "grid_from_scene", "mask_scene",
+    "render_packed",
+    # encodings, metrics, losses
+    "positional_encoding", "mse", "psnr", "ssim", "round_to_8_bits", "distortion_loss",
+    # data and fields
+    "Views", "Batch", "load_dataset", "draw_batch", "mlp_field", "hash_grid_field", "still_life",
+    # runs
+    "load_scene", "restore_run", "TrainedRun", "train_and_evaluate",
+    # registration
+    "register_field", "register_sampler", "register_loss", "register_reader",
 ]  # fmt: skip

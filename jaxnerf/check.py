@@ -8,12 +8,10 @@ import sys
 
 from absl import flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder.")
-_FORMAT = flags.DEFINE_string(
-    "format", "auto", "blender, transforms, colmap or llff; auto: as training would."
-)
+_FORMAT = flags.DEFINE_string("format", "auto", "blender, transforms, colmap or llff; auto: as training would.")
 _NEAR = flags.DEFINE_float("near", None, "Where training's rays begin, in t; its default when not given.")
 _FAR = flags.DEFINE_float("far", None, "Where they end.")
 _OUT = flags.DEFINE_string("out", None, "PNG of cameras and points; check-<folder>.png here when not given.")
@@ -22,9 +20,10 @@ _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier picture."
 
 def main(argv):
     del argv
-    from jaxnerf.data import camera_plot, inspection
-    from jaxnerf.data.checks import check_range
-    from jaxnerf.engine.scenes import scene_folder
+    from jaxnerf.capture_check import camera_plot
+    from jaxnerf.capture_check.report import inspect
+    from jaxnerf.data.dataset import scene_folder
+    from jaxnerf.data.readers.validation import check_range
 
     if not _DATA_DIR.value:
         raise ValueError("nothing to check: give --data_dir=DIR of a capture")
@@ -32,7 +31,7 @@ def main(argv):
         check_range(_NEAR.value, _FAR.value)
     folder = scene_folder(_DATA_DIR.value)
     out = _picture(folder)
-    report = inspection.inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value)
+    report = inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value)
     flagged = {index for finding in report.findings for index in finding.frames}
     camera_plot.plot_cameras(report.capture, report.poses, report.places, flagged=flagged).save(out)
     print(report.text())
@@ -55,4 +54,4 @@ def _picture(folder):
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

@@ -7,7 +7,7 @@ like any other.
 from absl import flags
 from ml_collections import config_flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 _WEIGHTS = flags.DEFINE_list(
     "weights",
@@ -25,11 +25,11 @@ flags.mark_flags_as_required(["weights", "config", "workdir"])
 
 def main(argv):
     del argv
-    from jaxnerf.engine.convert import convert  # after the flags: a wrong one is said at once
+    from jaxnerf.interop.convert import convert  # after the flags: a wrong one is said at once
 
-    config = app.use_data(_CONFIG.value, _DATA_DIR.value)
+    config = cli.use_data(_CONFIG.value, _DATA_DIR.value)
     print(convert(_WEIGHTS.value, config, _WORKDIR.value, legacy_posenc_order=_LEGACY.value))
 
 
 if __name__ == "__main__":
-    app.run(main, stopped="before anything was written; the same command starts again")
+    cli.run(main, stopped="before anything was written; the same command starts again")

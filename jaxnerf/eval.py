@@ -3,18 +3,18 @@
 from absl import flags
 from ml_collections import config_flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "In place of the workdir's own.", lock_config=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.")
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
 _SPLIT = flags.DEFINE_string("split", None, "Of the scene; config.eval.split when not given.")
 _STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
-_CHUNK = app.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
+_CHUNK = cli.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
 _WATCH = flags.DEFINE_bool("watch", False, "Score new checkpoints as they come, until training's last step.")
 _POLL = flags.DEFINE_float("poll_seconds", 10.0, "How often --watch looks.", lower_bound=0.01)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier result.")
-_SKIP_EMPTY = flags.DEFINE_bool("skip_empty", None, "Leave out what is not seen of a dense model.")
+_BAKE_OCCUPANCY = flags.DEFINE_bool("bake_occupancy", None, "Leave out what is not seen of a dense model.")
 _ERROR_BUDGET = flags.DEFINE_float(
     "error_budget",
     None,
@@ -34,7 +34,9 @@ _SHARD = flags.DEFINE_string(
 
 def main(argv):
     del argv
-    from jaxnerf.engine import budget, evaluate, predictions, shards, watch, workdir
+    from jaxnerf.evaluation import evaluate, external, quality_search, watch
+    from jaxnerf.runtime import shards
+    from jaxnerf.training import workdir
 
     if not (_WORKDIR.value or _PREDICTIONS.value):
         raise ValueError("nothing to score: give --workdir=DIR of a run, or --predictions=DIR of images")
@@ -48,9 +50,9 @@ def main(argv):
     if config is None and _WORKDIR.value and not _WATCH.value:
         config = workdir.read_config(_WORKDIR.value)
     if config is not None:
-        app.use_data(config, _DATA_DIR.value)
+        cli.use_data(config, _DATA_DIR.value)
     if _PREDICTIONS.value:
-        results = predictions.score_folder(
+        results = external.score_folder(
             _PREDICTIONS.value, config=config, split=_SPLIT.value, overwrite=_OVERWRITE.value
         )
     elif _WATCH.value:
@@ -64,9 +66,9 @@ def main(argv):
         )
         return
     else:
-        settings = {} if _SKIP_EMPTY.value is None else {"skip_empty": _SKIP_EMPTY.value}
+        settings = {} if _BAKE_OCCUPANCY.value is None else {"bake_occupancy": _BAKE_OCCUPANCY.value}
         if _ERROR_BUDGET.value is not None:
-            settings = budget.choose(
+            settings = quality_search.choose(
                 _WORKDIR.value,
                 _ERROR_BUDGET.value,
                 config=config,
@@ -92,4 +94,4 @@ def main(argv):
 
 
 if __name__ == "__main__":
-    app.run(main, stopped="between two views; the same command goes on from there")
+    cli.run(main, stopped="between two views; the same command goes on from there")

@@ -4,14 +4,14 @@ import sys
 
 from absl import flags
 
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 _SIDE = {"lower_bound": 1, "upper_bound": 16384}
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
-_CHUNK = app.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
-_SKIP_EMPTY = flags.DEFINE_bool("skip_empty", None, "Leave out what is not seen of a dense model.")
+_CHUNK = cli.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
+_BAKE_OCCUPANCY = flags.DEFINE_bool("bake_occupancy", None, "Leave out what is not seen of a dense model.")
 _PATH = flags.DEFINE_string(
     "path", None, "turntable, spiral, ellipse, interpolate or FILE.json; chosen by the views when not given."
 )
@@ -35,15 +35,15 @@ _SHARD = flags.DEFINE_string(
 
 def main(argv):
     del argv
-    from jaxnerf.engine import shards
-    from jaxnerf.engine.frames import render_path
+    from jaxnerf.evaluation.paths.render_path import render_path
+    from jaxnerf.runtime import shards
 
     written = render_path(
         _WORKDIR.value,
         path=_PATH.value,
         step=_STEP.value,
         data_dir=_DATA_DIR.value,
-        settings={} if _SKIP_EMPTY.value is None else {"skip_empty": _SKIP_EMPTY.value},
+        settings={} if _BAKE_OCCUPANCY.value is None else {"bake_occupancy": _BAKE_OCCUPANCY.value},
         size=(_WIDTH.value, _HEIGHT.value),
         num_frames=_FRAMES.value,
         closed=_CLOSED.value,
@@ -62,4 +62,4 @@ def main(argv):
 
 
 if __name__ == "__main__":
-    app.run(main, stopped="between two frames; the same command goes on from there")
+    cli.run(main, stopped="between two frames; the same command goes on from there")

@@ -17,10 +17,11 @@ import jax
 import numpy as np
 from PIL import Image
 
-from jaxnerf.core import cameras, paths, rendering
-from jaxnerf.core.structs import Camera, Rays
+from jaxnerf.core import cameras, rendering
+from jaxnerf.core.poses import look_at
+from jaxnerf.core.types import Camera, Rays
 from jaxnerf.data import synthetic
-from jaxnerf.fields import showcase
+from jaxnerf.fields import still_life
 
 WHITE = (1.0, 1.0, 1.0)
 SKY = 30.0  # radius of the textured sphere around an unbounded capture, world units
@@ -126,9 +127,7 @@ def hidden(height, width):
     return mask
 
 
-def write_images(
-    folder, shots, *, kind="png", bits=8, background=WHITE, rgba=False, masks=False, orientation=1
-):
+def write_images(folder, shots, *, kind="png", bits=8, background=WHITE, rgba=False, masks=False, orientation=1):
     """Writes images/<name>.<kind>, and masks/<name>.png, and returns the images' paths below the folder.
 
     Args:
@@ -235,9 +234,7 @@ def write_colmap(folder, shots, *, points=None, **images):
         pose = " ".join(repr(float(value)) for value in (*_quaternion(rotation.T), *shift))
         lines.append(f"{index + 1} {pose} {model} {path.removeprefix('images/')}")
         marks = np.flatnonzero(points.seen[index])
-        lines.append(
-            " ".join(f"{x!r} {y!r} {k + 1}" for k in marks for x, y in [points.at[index, k].tolist()])
-        )
+        lines.append(" ".join(f"{x!r} {y!r} {k + 1}" for k in marks for x, y in [points.at[index, k].tolist()]))
         for place, k in enumerate(marks):
             tracks[k].append(f"{index + 1} {place}")
     model_lines = [f"{number} {line}" for line, number in models.items()]
@@ -254,10 +251,7 @@ def write_colmap(folder, shots, *, points=None, **images):
 
 def write_llff(folder, shots, *, points=None, **images):
     """Writes the capture as images/ and poses_bounds.npy; its cameras must be pinholes of one kind."""
-    if (
-        len({tuple(_intrinsics(shot.camera).items()) for shot in shots}) > 1
-        or shots[0].camera.lens != "pinhole"
-    ):
+    if len({tuple(_intrinsics(shot.camera).items()) for shot in shots}) > 1 or shots[0].camera.lens != "pinhole":
         raise ValueError("LLFF has one pinhole camera for all images, these shots have others")
     write_images(folder, shots, **images)
     points = surface_points(shots) if points is None else points
@@ -317,7 +311,7 @@ def surface_points(shots, *, count=200, seed=0, sharp=0.06):
     return Points(xyz[kept], rgb[kept], seen[:, kept], at[:, kept], depth[:, kept])
 
 
-_look_at = jax.jit(paths.look_at)
+_look_at = jax.jit(look_at)
 
 
 def _aim(eyes, targets, height, width, lens, changes):
@@ -367,7 +361,7 @@ def _depths(rays, chunk=512):
 
 @jax.jit
 def _depth_of(rays):
-    result = rendering.render_rays(None, showcase.scene, rays, num_samples=384)
+    result = rendering.render_rays(None, still_life.still_life, rays, num_samples=384)
     middle = (np.arange(384, dtype=np.float32) + 0.5) / 384
     t = rays.near[:, None] + (rays.far - rays.near)[:, None] * middle[None]
     square = (result.weights * (t - result.depth[:, None]) ** 2).sum(axis=-1)

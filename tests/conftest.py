@@ -5,9 +5,7 @@ import pathlib
 
 # Both are read once, when JAX starts, so they are set before anything imports it.
 os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ["XLA_FLAGS"] = (
-    f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
-)
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

@@ -52,13 +52,13 @@ def rays_past_origin(seed, count):
 
 def full_grid(half=30.0, shape=(6, 5, 8)):
     """Returns a Grid of a cube around the origin, all of which is occupied."""
-    return create_grid(np.full(3, -half), np.full(3, half), np.ones(shape, bool), assumed=1.0)
+    return create_grid(np.full(3, -half), np.full(3, half), np.ones(shape, bool), initial_density=1.0)
 
 
 def checked_grid(half=1.5, shape=(6, 5, 8)):
     """Returns a Grid of a cube around the origin of which every other cell is empty."""
-    possible = np.indices(shape).sum(axis=0) % 2 == 0
-    return create_grid(np.full(3, -half), np.full(3, half), possible, assumed=1.0)
+    valid = np.indices(shape).sum(axis=0) % 2 == 0
+    return create_grid(np.full(3, -half), np.full(3, half), valid, initial_density=1.0)
 
 
 def all_finite(tree):

@@ -138,7 +138,5 @@ def ssim(a, b, size=11, sigma=1.5, k1=0.01, k2=0.03):
                 mp, mq = np.sum(window * p), np.sum(window * q)
                 vp, vq = np.sum(window * (p - mp) ** 2), np.sum(window * (q - mq) ** 2)
                 cov = np.sum(window * (p - mp) * (q - mq))
-                values.append(
-                    (2 * mp * mq + k1**2) * (2 * cov + k2**2) / ((mp**2 + mq**2 + k1**2) * (vp + vq + k2**2))
-                )
+                values.append((2 * mp * mq + k1**2) * (2 * cov + k2**2) / ((mp**2 + mq**2 + k1**2) * (vp + vq + k2**2)))
     return np.mean(values)

@@ -108,9 +108,7 @@ def random_layer(rng, rows, columns, shift=0.0):
     return kernel.astype(np.float32), (shift + 0.1 * rng.normal(size=columns)).astype(np.float32)
 
 
-def random_layers(
-    seed, *, depth=DEPTH, width=WIDTH, skip=SKIP, view_width=VIEW_WIDTH, freqs=(10, 4), views=True
-):
+def random_layers(seed, *, depth=DEPTH, width=WIDTH, skip=SKIP, view_width=VIEW_WIDTH, freqs=(10, 4), views=True):
     """Returns layers in Keras' order: trunk, bottleneck, view, rgb, alpha; or trunk, output of 5."""
     rng = np.random.default_rng(seed)
     points, directions = (3 + 6 * count for count in freqs)
@@ -127,9 +125,7 @@ def as_state_dict(layers):
     """Returns random layers under nerf-pytorch's names, transposed."""
     trunk, heads = (layers[:-4], layers[-4:]) if layers[-1][0].shape[1] == 1 else (layers[:-1], layers[-1:])
     names = ["feature_linear", "views_linears.0", "rgb_linear", "alpha_linear"]
-    names = [f"pts_linears.{i}" for i in range(len(trunk))] + (
-        names if len(heads) == 4 else ["output_linear"]
-    )
+    names = [f"pts_linears.{i}" for i in range(len(trunk))] + (names if len(heads) == 4 else ["output_linear"])
     state = {}
     for name, (kernel, bias) in zip(names, layers, strict=True):
         state[f"{name}.weight"], state[f"{name}.bias"] = np.ascontiguousarray(kernel.T), bias

@@ -24,17 +24,17 @@ def smoke_config(**train):
 # What makes configs/smoke.py a grid field asked only where something is. Its pool has room for all samples,
 # so that nothing depends on how many devices share it.
 PACKED = {
-    "field": "grid",
-    "space.skip_empty": True,
-    "space.step": 0.2,
-    "space.resolution": 16,
-    "space.update_every": 4,
-    "space.samples_per_ray": 32,
-    "space.fog_until": 3,
-    "features.resolutions": (8, 16),
-    "features.table_size": 2048,
-    "features.width": 16,
-    "features.view_width": 16,
+    "field": "hash_grid",
+    "sampler": "occupancy",
+    "occupancy.step_size": 0.2,
+    "occupancy.resolution": 16,
+    "occupancy.update_every": 4,
+    "occupancy.pool_samples_per_ray": 32,
+    "occupancy.long_steps_until": 3,
+    "hash_grid.resolutions": (8, 16),
+    "hash_grid.table_size": 2048,
+    "hash_grid.width": 16,
+    "hash_grid.view_width": 16,
 }
 
 

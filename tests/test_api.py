@@ -26,7 +26,7 @@ SURFACE = {
     "inverse_cdf": "edges weights u |",
     "importance_points": "key edges weights | num_points floor=0.0",
     "merge_edges": "edges points |",
-    "positions": "rays t |",
+    "points_on_rays": "rays t |",
     "weights_from_density": "density length | rule='segments'",
     "transmittance": "density length |",
     "composite": "weights values | background=None transmittance=None",
@@ -87,15 +87,21 @@ def test_docstring_says_what_goes_in_and_what_comes_out(name):
     assert text.startswith("Returns ")
     if name in SURFACE:
         parameters = inspect.signature(function).parameters
-        assert [p for p in parameters if not re.search(rf"\b{p}\b", text)] == [], (
-            "parameters it does not name"
-        )
-    if name in SURFACE and name not in ("positions", "look_at"):  # these say it all in a line
+        assert [p for p in parameters if not re.search(rf"\b{p}\b", text)] == [], "parameters it does not name"
+    if name in SURFACE and name not in ("points_on_rays", "look_at"):  # these say it all in a line
         assert "Args:" in text and ("Returns:" in text or "Returns [" in text)
 
 
 # What has a source in the paper, its code or the literature names it; the others are one plain line of maths.
-PLAIN = {"uniform_edges", "merge_edges", "positions", "render_image", "load_scene", "look_at", "turntable"}
+PLAIN = {
+    "uniform_edges",
+    "merge_edges",
+    "points_on_rays",
+    "render_image",
+    "load_scene",
+    "look_at",
+    "turntable",
+}
 PLAIN |= {
     "mse",
     "round_to_8_bits",
@@ -117,7 +123,5 @@ def test_import_is_light():
     heavy = ["absl", "ml_collections", "imageio", "flax", "optax"]
     code = f"import sys, jaxnerf; print([name for name in {heavy} if name in sys.modules])"
     root = pathlib.Path(__file__).resolve().parent.parent
-    result = subprocess.run(
-        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
-    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxnerf.engine import pictures, workdir
-from jaxnerf.engine.checkpoint import Checkpoints
-from jaxnerf.engine.evaluate import evaluate
-from jaxnerf.engine.loop import train_and_evaluate
-from jaxnerf.engine.records import read_rows
+from jaxnerf.evaluation import pictures
+from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.training import workdir
+from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.metric_log import read_rows
 from runs import SMOKE_FLAGS, run, smoke_config
 
-pytest_plugins = ["engine_fixtures"]
+pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
 
 SCENE = ("--config.data.format=blender", "--config.data.dir=nowhere")
@@ -64,9 +64,7 @@ def test_evaluating_an_empty_folder_leaves_it_empty(tmp_path):
     assert files(tmp_path) == {}
 
 
-@pytest.mark.parametrize(
-    "text", ['{"seed": 0, "data": {"for', "[1]", "{}", '"text"', '{"seed": 0, "data": 3}']
-)
+@pytest.mark.parametrize("text", ['{"seed": 0, "data": {"for', "[1]", "{}", '"text"', '{"seed": 0, "data": 3}'])
 def test_a_corrupt_config_is_named(trained, tmp_path, text):
     folder = shutil.copytree(trained, tmp_path / "run")
     (folder / "config.json").write_text(text)
@@ -81,9 +79,7 @@ def test_a_workdir_of_another_configuration_is_left_alone(trained):
     before = files(trained)
     config = smoke_config(batch_size=32)
     config.fine.width = 32
-    with pytest.raises(
-        ValueError, match="belongs to a run with another .*fine.width 16 -> 32.*batch_size 64 -> 32"
-    ):
+    with pytest.raises(ValueError, match="belongs to a run with another .*fine.width 16 -> 32.*batch_size 64 -> 32"):
         train_and_evaluate(config, trained)
     assert files(trained) == before
     assert_one_line(run("train", f"--workdir={trained}", *SMOKE_FLAGS, "--config.seed=1"), "seed 0 -> 1")
@@ -95,9 +91,7 @@ def blender_scene(folder, frames=1):
     pose[2, 3] = 4
     for split, count in (("train", frames), ("test", 0)):
         entries = [{"file_path": f"./{split}_{i}", "transform_matrix": pose.tolist()} for i in range(count)]
-        (folder / f"transforms_{split}.json").write_text(
-            json.dumps({"camera_angle_x": 0.7, "frames": entries})
-        )
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": entries}))
         for i in range(count):
             Image.new("RGBA", (12, 12), (200, 100, 0, 128)).save(folder / f"{split}_{i}.png")
     return folder
@@ -179,18 +173,16 @@ def test_a_disk_full_of_checkpoints_keeps_the_whole_ones(trained, tmp_path):
             "train",
             f"--workdir={disk}/run",
             *SMOKE_FLAGS,
-            "--config.train.keep=100",
+            "--config.train.max_to_keep=100",
             "--config.train.max_steps=1000",
         )
         assert result[0] == 1
         assert "Traceback" not in result[2]
-        assert (
-            result[2].splitlines()[-1].startswith("error: ") and "space" in result[2].splitlines()[-1].lower()
-        )
+        assert result[2].splitlines()[-1].startswith("error: ") and "space" in result[2].splitlines()[-1].lower()
         steps = Checkpoints(disk / "run").steps()
         assert steps and steps == list(range(5, steps[-1] + 1, 5))
         kept = shutil.copytree(disk / "run", tmp_path / "kept")
     finally:
         subprocess.run(["umount", "-l", disk], check=True)
-    assert train_and_evaluate(smoke_config(keep=100, max_steps=steps[-1] + 5), kept)
+    assert train_and_evaluate(smoke_config(max_to_keep=100, max_steps=steps[-1] + 5), kept)
     assert [row["step"] for row in read_rows(kept)] == list(range(5, steps[-1] + 6, 5))

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from jaxnerf import Camera, Views
-from jaxnerf.engine.build import build
+from jaxnerf.training.build import build
 from runs import ROOT
 
 NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.py"))
@@ -21,12 +21,12 @@ def load(name):
 
 def with_sizes(config):
     """Returns the configuration with what its views would fill in."""
-    if config.space.skip_empty:
+    if config.occupancy.skip_empty:
         sizes = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3, "resolution": 8, "step": 0.1}
         sizes["outside"] = "nothing"
         config.data.background = config.data.background or "none"
-        config.space.update({name: size for name, size in sizes.items() if not config.space[name]})
-        config.features.resolutions = config.features.resolutions or (4, 8)
+        config.occupancy.update({name: size for name, size in sizes.items() if not config.occupancy[name]})
+        config.hash_grid.resolutions = config.hash_grid.resolutions or (4, 8)
         config.fine.num_freqs = config.fine.num_freqs or 4
         config.train.max_steps = config.train.max_steps or 100
         config.train.lr_steps = config.train.lr_steps or config.train.max_steps
@@ -52,7 +52,7 @@ def test_it_builds_and_invents_no_field(name):
         assert value is None or type(value) is type(known[field]), field
     experiment = build(with_sizes(config))
     params = jax.eval_shape(experiment.model.init, jax.random.key(0))
-    assert ("coarse" in params) == (bool(config.sampling.num_fine) and not config.space.skip_empty)
+    assert ("coarse" in params) == (bool(config.sampling.num_fine) and not config.occupancy.skip_empty)
     assert float(experiment.schedule(config.train.lr_steps)) == pytest.approx(config.train.lr_final)
     assert experiment.conventions["background"] == config.data.background
 
@@ -122,7 +122,7 @@ def test_the_papers_values(name, own):
 def test_where_paper_and_code_disagree_a_comment_says_which():
     for name in ("blender_paper", "llff_paper"):
         source = (ROOT / "configs" / f"{name}.py").read_text()
-        for word in ("pixel_offset", "importance_floor", "lr_init" if name == "llff_paper" else "batching"):
+        for word in ("pixel_offset", "importance_padding", "lr_init" if name == "llff_paper" else "batching"):
             place = source.index(word)
             assert re.search(r"#.*(paper|code)", source[place - 150 : place + 150]), (name, word)
 
@@ -146,7 +146,7 @@ def test_the_learning_rate_falls_exponentially():
         ("train.batching", "rays", "train.batching is 'rays'"),
         ("fine.density_activation", "tanh", "density_activation is 'tanh'"),
         ("field", "grid", "field is 'grid' with space.skip_empty off"),
-        ("space.skip_empty", True, "space.lower is open"),
+        ("occupancy.skip_empty", True, "occupancy.lower is open"),
     ],
 )
 def test_what_cannot_be_built_is_named(field, value, wanted):
@@ -172,12 +172,8 @@ def _render_jaxpr(experiment):
     model = experiment.model
     params = jax.eval_shape(model.init, jax.random.key(0))
     keys = jax.eval_shape(lambda key: jax.random.split(key, 4), jax.random.key(0))
-    camera = Camera(
-        to_world=jax.numpy.eye(3, 4)[None], focal=jax.numpy.ones((1, 2)), center=jax.numpy.ones((1, 2))
-    )
-    views = Views(
-        pixels=None, offset=None, size=None, cameras=camera, near=jax.numpy.ones(1), far=jax.numpy.ones(1)
-    )
+    camera = Camera(to_world=jax.numpy.eye(3, 4)[None], focal=jax.numpy.ones((1, 2)), center=jax.numpy.ones((1, 2)))
+    views = Views(pixels=None, offset=None, size=None, cameras=camera, near=jax.numpy.ones(1), far=jax.numpy.ones(1))
     rays = jax.eval_shape(lambda: experiment.view_rays(views, 0, jax.numpy.ones((4, 2))))
     return jax.make_jaxpr(model.render)(keys, params, None, rays, 0)
 
@@ -201,9 +197,7 @@ def test_one_module_alone_reads_the_configuration():
         read = {
             node.attr
             for node in ast.walk(tree)
-            if isinstance(node, ast.Attribute)
-            and isinstance(node.value, ast.Name)
-            and node.value.id == "config"
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "config"
         } - {"to_json_best_effort", "update"}
         # To put --data_dir and other settings in, or to read what fit.py looks at.
         allowed = {"engine/load.py": {"data", "eval"}, "engine/loop.py": {"data"}}

@@ -88,10 +88,7 @@ def test_grad_through_scan_vmap_and_shard_map_is_the_slope(cameras):
         return (jax.vmap(render, in_axes=(None, 0))(params, cameras) ** 2).mean()
 
     def scanned(params):
-        return (
-            jax.lax.scan(lambda s, camera: (s + (render(params, camera) ** 2).mean(), None), 0.0, cameras)[0]
-            / 4
-        )
+        return jax.lax.scan(lambda s, camera: (s + (render(params, camera) ** 2).mean(), None), 0.0, cameras)[0] / 4
 
     def sharded(params):
         def share(params, stack):
@@ -183,6 +180,4 @@ def test_the_readmes_first_example_needs_jax_alone(bare, tmp_path):
 def test_importing_it_loads_none_of_the_rest():
     code = "import jaxnerf, sys; print(*sorted({name.split('.')[0] for name in sys.modules}))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"absl", "ml_collections", "imageio", "flax", "optax", "orbax", "PIL"} & set(
-        result.stdout.split()
-    )
+    assert not {"absl", "ml_collections", "imageio", "flax", "optax", "orbax", "PIL"} & set(result.stdout.split())

@@ -8,16 +8,17 @@ import types
 import jax
 import jax.numpy as jnp
 import numpy as np
+from test_step import toy_draw, toy_model
 
 from helpers import random_rays
-from jaxnerf.engine import hosts, loop, shards
-from jaxnerf.engine.build import build
-from jaxnerf.engine.checkpoint import Checkpoints
-from jaxnerf.engine.space import make_space
-from jaxnerf.engine.step import TrainData
-from jaxnerf.fields.mlp import Field
+from jaxnerf.fields.base import Field
+from jaxnerf.models.grid_schedule import make_grid_schedule
+from jaxnerf.runtime import processes, shards
+from jaxnerf.training import loop
+from jaxnerf.training.build import build
+from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.step import TrainData
 from runs import smoke_config
-from test_step import toy_draw, toy_model
 
 STEPS, RAYS = 6, 64
 
@@ -30,12 +31,12 @@ def toy_experiment():
     def render(keys, params, grid, rays, step):
         seen = plain.render(keys, params, grid, rays, step)
         full = (rays.origins[:, 0] > 1.0).astype(jnp.int32)
-        return tuple(types.SimpleNamespace(rgb=one.rgb, dropped=full) for one in seen)
+        return tuple(types.SimpleNamespace(rgb=one.rgb, num_dropped=full) for one in seen)
 
     def density(params, x, viewdirs):
         return jax.nn.relu(x @ params["w"])[..., 0], x
 
-    space = make_space(
+    schedule = make_grid_schedule(
         (-1.0, -1.0, -1.0),
         (1.0, 1.0, 1.0),
         resolution=4,
@@ -43,12 +44,12 @@ def toy_experiment():
         field=Field(None, density),
         threshold=0.02,
         update_every=2,
-        look_at_once=64,
-        passes_from_start=0,
+        cells_per_update=64,
+        initial_passes=0,
     )
     cells = np.arange(0, 64, 2, dtype=np.int32)
     return experiment._replace(
-        model=types.SimpleNamespace(init=plain.init, render=render, space=space, entrances={}),
+        model=types.SimpleNamespace(init=plain.init, render=render, grid_schedule=schedule, input_layers={}),
         draw=lambda step, positions, data: toy_draw(step, positions, (rays, jnp.array([-1]))),
         survey=lambda views: (None, TrainData(np.uint32(0), views, None, cells)),
     )
@@ -75,5 +76,5 @@ def train(folder, views):
 
 
 if __name__ == "__main__":
-    with hosts.cluster():
+    with processes.cluster():
         train(pathlib.Path(sys.argv[1]), toy_experiment().load_views("train"))

@@ -9,8 +9,9 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxnerf import app, train
-from jaxnerf.engine import build
+from jaxnerf import train
+from jaxnerf.runtime import cli
+from jaxnerf.training import build
 
 _load_views = build.load_views
 
@@ -27,4 +28,4 @@ def _widen(leaf):
 
 if __name__ == "__main__":
     build.load_views = load_views
-    app.run(train.main)
+    cli.run(train.main)

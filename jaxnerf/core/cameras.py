@@ -8,8 +8,8 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxnerf.core.numerics import divide, norm, normalize
-from jaxnerf.core.structs import Rays, check_shapes
+from jaxnerf.core.safe_math import divide, norm, normalize
+from jaxnerf.core.types import Rays, check_shapes
 
 
 def pixel_grid(height, width, *, offset=0.5):
@@ -44,9 +44,7 @@ def undistort(camera, pixels):
         ValueError: on other shapes or an unknown lens.
     """
     pixels = jnp.asarray(pixels)
-    check_shapes(
-        "undistort", pixels=(pixels, "... 2"), focal=(camera.focal, "2"), center=(camera.center, "2")
-    )
+    check_shapes("undistort", pixels=(pixels, "... 2"), focal=(camera.focal, "2"), center=(camera.center, "2"))
     lead = (1,) * (pixels.ndim - 1)
     focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
     target = (pixels - center) / focal
@@ -246,9 +244,9 @@ def _equidistant(distortion, point):
 def _growing(distort, distortion, point):
     """Returns whether the image grows from the axis to a point [2]: past a fold a pixel is met again."""
     fractions = jnp.linspace(0, 1, 32, dtype=point.dtype)
-    _, slopes = jax.vmap(
-        lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),))
-    )(fractions)
+    _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),)))(
+        fractions
+    )
     return ((slopes * point[None]).sum(axis=-1)[1:] > 0).all() | (norm(point) == 0)
 
 

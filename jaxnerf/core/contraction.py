@@ -5,7 +5,7 @@ The largest component takes the place of the length there, so that what comes ou
 
 import jax.numpy as jnp
 
-from jaxnerf.core.structs import check_shapes
+from jaxnerf.core.types import check_shapes
 
 
 def contract(x):

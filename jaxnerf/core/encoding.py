@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from jaxnerf.core.numerics import at_least_float32
+from jaxnerf.core.safe_math import at_least_float32
 
 # 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half a float32's
 # digits is exact. Six pieces hold |x| 2^k up to 1e6 * 2^15 to 2^-27 of a turn.

@@ -5,8 +5,8 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxnerf.core.numerics import at_least_float32
-from jaxnerf.core.structs import check_shapes
+from jaxnerf.core.safe_math import at_least_float32
+from jaxnerf.core.types import check_shapes
 
 
 def mse(a, b, *, mask=None):
@@ -74,9 +74,7 @@ def ssim(a, b):
     check_shapes("ssim", a=(a, "... H W C"), b=(b, "... H W C"))
     size, deviation = 11, 1.5
     if min(a.shape[-3:-1]) < size:
-        raise ValueError(
-            f"ssim: images are {a.shape[-3]} x {a.shape[-2]} px, wanted at least {size} x {size}"
-        )
+        raise ValueError(f"ssim: images are {a.shape[-3]} x {a.shape[-2]} px, wanted at least {size} x {size}")
     bells = [math.exp(-(((i - size // 2) / deviation) ** 2) / 2) for i in range(size)]
     window = [bell / sum(bells) for bell in bells]
 

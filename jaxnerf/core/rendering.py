@@ -6,14 +6,14 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxnerf.core import compositing, sampling
-from jaxnerf.core.numerics import norm
-from jaxnerf.core.structs import Rendering, check_shapes, without_weights
+from jaxnerf.core import sampling, volume_rendering
+from jaxnerf.core.safe_math import norm
+from jaxnerf.core.types import Rendering, Samples, check_shapes, without_samples
 
 
-def positions(rays, t):
+def points_on_rays(rays, t):
     """Returns the points x(t) = o + t d on rays [...], for t [..., S]: [..., S, 3] in world units."""
-    check_shapes("positions", origins=(rays.origins, "... 3"), t=(t, "... S"))
+    check_shapes("points_on_rays", origins=(rays.origins, "... 3"), t=(t, "... S"))
     return rays.origins[..., None, :] + t[..., None] * rays.directions[..., None, :]
 
 
@@ -44,24 +44,25 @@ def render_samples(scene, rays, samples, *, background=None):
     )
     kept = ~(samples.delta <= 0)  # NaN is kept, and shows
     t = jnp.where(kept, samples.t, jnp.broadcast_to(rays.near[..., None], samples.t.shape))
-    x = positions(rays, t)
+    x = points_on_rays(rays, t)
     x = jnp.where(kept[..., None], x, jax.lax.stop_gradient(x))  # nor may a slope of NaN come back
     density, rgb = scene(x, rays.viewdirs[..., None, :])
-    check_answer("render_samples", density, rgb, x)
+    check_scene_output("render_samples", density, rgb, x)
     density = jnp.where(kept, density, 0)
     rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # as composite sums them
-    length = world_length(samples.delta, rays.directions)
+    length = segment_lengths(samples.delta, rays.directions)
     dtype = jnp.result_type(length.dtype, density.dtype, rgb.dtype)
     density, rgb = density.astype(dtype), rgb.astype(dtype)  # once, or each sum rounds its slopes to bfloat16
-    weights = compositing.weights_from_density(density, length, rule=samples.rule)
-    passing = compositing.transmittance(density, length)
+    weights = volume_rendering.weights_from_density(density, length, rule=samples.rule)
+    passing = volume_rendering.transmittance(density, length)
     return Rendering(
-        rgb=compositing.composite(weights, rgb, background=background, transmittance=passing),
-        opacity=compositing.opacity(density, length),
-        depth=compositing.expected_depth(weights, t, passing, far=rays.far),
-        disparity=compositing.expected_disparity(weights, t),
+        rgb=volume_rendering.composite(weights, rgb, background=background, transmittance=passing),
+        opacity=volume_rendering.opacity(density, length),
+        depth=volume_rendering.expected_depth(weights, t, passing, far=rays.far),
+        disparity=volume_rendering.expected_disparity(weights, t),
         weights=weights,
-        dropped=jnp.zeros(t.shape[:-1], jnp.int32),
+        num_dropped=jnp.zeros(t.shape[:-1], jnp.int32),
+        samples=Samples(t=t, delta=jnp.where(kept, samples.delta, 0), rule=samples.rule),
     )
 
 
@@ -113,7 +114,7 @@ def render_hierarchical(
     num_fine,
     rule="segments",
     in_disparity=False,
-    importance_floor=0.0,
+    importance_padding=0.0,
     background=None,
 ):
     """Returns what rays see of two scenes, the second asked where the first has weight (Section 5.2).
@@ -147,16 +148,12 @@ def render_hierarchical(
     if rule == "points":
         # The released codes draw between the middles of the coarse points, from the inner weights.
         middles, inner = sampling.midpoints(samples.t), first.weights[..., 1:-1]
-        points = sampling.importance_points(
-            point_key, middles, inner, num_points=num_fine, floor=importance_floor
-        )
+        points = sampling.importance_points(point_key, middles, inner, num_points=num_fine, padding=importance_padding)
         samples = sampling.samples_from_points(sampling.merge_edges(samples.t, points))
     else:
         cells = _cells("num_fine", num_fine, rule)
         weights = first.weights.reshape(*edges.shape[:-1], edges.shape[-1] - 1, -1).sum(axis=-1)
-        points = sampling.importance_points(
-            point_key, edges, weights, num_points=cells, floor=importance_floor
-        )
+        points = sampling.importance_points(point_key, edges, weights, num_points=cells, padding=importance_padding)
         samples = sampling.samples_from_edges(fine_key, sampling.merge_edges(edges, points), rule=rule)
     return first, render_samples(fine, rays, samples, background=background)
 
@@ -182,7 +179,7 @@ def render_image(render, rays, *, chunk):
     parts = []
     for start in range(0, count, chunk):
         part = render(_chunk_of(rays, start, chunk=chunk))
-        parts.append(without_weights(part))
+        parts.append(without_samples(part))
     return _joined(parts, shape=shape)
 
 
@@ -202,7 +199,7 @@ def _joined(parts, *, shape):
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
 
 
-def check_answer(function, density, rgb, x):
+def check_scene_output(function, density, rgb, x):
     """Raises a ValueError unless a scene's answer has the shapes that positions x [..., 3] want."""
     if density.shape != x.shape[:-1] or rgb.shape != x.shape:
         raise ValueError(
@@ -211,7 +208,7 @@ def check_answer(function, density, rgb, x):
         )
 
 
-def world_length(delta, directions):
+def segment_lengths(delta, directions):
     """Returns delta in world units; kept apart from an endless one, whose derivative would be 0 times inf."""
     size = norm(directions)[..., None]
     endless = jnp.isinf(delta)
@@ -219,9 +216,7 @@ def world_length(delta, directions):
 
 
 def _even_points(key, rays, num_samples, in_disparity):
-    t = sampling.stratified_points(
-        key, rays.near, rays.far, num_points=num_samples, in_disparity=in_disparity
-    )
+    t = sampling.stratified_points(key, rays.near, rays.far, num_points=num_samples, in_disparity=in_disparity)
     return sampling.samples_from_points(t)
 
 
@@ -235,7 +230,5 @@ def _cells(name, num_samples, rule):
     if rule not in ("segments", "gauss"):
         raise ValueError(f"rule is {rule!r}, wanted 'segments', 'gauss' or 'points'")
     if rule == "gauss" and num_samples % 2:
-        raise ValueError(
-            f"{name} is {num_samples}, wanted an even number for rule 'gauss', which asks in pairs"
-        )
+        raise ValueError(f"{name} is {num_samples}, wanted an even number for rule 'gauss', which asks in pairs")
     return num_samples // 2 if rule == "gauss" else num_samples

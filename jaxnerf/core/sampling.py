@@ -5,8 +5,8 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxnerf.core.numerics import at_least_float32, divide, hold
-from jaxnerf.core.structs import Samples, check_shapes
+from jaxnerf.core.safe_math import at_least_float32, clamp, divide
+from jaxnerf.core.types import Samples, check_shapes
 
 
 def uniform_edges(near, far, *, num_segments, in_disparity=False):
@@ -33,17 +33,15 @@ def uniform_edges(near, far, *, num_segments, in_disparity=False):
     s = (jnp.arange(1, num_segments, dtype=dtype) / num_segments).reshape((1,) * (near.ndim - 1) + (-1,))
     if in_disparity:
         if _is_known(~(near > 0).all()):
-            raise ValueError(
-                f"uniform_edges: near has {near.min()}, disparity 1 / t wants near > 0; raise near"
-            )
+            raise ValueError(f"uniform_edges: near has {near.min()}, disparity 1 / t wants near > 0; raise near")
         inner = near / ((1 - s) + s * (near / far))
     else:
         inner = near + (far - near) * s
-    inner = hold(inner, near, far)  # a rounding past the end would put samples outside
+    inner = clamp(inner, near, far)  # a rounding past the end would put samples outside
     return jnp.concatenate([near, inner, far], axis=-1)
 
 
-def stepped_edges(key, near, far, *, step, num_segments):
+def stepped_edges(key, near, far, *, step_size, num_segments):
     """Returns the edges of segments of one length, so that a ray has as many as it is long.
 
     What the marching of arXiv:2201.05989 does with one draw a ray, in place of Eq. 2's one a segment.
@@ -52,7 +50,7 @@ def stepped_edges(key, near, far, *, step, num_segments):
         key: None, one key, or one key a ray [...]: moves all edges of a ray by one draw of up to a step,
             which costs one number a ray. None moves none.
         near, far: [...] in t, near <= far, both finite.
-        step: [...] or a number, in t, > 0.
+        step_size: [...] or a number, in t, > 0.
         num_segments: S >= 1. Those past far are empty; where S steps do not reach far, the last is longer.
 
     Returns:
@@ -67,7 +65,7 @@ def stepped_edges(key, near, far, *, step, num_segments):
         raise ValueError(f"stepped_edges: num_segments is {num_segments}, wanted at least 1")
     moved = 0.0 if key is None else uniform(key, (*near.shape, 1))
     count = jnp.arange(1, num_segments, dtype=near.dtype).reshape((1,) * near.ndim + (-1,))
-    step = jnp.broadcast_to(jnp.asarray(step, near.dtype), near.shape)
+    step = jnp.broadcast_to(jnp.asarray(step_size, near.dtype), near.shape)
     inner = near[..., None] + (count - moved) * step[..., None]
     inner = jnp.minimum(inner, far[..., None])
     return jnp.concatenate([near[..., None], inner, far[..., None]], axis=-1)
@@ -166,10 +164,10 @@ def inverse_cdf(edges, weights, u):
     lower, upper = _take(edges, index), _take(edges, index + 1)
     width = upper_sum - lower_sum
     share = jnp.where(width > 0, divide(target - lower_sum, jnp.where(width > 0, width, 1)), 0)
-    return hold(_part_way(lower, upper, share), lower, upper)
+    return clamp(_part_way(lower, upper, share), lower, upper)
 
 
-def importance_points(key, edges, weights, *, num_points, floor=0.0):
+def importance_points(key, edges, weights, *, num_points, padding=0.0):
     """Returns points that lie dense where the weight is (Section 5.2).
 
     Stratified: one uniform draw in each of N equal shares of the weight, which keeps the
@@ -180,7 +178,7 @@ def importance_points(key, edges, weights, *, num_points, floor=0.0):
         edges: [..., S + 1] ascending, in t.
         weights: [..., S] >= 0. Where all are 0 the points spread evenly over the segments.
         num_points: N >= 1.
-        floor: added to every weight. The released codes use 1e-5 against division by zero, which
+        padding: added to every weight. The released codes use 1e-5 against division by zero, which
             pulls samples into empty space wherever a ray is nearly empty; here it is for parity.
 
     Returns:
@@ -197,7 +195,7 @@ def importance_points(key, edges, weights, *, num_points, floor=0.0):
         jnp.arange(num_points + 1, dtype=weights.dtype) / num_points, (*shape[:-1], num_points + 1)
     )
     u = _between(key, shares[..., :-1], shares[..., 1:])
-    return inverse_cdf(edges, weights + floor if floor else weights, u)
+    return inverse_cdf(edges, weights + padding if padding else weights, u)
 
 
 def merge_edges(edges, points):
@@ -291,7 +289,7 @@ def _per_ray(function, keys):
 def _gauss_samples(edges):
     lower, upper = edges[..., :-1], edges[..., 1:]
     shares = [0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12)]
-    t = jnp.stack([hold(_part_way(lower, upper, share), lower, upper) for share in shares], axis=-1)
+    t = jnp.stack([clamp(_part_way(lower, upper, share), lower, upper) for share in shares], axis=-1)
     half = 0.5 * _width(lower, upper)
     delta = jnp.stack([half, half], axis=-1)
     flat = (*lower.shape[:-1], 2 * lower.shape[-1])
@@ -307,14 +305,14 @@ def _moved_edges(key, edges):
 def _between(key, lower, upper):
     """A draw in [lower, upper) or the middle, never past either end by rounding."""
     if key is None:
-        return hold(_part_way(lower, upper, 0.5), lower, upper)
+        return clamp(_part_way(lower, upper, 0.5), lower, upper)
     draw = _part_way(lower, upper, uniform(key, lower.shape).astype(lower.dtype))
     # Edges are rounded themselves: a draw this close to one may lie in the next of the exact bins.
     finite_upper = jnp.where(jnp.isinf(upper), lower, upper)
     rounding = 2 * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(finite_upper))
     margin = jnp.minimum(rounding, 0.25 * (finite_upper - lower))
     below = jnp.nextafter(*jax.lax.stop_gradient((upper, lower)))
-    return hold(draw, lower + margin, jnp.minimum(upper - margin, below))
+    return clamp(draw, lower + margin, jnp.minimum(upper - margin, below))
 
 
 def _part_way(lower, upper, share):

@@ -10,18 +10,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core import cameras, compositing, paths, rendering, sampling, structs
-from jaxnerf.core.structs import Camera, Rays, Views
-from jaxnerf.data import images
-from jaxnerf.data.cache import load_or_make
-from jaxnerf.fields import showcase
+from jaxnerf.core import cameras, poses, rendering, sampling, types, volume_rendering
+from jaxnerf.core.poses import look_at
+from jaxnerf.core.types import Camera, Rays, Views
+from jaxnerf.data.images import image_files
+from jaxnerf.fields import still_life
+from jaxnerf.runtime.user_cache import load_or_make
 
 _COUNT = {"train": 60, "val": 8, "test": 8}
 _DISTANCE = 4.0  # of every camera from the origin, world units
 _DEPTH = 1.4  # of the scene before and behind the origin along any axis: the plinth's edge is 1.27 from it
 _CYLINDER = {"radius": 1.14, "ends": (-0.97, 1.1)}  # around the z axis, holds all density; world units
 _WHITE = (1.0, 1.0, 1.0)
-FINISHES = {"usual": showcase.scene, "matt": showcase.matt_scene, "shiny": showcase.shiny_scene}
+FINISHES = {"usual": still_life.still_life, "matt": still_life.matt_scene, "shiny": still_life.shiny_scene}
 
 
 def load_views(*, split="train", size=100, finish="usual", cache=None):
@@ -71,7 +72,7 @@ def load_views(*, split="train", size=100, finish="usual", cache=None):
     )
 
 
-def render_views(stack, scene=showcase.scene, *, num_segments=384, chunk=1024):
+def render_views(stack, scene=still_life.still_life, *, num_segments=384, chunk=1024):
     """Returns the pixels of a stack of V cameras, [V * H * W, 4] uint16 with straight alpha.
 
     Args:
@@ -90,12 +91,10 @@ def render_views(stack, scene=showcase.scene, *, num_segments=384, chunk=1024):
         for start in range(0, indices.size, chunk):
             index = indices[np.minimum(np.arange(start, start + chunk), indices.size - 1)]  # one shape
             part = jax.tree.map(lambda leaf, index=index: leaf[index], rays)
-            parts.append(
-                _render(part, scene, num_segments // share)
-            )  # returns at once: the device stays busy
+            parts.append(_render(part, scene, num_segments // share))  # returns at once: the device stays busy
         if parts:
             seen[indices] = np.concatenate(parts)[: indices.size]
-    return images.to_straight(seen[:, :3], seen[:, 3], background=_WHITE)
+    return image_files.to_straight(seen[:, :3], seen[:, 3], background=_WHITE)
 
 
 def scene_rays(stack):
@@ -152,9 +151,9 @@ def _cameras(split, size):
     azimuth = golden * steps + list(_COUNT).index(split)  # a radian between splits: no pose comes twice
     around = np.sqrt(1 - height**2)
     eyes = _DISTANCE * np.stack([around * np.cos(azimuth), around * np.sin(azimuth), height], axis=-1)
-    poses = jax.vmap(lambda eye: paths.look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))(eyes)
+    to_world = jax.vmap(lambda eye: look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))(eyes)
     return Camera(
-        to_world=np.asarray(poses),
+        to_world=np.asarray(to_world),
         focal=np.full((count, 2), 1.36 * size, np.float32),  # the whole plinth fits
         center=np.full((count, 2), size / 2, np.float32),
         height=size,
@@ -165,6 +164,6 @@ def _cameras(split, size):
 def _fingerprint():
     """Returns a hash of the source code that the pixels depend on: a changed scene is rendered anew."""
     own = sys.modules[__name__]
-    modules = (showcase, cameras, compositing, paths, rendering, sampling, structs, images, own)
+    modules = (still_life, cameras, volume_rendering, poses, rendering, sampling, types, image_files, own)
     source = "".join(inspect.getsource(module) for module in modules)
     return hashlib.sha256(source.encode()).hexdigest()[:16]

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnerf.core.numerics import norm
-from jaxnerf.core.structs import SceneFn
+from jaxnerf.core.safe_math import norm
+from jaxnerf.core.types import SceneFn
 
 GREY = (0.5, 0.5, 0.5)
 

@@ -1,8 +1,7 @@
 """The paper's network: a multilayer perceptron on encoded positions and directions (Fig. 7)."""
 
-import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,18 +10,9 @@ from flax import linen
 
 from jaxnerf.core.encoding import encode_planes
 from jaxnerf.core.sampling import normal
+from jaxnerf.fields.base import Box, Field, apply_network
 
-_COLLIDING = 512  # float32 numbers, 2 KiB
-_ASIDE, _FEW = 32, 16  # samples; rays, of which one more would be much
 DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
-
-
-class Field(NamedTuple):
-    """A learned scene: init(key) -> params, and apply(params, x, viewdirs) -> (density, rgb)."""
-
-    init: Callable[[jax.Array], Any]
-    apply: Callable[..., tuple[jax.Array, jax.Array]]
-    entrances: tuple[str, ...] = ()  # names in params of what the position enters; (): all of them
 
 
 def mlp_field(**options):
@@ -52,13 +42,19 @@ def mlp_field(**options):
         return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
 
     def apply(params, x, viewdirs, *, key=None, density_noise=0.0):
-        density, rgb = ask(network, params, x, viewdirs)
+        density, rgb = apply_network(network, params, x, viewdirs)
         if key is not None and density_noise:
             density = density + density_noise * normal(key, density.shape)
         return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
 
-    entrances = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
-    return Field(init, apply, tuple(f"trunk_{layer}" for layer in entrances))
+    layers = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
+    return Field(init, apply, tuple(f"trunk_{layer}" for layer in layers))
+
+
+def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
+    """Makes the field "mlp" from a section of a config; it needs no box."""
+    del box
+    return mlp_field(**{**options, "compute_dtype": jnp.dtype(options["compute_dtype"])})
 
 
 class MLP(linen.Module):
@@ -142,26 +138,6 @@ class Dense(Affine):
         for rows, value in zip(blocks, inputs, strict=True):
             total = total + jnp.tensordot(rows.astype(value.dtype), value, axes=(0, 0))
         return total
-
-
-def ask(network, params, x, viewdirs):
-    """Returns a network's [..., S] and [..., S, 3] for x [..., S, 3] and viewdirs [..., 1 or S, 3].
-
-    Rows of features that are a multiple of 2 KiB long share few places of a CPU's cache, which slows each
-    product down: then it is asked for one ray more, or, of few rays, for a few samples more of each.
-    """
-    *leading, samples = shape = x.shape[:-1]
-    rays = math.prod(leading)
-    if not rays * samples or rays * samples % _COLLIDING:
-        return network.apply({"params": params}, x, viewdirs)
-    more = (0, _ASIDE) if rays < _FEW else (1, 0)
-
-    def pad(vectors):
-        vectors = jnp.broadcast_to(vectors, (*leading, *vectors.shape[-2:])).reshape(rays, -1, 3)
-        return jnp.pad(vectors, [(0, more[0]), (0, more[1] * (vectors.shape[1] > 1)), (0, 0)])
-
-    density, rgb = network.apply({"params": params}, pad(x), pad(viewdirs))
-    return density[:rays, :samples].reshape(shape), rgb[:rays, :samples].reshape(*shape, 3)
 
 
 def planes(vectors):

@@ -12,7 +12,7 @@ import numpy as np
 
 from hard_cases.checks import Case, Check, absolute, count, not_finite, relative
 from jaxnerf import Camera, Rays, look_at, ndc_rays, pixel_grid, rays_from_pixels, undistort
-from jaxnerf.core.numerics import norm, normalize
+from jaxnerf.core.safe_math import norm, normalize
 
 EPS = float(np.finfo(np.float32).eps)
 COUNT, FOCAL, HEIGHT, WIDTH = 500, 400.0, 300, 400
@@ -20,21 +20,15 @@ LENSES, PIXELS, STEPS = 12, 160, 80
 
 
 def cases():
-    found = [
-        Case("cameras", f"NDC: {name}", functools.partial(_ndc, *rays)) for name, rays in forward().items()
-    ]
+    found = [Case("cameras", f"NDC: {name}", functools.partial(_ndc, *rays)) for name, rays in forward().items()]
     found += [
         Case("cameras", f"length {length:g}", functools.partial(_length, length))
         for length in (0.0, 1e-30, 1e-20, 1.0, 1e20, 1e37)
     ]
     found.append(Case("cameras", "components over 60 decades", _mixed))
     found.append(Case("cameras", "a camera 1e6 away", _far_away))
-    found += [
-        Case("cameras", f"{LENSES} random {name} lenses", functools.partial(_lenses, name)) for name in LENS
-    ]
-    found.append(
-        Case("cameras", "lenses that bend nothing", functools.partial(_lenses, "opencv", still=True))
-    )
+    found += [Case("cameras", f"{LENSES} random {name} lenses", functools.partial(_lenses, name)) for name in LENS]
+    found.append(Case("cameras", "lenses that bend nothing", functools.partial(_lenses, "opencv", still=True)))
     return found
 
 
@@ -236,9 +230,7 @@ def _jacobian(lens, k, points):
 def _camera(**given):
     pose = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1).astype(np.float32)
     center, focal = jnp.array([WIDTH / 2, HEIGHT / 2]), jnp.full(2, FOCAL)
-    return Camera(
-        **({"to_world": pose, "focal": focal, "center": center, "height": HEIGHT, "width": WIDTH} | given)
-    )
+    return Camera(**({"to_world": pose, "focal": focal, "center": center, "height": HEIGHT, "width": WIDTH} | given))
 
 
 @functools.cache
@@ -271,9 +263,7 @@ def _ndc_compiled():
 @functools.cache
 def _norm_compiled():
     def both(vectors):
-        slopes = [
-            jax.grad(lambda v, f=f: f(v).sum())(vectors) for f in (norm, lambda v: normalize(v)[..., 0])
-        ]
+        slopes = [jax.grad(lambda v, f=f: f(v).sum())(vectors) for f in (norm, lambda v: normalize(v)[..., 0])]
         return norm(vectors), normalize(vectors), slopes
 
     run = jax.jit(both)

@@ -57,9 +57,7 @@ def checks(name, *, render=render_samples, outputs="float32"):
 
 def rounded(ray, outputs):
     """Returns the ray in float64 with the scene's answers rounded to a type."""
-    fields = {
-        key: np.asarray(jnp.asarray(ray[key]).astype(outputs), np.float64) for key in ("density", "rgb")
-    }
+    fields = {key: np.asarray(jnp.asarray(ray[key]).astype(outputs), np.float64) for key in ("density", "rgb")}
     return {key: np.asarray(value, np.float64) for key, value in ray.items()} | fields
 
 
@@ -131,9 +129,7 @@ def _measure(render, dtype, batch):
 
         seen = render(scene, rays, samples, background=given["background"])
         whole = render(white, rays, samples, background=ones).rgb[..., 0]
-        values = jnp.concatenate(
-            [seen.rgb, jnp.stack([seen.opacity, seen.depth, seen.disparity], axis=-1)], axis=-1
-        )
+        values = jnp.concatenate([seen.rgb, jnp.stack([seen.opacity, seen.depth, seen.disparity], axis=-1)], axis=-1)
         return values, (seen.weights, whole)
 
     values, pull, (weights, whole) = jax.vjp(outputs, {name: batch[name] for name in ARGUMENTS}, has_aux=True)

@@ -14,18 +14,13 @@ OCTAVES, COUNT = 16, 2000
 
 def cases(encode=positional_encoding):
     """Returns the cases; encode has the arguments of positional_encoding."""
-    return [
-        Case("encoding", name, functools.partial(_checks, encode, values))
-        for name, values in inputs().items()
-    ]
+    return [Case("encoding", name, functools.partial(_checks, encode, values)) for name, values in inputs().items()]
 
 
 def inputs():
     """Returns {name: x [COUNT]}."""
     rng = np.random.default_rng(0)
-    found = {
-        f"|x| up to {scale:g}": rng.uniform(-scale, scale, COUNT) for scale in (1e-6, 1, 10, 1e3, 1e5, 1e6)
-    }
+    found = {f"|x| up to {scale:g}": rng.uniform(-scale, scale, COUNT) for scale in (1e-6, 1, 10, 1e3, 1e5, 1e6)}
     whole = np.arange(COUNT) - COUNT // 2
     found["multiples of pi / 2"] = whole * (np.pi / 2)
     found["multiples of pi / 2 up to 1e6"] = np.linspace(-636619, 636619, COUNT).round() * (np.pi / 2)

@@ -52,8 +52,7 @@ def gradients(ray):
             by_rgb[:, index] = np.where(kept, weights, 0)
         by_density = by_depth * delta * size
         slope, rgb_slope = (
-            np.where(kept.reshape(-1, *[1] * (ray[key].ndim - 1)), ray[key], 0)
-            for key in ("slope", "rgb_slope")
+            np.where(kept.reshape(-1, *[1] * (ray[key].ndim - 1)), ray[key], 0) for key in ("slope", "rgb_slope")
         )
         by_x = by_density[:, None] * slope + (by_rgb[:, :, None] * rgb_slope).sum(axis=1)
         through = abs(by_density[:, None] * slope) + abs(by_rgb[:, :, None] * rgb_slope).sum(axis=1)
@@ -97,9 +96,7 @@ def _light(ray):
 def _values(ray):
     with np.errstate(divide="ignore"):
         disparity = 1 / np.asarray(ray["t"], np.longdouble)
-    colours = {
-        name: (ray["rgb"][:, i], ray["background"][i]) for i, name in enumerate(("red", "green", "blue"))
-    }
+    colours = {name: (ray["rgb"][:, i], ray["background"][i]) for i, name in enumerate(("red", "green", "blue"))}
     ones = np.ones_like(ray["t"])
     return colours | {"opacity": (ones, 0), "depth": (ray["t"], ray["far"]), "disparity": (disparity, 0)}
 

@@ -132,13 +132,9 @@ def _statistics():
         expected = DRAWS * weights.astype(np.float64) / weights.sum(dtype=np.float64)
         found.append(Check("draws outside the edges", float(DRAWS - counts.sum()), 0))
         square = float(((counts - expected) ** 2 / expected).sum())
-        found.append(
-            Check(f"chi-square, {points_a_ray} a ray", square, _chi_square(SEGMENTS - 1, 3.72), "chance")
-        )
+        found.append(Check(f"chi-square, {points_a_ray} a ray", square, _chi_square(SEGMENTS - 1, 3.72), "chance"))
         if points_a_ray == 1:
-            found.append(
-                Check("chi-square too small for chance", _chi_square(SEGMENTS - 1, -3.72), square, "chance")
-            )
+            found.append(Check("chi-square too small for chance", _chi_square(SEGMENTS - 1, -3.72), square, "chance"))
     return found
 
 

@@ -15,9 +15,7 @@ SHAPE = (13, 14, 3)
 
 def cases(psnr=psnr, ssim=ssim):
     """Returns the cases, of functions with the arguments of psnr and ssim."""
-    found = [
-        Case("metrics", name, functools.partial(_pair, psnr, ssim, a, b)) for name, (a, b) in pairs().items()
-    ]
+    found = [Case("metrics", name, functools.partial(_pair, psnr, ssim, a, b)) for name, (a, b) in pairs().items()]
     found += [
         Case("metrics", f"NaN in {where}", functools.partial(_nan, psnr, ssim, where))
         for where in ("the first pixel", "the last pixel", "every pixel")

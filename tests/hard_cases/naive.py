@@ -2,12 +2,12 @@
 
 import jax.numpy as jnp
 
-from jaxnerf import Rendering, positions
+from jaxnerf import Rendering, points_on_rays
 
 
 def render_samples(scene, rays, samples, *, background=None):
     """Returns what render_samples of jaxnerf does, as the 2020 code sums it."""
-    density, rgb = scene(positions(rays, samples.t), rays.viewdirs[..., None, :])
+    density, rgb = scene(points_on_rays(rays, samples.t), rays.viewdirs[..., None, :])
     length = samples.delta * jnp.linalg.norm(rays.directions, axis=-1, keepdims=True)
     return composite(density, rgb, samples.t, length, background=background)
 
@@ -22,9 +22,14 @@ def composite(density, rgb, t, length, *, background=None):
     disparity = 1.0 / jnp.maximum(1e-10, depth / opacity)
     if background is not None:
         colour = colour + (1.0 - opacity)[..., None] * background
-    dropped = jnp.zeros(opacity.shape, jnp.int32)
+    num_dropped = jnp.zeros(opacity.shape, jnp.int32)
     return Rendering(
-        rgb=colour, opacity=opacity, depth=depth, disparity=disparity, weights=weights, dropped=dropped
+        rgb=colour,
+        opacity=opacity,
+        depth=depth,
+        disparity=disparity,
+        weights=weights,
+        num_dropped=num_dropped,
     )
 
 
@@ -33,13 +38,10 @@ def inverse_cdf(edges, weights, u):
     weights = weights + 1e-5
     cdf = jnp.cumsum(weights / weights.sum(axis=-1, keepdims=True), axis=-1)
     cdf = jnp.concatenate([jnp.zeros_like(cdf[..., :1]), cdf], axis=-1)
-    above = jnp.vectorize(lambda row, u: jnp.searchsorted(row, u, side="right"), signature="(s),(n)->(n)")(
-        cdf, u
-    )
+    above = jnp.vectorize(lambda row, u: jnp.searchsorted(row, u, side="right"), signature="(s),(n)->(n)")(cdf, u)
     below, above = jnp.maximum(above - 1, 0), jnp.minimum(above, cdf.shape[-1] - 1)
     start, low, high = (
-        jnp.take_along_axis(values, index, axis=-1)
-        for values, index in ((cdf, below), (edges, below), (edges, above))
+        jnp.take_along_axis(values, index, axis=-1) for values, index in ((cdf, below), (edges, below), (edges, above))
     )
     width = jnp.take_along_axis(cdf, above, axis=-1) - start
     return low + (u - start) / jnp.where(width < 1e-5, 1.0, width) * (high - low)

@@ -30,13 +30,10 @@ RANGES = {  # name: near, far, whether in disparity
 def cases(edges=uniform_edges, samples=samples_from_edges):
     """Returns the cases, of functions with the arguments of uniform_edges and samples_from_edges."""
     found = [
-        Case("stratified", name, functools.partial(_range, edges, samples, *given))
-        for name, given in RANGES.items()
+        Case("stratified", name, functools.partial(_range, edges, samples, *given)) for name, given in RANGES.items()
     ]
     found.append(Case("stratified", "near <= 0 in disparity is an error", functools.partial(_wrong, edges)))
-    found.append(
-        Case("stratified", "draws are uniform in their bin", functools.partial(_even, edges, samples))
-    )
+    found.append(Case("stratified", "draws are uniform in their bin", functools.partial(_even, edges, samples)))
     return found
 
 

@@ -1,0 +1,177 @@
+"""The fast field: features at the vertices of several grids, and two small networks that read them."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen
+
+from jaxnerf.core.types import check_shapes
+from jaxnerf.fields.base import Box, Field, apply_network
+from jaxnerf.fields.mlp import Dense
+
+_glorot = linen.initializers.glorot_uniform()
+
+_PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, Eq. 4
+_LARGEST = 15.0  # its exponential stops all light within 1e-5 world units
+
+
+def hash_grid_field(**options):
+    """Returns features in grids of several resolutions as a Field (after arXiv:2201.05989).
+
+    Args:
+        **options: attributes of FeatureGrid.
+
+    Returns:
+        Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3]) returns density [..., S] in
+        1 / world unit, an exponential of at most e^15, and rgb [..., S, 3] in [0, 1], both float32.
+        Outside the box the answer is that of the nearest point inside.
+
+    Raises:
+        ValueError: if the box has no inside, or a level fewer than 2 vertices a side.
+    """
+    network = HashGrid(**options)
+    lower, upper = np.asarray(network.lower, float), np.asarray(network.upper, float)
+    if lower.shape != (3,) or upper.shape != (3,) or not (lower < upper).all():
+        raise ValueError(f"grid_field: the box is {network.lower} to {network.upper}, wanted lower < upper")
+    if not network.resolutions or min(network.resolutions) < 2:
+        raise ValueError(f"grid_field: resolutions are {network.resolutions}, wanted one, of at least 2")
+
+    def init(key):
+        return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
+
+    def apply(params, x, viewdirs):
+        density, rgb = apply_network(network, params, x, viewdirs)
+        return jnp.exp(jnp.minimum(density, _LARGEST)), jax.nn.sigmoid(rgb)
+
+    return Field(init, apply)
+
+
+def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
+    """Makes the field "hash_grid" from a section of a config, in the scene's box."""
+    resolutions = options["resolutions"]
+    if box is None or isinstance(resolutions, str):
+        raise ValueError(
+            "hash_grid.resolutions or the box of occupancy.lower and occupancy.upper is 'auto'; resolve the "
+            "config against a dataset, or set them"
+        )
+    return hash_grid_field(lower=box[0], upper=box[1], **options)
+
+
+class HashGrid(linen.Module):
+    """Interpolated features, a network for the density's logarithm, and one for colour (arXiv:2201.05989)."""
+
+    lower: Sequence[float]  # [3] world units, the box
+    upper: Sequence[float]  # [3]
+    resolutions: Sequence[int] = (16, 32, 64, 128)  # vertices along the longest side, a level each
+    features_per_level: int = 4
+    table_size: int = 2**17  # rows of a level; where it has more vertices, they share rows by a hash
+    width: int = 64  # of the density's hidden layer
+    geometry_features: int = 15  # passed from the density network to the colour network
+    view_depth: int = 2  # hidden layers of colour
+    view_width: int = 128
+    use_viewdirs: bool = True  # False: colour does not depend on the direction
+    feature_scale: float = 4.0  # of the features over their table: each step moves few of them, so further
+
+    @linen.compact
+    def __call__(self, x, viewdirs):
+        """Returns density [..., S] and rgb [..., S, 3] before their activations; features first inside."""
+        shape = x.shape[:-1]
+        side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
+        place = [(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)]
+        sizes = [vertices(side, resolution) for resolution in self.resolutions]
+        first = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes])
+        # One table for all levels: one gradient to clear and one array to update.
+        table = self.param("table", _near_zero, (int(first[-1]), self.features_per_level))
+        levels = [
+            interpolate(table, place, size, rows=range(*ends))
+            for size, ends in zip(sizes, np.stack([first[:-1], first[1:]], -1).tolist(), strict=True)
+        ]
+        features = self.feature_scale * jnp.concatenate(levels, axis=-1)
+        # Rows come from the table, but small layers are faster with features first.
+        kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
+        bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
+        hidden = jax.nn.relu(jnp.einsum("df,nd->fn", kernel, features) + bias[:, None])
+        geometry = Dense(1 + self.geometry_features, name="density")(hidden)
+        density, inputs = geometry[0], [geometry[1:]]
+        if self.use_viewdirs:
+            directions = jnp.broadcast_to(harmonics(viewdirs), (*shape, 9))
+            inputs.append(directions.reshape(-1, 9).T)
+        for layer in range(self.view_depth):
+            inputs = [jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(*inputs))]
+        rgb = Dense(3, name="rgb")(*inputs)
+        return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
+
+
+def vertices(side, resolution):
+    """Returns how many vertices a grid has along each side [3] of a box, for cells that are nearly cubes."""
+    side = np.asarray(side, np.float64)
+    return tuple(int(max(round(share * (resolution - 1)), 1)) + 1 for share in side / side.max())
+
+
+def interpolate(table, place, size, *, rows):
+    """Returns features, linear between the 8 vertices around each place.
+
+    Args:
+        table: [T, F] features of vertices.
+        place: three times [N], x, y and z as shares of the box; held inside it.
+        size: vertices along x, y and z.
+        rows: range of the table's rows that belong to this grid: one a vertex, z fastest, or fewer, which
+            vertices then share by the hash of arXiv:2201.05989 (Eq. 4).
+
+    Returns:
+        [N, F]. The derivative with respect to place is that of the linear pieces.
+
+    Raises:
+        ValueError: on another shape of the table.
+    """
+    check_shapes("interpolate", table=(table, "T F"), x=(place[0], "N"), y=(place[1], "N"), z=(place[2], "N"))
+    spread = [jnp.clip(value, 0, 1) * (count - 1) for value, count in zip(place, size, strict=True)]
+    low = [jnp.minimum(value.astype(jnp.int32), count - 2) for value, count in zip(spread, size, strict=True)]
+    share = [value - start for value, start in zip(spread, low, strict=True)]
+    weights = _of_corners(jnp.multiply, [(1 - part, part) for part in share])
+    total = 0.0
+    for row, weight in zip(_corner_rows(low, size, rows), weights, strict=True):
+        total = total + weight[:, None] * table.at[row].get(mode="promise_in_bounds")
+    return total
+
+
+def harmonics(directions):
+    """Returns the 9 real spherical harmonics [..., 9] of degree up to 2 of unit vectors [..., 3]."""
+    x, y, z = (directions[..., i] for i in range(3))
+    return jnp.stack(
+        [
+            jnp.full_like(x, 0.28209479),
+            *(0.48860251 * value for value in (y, z, x)),
+            *(1.0925484 * value for value in (x * y, y * z, x * z)),
+            0.31539157 * (3 * z**2 - 1),
+            0.54627421 * (x**2 - y**2),
+        ],
+        axis=-1,
+    )
+
+
+def _corner_rows(low, size, rows):
+    """Returns the rows [N] of the 8 vertices around places, of which low is the lowest along each axis."""
+    if len(rows) == np.prod(size):
+        strides = (size[1] * size[2], size[2], 1)
+        along = [(v * stride, v * stride + stride) for v, stride in zip(low, strides, strict=True)]
+        return [rows.start + row for row in _of_corners(jnp.add, along)]
+    first = [v.astype(jnp.uint32) for v in low]
+    along = [(v * prime, (v + 1) * prime) for v, prime in zip(first, map(jnp.uint32, _PRIMES), strict=True)]
+    scattered = _of_corners(jnp.bitwise_xor, along)
+    return [rows.start + (row % jnp.uint32(len(rows))).astype(jnp.int32) for row in scattered]
+
+
+def _of_corners(combine, along):
+    """Returns the 8 combinations of two values along each of three axes, z fastest."""
+    x, y, z = along
+    pairs = [combine(*pair) for pair in itertools.product(x, y)]
+    return [combine(*pair) for pair in itertools.product(pairs, z)]
+
+
+def _near_zero(key, shape):
+    return jax.random.uniform(key, shape, minval=-0.025, maxval=0.025)

@@ -1,0 +1,212 @@
+"""The occupancy sampler: one field, evaluated only in the occupied cells of a grid (after arXiv:2201.05989)."""
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxnerf.core.occupancy.from_scene import crop_grid, num_visibility_rays, visible_grid
+from jaxnerf.core.occupancy.grid import mask_samples, mask_scene
+from jaxnerf.core.occupancy.packed import render_packed
+from jaxnerf.core.occupancy.ray_culling import rays_may_hit, render_background
+from jaxnerf.core.occupancy.ray_marching import march_rays
+from jaxnerf.fields.base import Field
+from jaxnerf.models.base import Model, SamplerContext
+from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
+
+_LONG_STEP = 3.0  # times the step size
+_ONE_RAY_OPAQUE = 1e-30  # transmittance below which every ray has ended
+
+
+def from_context(context: SamplerContext) -> Model:
+    """Makes the model that the section `occupancy` describes."""
+    section, sampling = context.sections["occupancy"], context.sections["sampling"]
+    if sampling["density_noise"]:
+        raise ValueError(
+            f"sampling.density_noise is {sampling['density_noise']} and the sampler 'occupancy', which adds no "
+            "noise; set it to 0, or use the sampler 'hierarchical'"
+        )
+    if not sampling["stratified"]:
+        raise ValueError(
+            "sampling.stratified is False and the sampler 'occupancy', which draws its samples; set it to True, "
+            "or use the sampler 'hierarchical'"
+        )
+    field = context.make_field("fine")
+    return occupancy_model(
+        field,
+        schedule_from_section(section, field),
+        pool_samples_per_ray=section["pool_samples_per_ray"],
+        long_steps_until=section["long_steps_until"],
+        max_optical_depth=section["max_optical_depth"],
+        occlusion_start_step=section["occlusion_start_step"],
+        **view_options(context),
+    )
+
+
+def schedule_from_section(section, field: Field | None) -> GridSchedule:
+    """Makes the GridSchedule that a resolved section `occupancy` describes; field: None without updates."""
+    names = ("resolution", "step_size", "threshold", "update_every", "cells_per_update", "contracted")
+    return make_grid_schedule(
+        section["lower"], section["upper"], field=field, **{name: section[name] for name in names}
+    )
+
+
+def view_options(context: SamplerContext) -> dict:
+    """Returns the options of occupancy_model that concern images."""
+    names = ("early_stop_eps", "sample_multiplier", "max_samples")
+    section = context.sections["eval"]
+    return {name: section[name] for name in names} | {"background": context.background}
+
+
+def occupancy_model(
+    field: Field,
+    schedule: GridSchedule,
+    *,
+    pool_samples_per_ray: float,
+    long_steps_until: int,
+    max_optical_depth: float,
+    occlusion_start_step: int,
+    early_stop_eps: float,
+    sample_multiplier: float,
+    max_samples: int,
+    background,
+) -> Model:
+    """Makes the model of one field that is evaluated only where its grid is occupied.
+
+    Args:
+        field: Field.
+        schedule: GridSchedule.
+        pool_samples_per_ray: size of training's sample buffer over the number of rays. Rays whose samples do
+            not fit are dropped and counted.
+        long_steps_until: the training step before which samples are three times as long, as fog looks the
+            same and more rays fit.
+        max_optical_depth: optical depth, as the grid estimates it, beyond which training evaluates nothing;
+            0: no limit.
+        occlusion_start_step: the training step from which max_optical_depth applies.
+        early_stop_eps: of images: transmittance below which a ray ends.
+        sample_multiplier: samples of images over those of training.
+        max_samples: of images: samples evaluated at once.
+        background: see `render_samples`.
+    """
+
+    def scene(params):
+        return functools.partial(field.apply, params["fine"])
+
+    def render(keys, params, grid, rays, step):
+        buffer = math.ceil(pool_samples_per_ray * rays.near.size)
+        stretch = jnp.where(step < long_steps_until, _LONG_STEP, 1.0) if long_steps_until else 1.0
+        samples = march_rays(keys, grid, rays, step_size=schedule.step_size, cell=schedule.cell, stretch=stretch)
+        limit = jnp.inf
+        if max_optical_depth:
+            limit = jnp.where(step < occlusion_start_step, jnp.inf, max_optical_depth)
+        samples, occluded = mask_samples(grid, rays, samples, max_optical_depth=limit)
+        rendering = render_packed(scene(params), None, rays, samples, max_samples=buffer)
+        return (_over_background(rendering, occluded, background),)
+
+    return Model(
+        init=lambda key: {"fine": field.init(key)},
+        render=render,
+        view=_view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background),
+        scene=lambda params, grid: mask_scene(scene(params), grid),
+        samples_per_ray=pool_samples_per_ray,
+        grid_schedule=schedule,
+        input_layers={"fine": field.input_layers},
+        cull=_cull(schedule, background),
+    )
+
+
+def bake_occupancy(
+    model: Model,
+    schedule: GridSchedule,
+    visibility_rays,
+    *,
+    early_stop_eps,
+    sample_multiplier,
+    max_samples,
+    background,
+):
+    """Makes a model for images of one that was trained without a grid, with a grid of its visible matter.
+
+    Args:
+        model: Model without a grid.
+        schedule: GridSchedule of the box that images show.
+        visibility_rays: count -> Rays [count] of what the training views see.
+        early_stop_eps, sample_multiplier, max_samples, background: see `occupancy_model`.
+
+    Returns:
+        Model, which evaluates nothing outside its grid; and params -> that grid, see `visible_grid`.
+    """
+
+    def scene(params):
+        return model.scene(params, None)
+
+    @jax.jit
+    def find(params, rays):
+        options = {"max_samples": max_samples, "background": background}
+        return visible_grid(scene(params), schedule, rays, **options)
+
+    rays = visibility_rays(num_visibility_rays(schedule))
+    view = _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background)
+    model = model._replace(view=view, cull=_cull(schedule, background))
+    return model, lambda params: crop_grid(find(params, rays))
+
+
+def render_with_grid(scene, grid, rays, *, step_size, cell, early_stop_eps, max_samples, background=None):
+    """Renders rays [...] through a scene where its grid is occupied: Rendering [...] without weights.
+
+    Args:
+        scene, grid, rays, background: see `render_packed`.
+        step_size, cell: see `march_rays`.
+        early_stop_eps: a ray ends where its transmittance falls below it; 0: where nothing is left.
+        max_samples: samples evaluated at once; the rest follow in further rounds.
+    """
+    samples = march_rays(None, grid, rays, step_size=step_size, cell=cell)
+    return render_packed(
+        scene,
+        grid,
+        rays,
+        samples,
+        max_samples=max_samples,
+        early_stop_eps=early_stop_eps or _ONE_RAY_OPAQUE,
+        background=background,
+    )
+
+
+def _cull(schedule, background):
+    def cull(grid, rays):
+        return rays_may_hit(grid, rays, cell=schedule.cell), render_background(rays, background=background)
+
+    return cull
+
+
+def _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background):
+    def view(params, grid, rays):
+        return render_with_grid(
+            scene(params),
+            grid,
+            rays,
+            step_size=schedule.step_size / sample_multiplier,
+            cell=schedule.cell,
+            early_stop_eps=early_stop_eps,
+            max_samples=max_samples,
+            background=background,
+        )
+
+    return view
+
+
+def _over_background(rendering, occluded, background):
+    """Composites a Rendering of black over a background.
+
+    Where occluded samples were skipped, the remaining light is taken to look like the rest of the ray. If the
+    background showed there, the field would grow opaque too early, the grid's estimate with it, and both
+    would run away.
+    """
+    transmittance = (1 - rendering.opacity)[..., None]
+    behind = jnp.zeros(3) if background is None else jnp.asarray(background)
+    behind = jnp.broadcast_to(behind, rendering.rgb.shape)
+    alike = rendering.rgb / jnp.maximum(rendering.opacity, 0.1)[..., None]
+    rgb = rendering.rgb + transmittance * jnp.where(occluded[..., None], alike, behind)
+    return dataclasses.replace(rendering, rgb=rgb)

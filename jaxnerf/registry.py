@@ -1,0 +1,147 @@
+"""The parts of a run that can be replaced by name: fields, samplers, losses and dataset readers.
+
+Built-in parts are imported when they are first used. Code outside the package registers its own with the
+`register_*` functions; a program imports such code with `--plugins=module,...`.
+"""
+
+import importlib
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+
+class Loss(NamedTuple):
+    """A loss and what it is computed from."""
+
+    function: Callable[..., Any]
+    on: str  # "renderings": (outputs, batch) -> [B]; "params": (params) -> scalar
+    needs: tuple[str, ...]  # optional fields of Batch that it reads
+
+
+class Reader(NamedTuple):
+    """A reader of one dataset format."""
+
+    read: Callable[..., Any]  # folder -> Capture
+    detect: Callable[..., bool]  # folder -> whether the folder holds this format
+
+
+class Registry:
+    """Parts of one kind by name."""
+
+    def __init__(self, kind: str, register: str, builtin: dict[str, str]):
+        """kind: for messages; register: the function to call; builtin: name -> "module:attribute"."""
+        self._kind, self._register, self._parts = kind, register, dict(builtin)
+
+    def add(self, name: str, part: Any) -> None:
+        """Adds a part; raises ValueError if another part has that name."""
+        if name in self._parts and self._parts[name] != part:
+            raise ValueError(f"there is already a {self._kind} {name!r}; register yours under another name")
+        self._parts[name] = part
+
+    def get(self, name: str) -> Any:
+        """Returns the part of that name; raises ValueError with the known names if there is none."""
+        if name not in self._parts:
+            known = ", ".join(repr(known) for known in self._parts)
+            raise ValueError(
+                f"there is no {self._kind} {name!r}, expected one of {known}; correct the name, or import the "
+                f"module that calls {self._register} with --plugins=MODULE"
+            )
+        part = self._parts[name]
+        if isinstance(part, str):
+            module, _, attribute = part.partition(":")
+            part = self._parts[name] = getattr(importlib.import_module(module), attribute)
+        return part
+
+    def names(self) -> list[str]:
+        """Returns the names of all parts, built-in ones first."""
+        return list(self._parts)
+
+
+FIELDS = Registry(
+    "field",
+    "jaxnerf.register_field",
+    {"mlp": "jaxnerf.fields.mlp:from_options", "hash_grid": "jaxnerf.fields.hash_grid:from_options"},
+)
+SAMPLERS = Registry(
+    "sampler",
+    "jaxnerf.register_sampler",
+    {
+        "hierarchical": "jaxnerf.models.hierarchical:from_context",
+        "occupancy": "jaxnerf.models.occupancy:from_context",
+    },
+)
+LOSSES = Registry(
+    "loss",
+    "jaxnerf.register_loss",
+    {"mse": "jaxnerf.core.losses:MSE", "distortion": "jaxnerf.core.losses:DISTORTION"},
+)
+READERS = Registry(
+    "dataset format",
+    "jaxnerf.register_reader",
+    {  # in the order in which a folder is searched for them
+        "blender": "jaxnerf.data.readers.blender:READER",
+        "transforms": "jaxnerf.data.readers.transforms:READER",
+        "colmap": "jaxnerf.data.readers.colmap:READER",
+        "llff": "jaxnerf.data.readers.llff:READER",
+    },
+)
+
+
+def register_field(name: str, make: Callable[..., Any]) -> None:
+    """Registers a field under the name that the config's `field` selects.
+
+    Args:
+        name: its options are the section of this name in the config, if there is one.
+        make: (options, box) -> Field, see `jaxnerf.fields.base.Field`. `options` is a dict; `box` is the
+            scene's box (lower [3], upper [3]) in world units, or None where a run has none.
+
+    Raises:
+        ValueError: if another field has that name.
+    """
+    FIELDS.add(name, make)
+
+
+def register_sampler(name: str, make: Callable[..., Any]) -> None:
+    """Registers a way to place samples under the name that the config's `sampler` selects.
+
+    Args:
+        name: its options are the section of this name in the config, if there is one.
+        make: (context) -> Model, see `jaxnerf.models.base.SamplerContext` and `Model`.
+
+    Raises:
+        ValueError: if another sampler has that name.
+    """
+    SAMPLERS.add(name, make)
+
+
+def register_loss(
+    name: str, function: Callable[..., Any], *, on: str = "renderings", needs: Iterable[str] = ()
+) -> None:
+    """Registers a loss under the name that the config's `losses` gives a weight.
+
+    Args:
+        name: of the loss.
+        function: for "renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
+            of a step, the one that counts last, and `batch` is a Batch. For "params" (params) -> scalar.
+        on: "renderings" or "params".
+        needs: the optional fields of Batch that the function reads, of "image_index", "pixel" and "alpha".
+
+    Raises:
+        ValueError: if another loss has that name, or on another value of `on`.
+    """
+    if on not in ("renderings", "params"):
+        raise ValueError(f"register_loss: on is {on!r}, expected 'renderings' or 'params'")
+    LOSSES.add(name, Loss(function, on, tuple(needs)))
+
+
+def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[..., bool] | None = None) -> None:
+    """Registers a dataset format under the name that `--format` and the config's `data.format` select.
+
+    Args:
+        name: of the format.
+        read: (folder) -> Capture, see `jaxnerf.data.readers.base.Capture`.
+        detect: (folder) -> whether the folder holds this format, for `data.format` "auto"; None: never.
+
+    Raises:
+        ValueError: if another format has that name.
+    """
+    READERS.add(name, Reader(read, detect or (lambda folder: False)))

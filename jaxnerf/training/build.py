@@ -1,0 +1,228 @@
+"""Turns a resolved config into the functions of a run. Nothing else reads a resolved config."""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+from ml_collections import ConfigDict
+
+from jaxnerf.core.types import Views
+from jaxnerf.data import dataset, ray_batches
+from jaxnerf.data.active_pixels import active_region, unmasked_pixels
+from jaxnerf.fields.base import Field, contract_field, make_field
+from jaxnerf.models.base import Model, SamplerContext, make_model
+from jaxnerf.models.occupancy import bake_occupancy, schedule_from_section, view_options
+from jaxnerf.registry import LOSSES
+from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.training.optimizer import make_optimizer
+from jaxnerf.training.step import StepLoss, TrainData
+
+_FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha")  # of the optional ones, those that datasets give
+
+
+class Experiment(NamedTuple):
+    """All that the training and evaluation loops need of a config."""
+
+    model: Model
+    losses: tuple[StepLoss, ...]
+    optimizer: optax.GradientTransformation
+    schedule: Callable[[int], float]  # step -> learning rate
+    load_split: Callable[[str], Views]  # split -> Views
+    draw: Callable[..., tuple]  # (step, positions, TrainData) -> (keys, Batch)
+    pixel_ids: Callable[..., Any]  # (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes
+    view_rays: Callable[..., Any]  # (Views, index, pixels) -> Rays
+    world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in the file's units
+    prepare: Callable[..., tuple]  # Views -> (valid cells, or None without a grid; TrainData)
+    seed: int
+    pixel_offset: float
+    train: SimpleNamespace  # the config's section
+    eval: SimpleNamespace
+    conventions: dict[str, Any]  # see conventions
+
+
+def build(config: ConfigDict) -> Experiment:
+    """Builds the Experiment that a resolved config describes.
+
+    Raises:
+        ValueError: names the field that holds what cannot be built.
+    """
+    model, losses = build_model(config), build_losses(config.losses)
+    optimizer, schedule = make_optimizer(config.train)
+    options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
+    batching = {"batching": config.train.batching}
+    extras = tuple(sorted({need for loss in losses for need in loss.needs}))
+    if config.train.batching not in ray_batches.BATCHINGS:
+        raise ValueError(f"train.batching is {config.train.batching!r}, expected one of {ray_batches.BATCHINGS}")
+
+    def draw(step, positions, data):
+        return ray_batches.draw_batch(
+            data.seed, step, positions, data.views, data.active_pixels, extras=extras, **batching, **options
+        )
+
+    def pixel_ids(step, positions, data):
+        return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **batching)[1]
+
+    return Experiment(
+        model=model,
+        losses=losses,
+        optimizer=optimizer,
+        schedule=schedule,
+        load_split=functools.partial(dataset.load_split, config.data),
+        draw=draw,
+        pixel_ids=pixel_ids,
+        view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
+        world_depth=functools.partial(ray_batches.world_depth, ndc=config.data.ndc),
+        prepare=functools.partial(_prepare, config, model),
+        seed=config.seed,
+        pixel_offset=config.data.pixel_offset,
+        train=SimpleNamespace(**config.train),
+        eval=SimpleNamespace(**config.eval),
+        conventions=conventions(config.data),
+    )
+
+
+def build_model(config: ConfigDict) -> Model:
+    """Builds the Model: the config's field under the config's sampler."""
+    return make_model(config.sampler, _context(config))
+
+
+def build_losses(weights: Mapping[str, Any]) -> tuple[StepLoss, ...]:
+    """Builds the losses of the config's section; one whose weight is 0 is absent.
+
+    Raises:
+        ValueError: if no loss has a weight, a name is not registered, or a loss needs what no dataset gives.
+    """
+    losses = []
+    for name, weight in weights.items():
+        if isinstance(weight, int | float) and weight == 0:
+            continue
+        loss = LOSSES.get(name)
+        missing = [need for need in loss.needs if need not in _FILLED_BATCH_FIELDS]
+        if missing:
+            raise ValueError(
+                f"losses.{name} needs {missing[0]} in the batch, expected one of {_FILLED_BATCH_FIELDS}; set it to 0"
+            )
+        losses.append(StepLoss(name, loss.function, loss.on, _weight_at(name, weight), loss.needs))
+    if not any(loss.on == "renderings" for loss in losses):
+        raise ValueError("losses: no loss of the renderings has a weight; set losses.mse to 1")
+    return tuple(losses)
+
+
+def bake_model(config: ConfigDict, model: Model, visibility_rays):
+    """Returns what `bake_occupancy` does, for the box of a resolved config's section `occupancy`."""
+    schedule = schedule_from_section(_section(config, "occupancy"), None)
+    return bake_occupancy(model, schedule, visibility_rays, **view_options(_context(config)))
+
+
+def load_split(config: ConfigDict, split: str | None = None) -> tuple[Views, str, dict[str, Any]]:
+    """Reads the Views of a split without building a model.
+
+    Returns:
+        Views; the split's name, which is eval.split where none is given; and the conventions.
+    """
+    data, split = dataset.resolve(config.data)[0], split or config.eval.split
+    return dataset.load_split(data, split), split, conventions(data)
+
+
+def conventions(data: ConfigDict) -> dict[str, Any]:
+    """Returns how the views of a data section are read, which an evaluation's protocol repeats."""
+    return {name: data[name] for name in ("format", "background", "pixel_offset", "factor", "hold_out", "num_views")}
+
+
+def identity(config: ConfigDict) -> str:
+    """Returns as text what renderings depend on: not how the run was trained, nor where the data lies."""
+    plain = json.loads(config.to_json_best_effort())
+    data = {name: value for name, value in plain["data"].items() if name != "dir"}
+    rest = {name: value for name, value in plain.items() if name not in ("train", "eval", "data", "losses")}
+    return json.dumps({**rest, "data": data}, sort_keys=True)
+
+
+def check_released(config: ConfigDict, origin: str) -> None:
+    """Raises a ValueError where a config's networks do what those of a released code do not."""
+    if config.sampler != "hierarchical" or config.field != "mlp":
+        raise ValueError(
+            f"sampler is {config.sampler!r} and field {config.field!r}, expected 'hierarchical' and 'mlp' as in "
+            f"{origin}"
+        )
+    activations = ("relu", "softplus") if origin == "JaxNeRF" else ("relu",)
+    for name in ("coarse", "fine"):
+        if not config[name].encode:
+            raise ValueError(f"{name}.encode is False, expected True as in {origin}")
+        if config[name].density_bias:
+            raise ValueError(f"{name}.density_bias is {config[name].density_bias}, expected 0 as in {origin}")
+        if config[name].density_activation not in activations:
+            raise ValueError(
+                f"{name}.density_activation is {config[name].density_activation!r}, expected "
+                f"{' or '.join(map(repr, activations))} as in {origin}"
+            )
+
+
+def _context(config):
+    names = [name for name, value in config.items() if isinstance(value, ConfigDict)]
+    sections = {name: _section(config, name) for name in names}
+    section = sections["occupancy"]
+    box = None
+    if not (is_auto(section["lower"]) or is_auto(section["upper"])):
+        box = section["lower"], section["upper"]
+    return SamplerContext(
+        make_field=functools.partial(_make_field, config, sections, box),
+        sections=sections,
+        background=dataset.background_of(config.data),
+    )
+
+
+def _make_field(config, sections, box, network) -> Field:
+    """Makes the field of a network; that of "coarse" is always an MLP."""
+    name = config.field if network == "fine" else "mlp"
+    options = sections[network] if name == "mlp" else sections.get(name, {})
+    if name == "mlp" and is_auto(options["num_freqs"]):
+        raise ValueError(f"{network}.num_freqs is 'auto'; resolve the config against a dataset, or set a number")
+    field = make_field(name, options, box)
+    # The paper's networks see the world as it is; all else lives in the box.
+    in_box = config.sampler != "hierarchical" or name != "mlp"
+    if in_box and sections["occupancy"]["contracted"] is True:
+        return contract_field(field, *box)
+    return field
+
+
+def _section(config, name):
+    """Returns a section as a plain dict."""
+    section = dict(config[name])
+    for field, value in section.items():
+        if name == "occupancy" and config.sampler == "occupancy" and is_auto(value):
+            raise ValueError(f"occupancy.{field} is 'auto'; resolve the config against a dataset, or set a value")
+    return section
+
+
+def _weight_at(name, weight):
+    """Returns the function step -> weight of a number or of points (step, weight), linear between them."""
+    if isinstance(weight, int | float):
+        return lambda step: weight
+    steps, values = zip(*weight, strict=True)
+    if list(steps) != sorted(steps):
+        raise ValueError(f"losses.{name} is {weight}, expected points (step, weight) with ascending steps")
+    steps, values = np.float32(steps), np.float32(values)
+    return lambda step: jnp.interp(jnp.asarray(step, jnp.float32), steps, values)
+
+
+def _prepare(config, model, views):
+    valid = cells = None
+    if model.grid_schedule is None:
+        active = unmasked_pixels(views)
+    else:
+        valid, active, cells = active_region(
+            views,
+            model.grid_schedule,
+            use_alpha=config.occupancy.use_alpha and not config.data.ndc,
+            ndc=config.data.ndc,
+            pixel_offset=config.data.pixel_offset,
+        )
+    seed = np.uint32(config.seed % 2**32)
+    # The mask is part of the active pixels.
+    return valid, TrainData(seed, dataclasses.replace(views, mask=None), active, cells)

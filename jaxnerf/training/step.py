@@ -1,0 +1,155 @@
+"""One training step: draw rays, render them, and descend on the weighted sum of the losses."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxnerf.core.losses import squared_error
+from jaxnerf.core.types import Views
+from jaxnerf.data import ray_batches
+from jaxnerf.data.active_pixels import PixelRuns
+from jaxnerf.models.base import Model
+from jaxnerf.training.dead_networks import count_dead_steps
+from jaxnerf.training.state import TrainState
+
+
+class TrainData(NamedTuple):
+    """What a run's steps read and never change. The seed is part of it, so runs that differ by it compile once."""
+
+    seed: Any  # uint32
+    views: Views
+    active_pixels: PixelRuns | None  # the pixels to draw from; None: all
+    cells: Any  # [M] int32, the cells of the grid that are updated; None without a grid
+
+
+class StepLoss(NamedTuple):
+    """A loss of the training step."""
+
+    name: str
+    function: Callable[..., Any]
+    on: str  # "renderings" or "params", see register_loss
+    weight: Callable[[Any], Any]  # step -> number
+    needs: tuple[str, ...] = ()  # optional fields of Batch
+
+
+def make_train_step(model: Model, optimizer: optax.GradientTransformation, draw, losses: Sequence[StepLoss]):
+    """Makes the pure training step.
+
+    Args:
+        model: see `jaxnerf.models.base.Model`. Of its Renderings in training the last one counts.
+        optimizer: an optax gradient transformation.
+        draw: (step, positions [B], data) -> (keys [B], Batch [B]); see `draw_batch`.
+        losses: at least one of the renderings.
+
+    Returns:
+        train_step(state, data, positions, *, axis_name=None) -> (state, metrics). `data` is TrainData, or
+        whatever `draw` takes where the model has no grid. `positions` is [N, B] int32, the places of this
+        device's rays in the whole batch, in N microbatches: they run one after the other and their gradients
+        add up, so that the activations of B rays stay in the cache (or in the memory) whatever the batch
+        size. With an `axis_name` all sums are also over that axis of devices. `metrics` are scalars: "loss",
+        "mse" (last rendering), "mse_coarse" (first), "loss_<name>" for each loss (unweighted) if there are
+        several, "grad_norm", the number of "rays" that counted, and the counters.
+
+        The counters: "nonfinite" steps, whose loss or gradient was not finite; they leave parameters,
+        optimizer and grid as they were. "nonfinite_in_a_row". "dead_<name>" of each network, see
+        `count_dead_steps`, and "num_reinits", which only reinitialization changes. With a grid also
+        "rays_dropped": some of their samples did not fit into the buffer, so they count for nothing.
+    """
+    ray_losses = [loss for loss in losses if loss.on == "renderings"]
+    regularizers = [loss for loss in losses if loss.on == "params"]
+
+    def loss_fn(params, grid, step, keys, batch):
+        renderings = model.render(keys, params, grid, batch.rays, step)
+        complete = renderings[-1].num_dropped == 0
+
+        def total(values):
+            return jnp.where(complete, values, 0).sum()
+
+        parts = {loss.name: total(loss.function(renderings, batch)) for loss in ray_losses}
+        weighted = sum(_scaled(loss.weight(step), parts[loss.name]) for loss in ray_losses)
+        sums = {
+            "mse_coarse": total(squared_error(renderings[0], batch)),
+            "mse": total(squared_error(renderings[-1], batch)),
+            "rays": complete.sum(dtype=jnp.int32),
+        }
+        if len(losses) > 1:
+            sums |= {f"loss_{name}": part for name, part in parts.items()}
+        return weighted, sums
+
+    def microbatch(state, data, positions):
+        keys, batch = draw(state.step, positions, data)
+        (loss, sums), grads = jax.value_and_grad(loss_fn, has_aux=True)(
+            state.params, state.grid, state.step, keys, batch
+        )
+        return {"loss": loss, **sums}, grads
+
+    def regularize(state, metrics, grads):
+        for loss in regularizers:
+            value, gradient = jax.value_and_grad(loss.function)(state.params)
+            weight = loss.weight(state.step)
+            metrics[f"loss_{loss.name}"] = value
+            metrics["loss"] += weight * value
+            grads = jax.tree.map(lambda a, b, weight=weight: a + weight * b, grads, gradient)
+        return metrics, grads
+
+    def train_step(state, data, positions, *, axis_name=None):
+        drawn = positions.size * (1 if axis_name is None else jax.lax.axis_size(axis_name))
+        total = _sum_over_microbatches(lambda part: microbatch(state, data, part), positions)
+        if axis_name is not None:
+            total = jax.lax.psum(total, axis_name)
+        metrics, grads, rays = _mean_over_rays(*total)
+        errors = (metrics["mse_coarse"], metrics["mse"])[-len(grads) :]
+        dead = count_dead_steps(state.counters, grads, errors, model.input_layers)
+        metrics, grads = regularize(state, metrics, grads)
+        metrics["grad_norm"] = optax.tree.norm(grads)
+        finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
+
+        def descend():
+            updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+            return optax.apply_updates(state.params, updates), opt_state
+
+        # A branch: selecting between old and new arrays would take about as long as the update itself.
+        params, opt_state = jax.lax.cond(finite, descend, lambda: (state.params, state.opt_state))
+        missed = (~finite).astype(jnp.int32)
+        counters = {
+            **dead,
+            "num_reinits": state.counters["num_reinits"],
+            "nonfinite": state.counters["nonfinite"] + missed,
+            "nonfinite_in_a_row": (state.counters["nonfinite_in_a_row"] + 1) * missed,
+        }
+        grid = state.grid
+        if model.grid_schedule is not None:
+            counters["rays_dropped"] = state.counters["rays_dropped"] + drawn - rays
+            # No ray has this position, so the key is the step's own.
+            key = jax.random.fold_in(ray_batches.step_key(data.seed, state.step), 2**32 - 2)
+            grid = model.grid_schedule.update(key, state.step, params, grid, data.cells)
+        state = TrainState(step=state.step + 1, params=params, opt_state=opt_state, grid=grid, counters=counters)
+        return state, {**metrics, "rays": rays, **counters}
+
+    return train_step
+
+
+def _scaled(weight, value):
+    """Returns the product; a weight of 1 adds no operation."""
+    return value if isinstance(weight, int | float) and weight == 1 else weight * value
+
+
+def _mean_over_rays(sums, grads):
+    """Returns means over the rays that counted: metrics, gradient; and how many rays those were."""
+    rays = sums.pop("rays")
+    scale = 1 / jnp.maximum(rays, 1)
+    return *jax.tree.map(lambda leaf: leaf * scale, (sums, grads)), rays
+
+
+def _sum_over_microbatches(function, positions):
+    if positions.shape[0] == 1:
+        return function(positions[0])
+
+    def add(total, part):
+        return jax.tree.map(jnp.add, total, function(part)), None
+
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(function, positions[0]))
+    return jax.lax.scan(add, zeros, positions)[0]

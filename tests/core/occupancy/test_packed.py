@@ -1,0 +1,329 @@
+"""The renderer that asks only where there is something gives what render_samples gives."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxnerf
+from helpers import all_finite, assert_same, checked_grid, compiled, full_grid, rays_past_origin
+from jaxnerf.core import volume_rendering
+from jaxnerf.core.occupancy import early_termination
+from jaxnerf.core.occupancy import packed as packed_module
+from jaxnerf.core.occupancy.grid import is_occupied, mask_samples
+from jaxnerf.fields import analytic
+
+RAYS, SEGMENTS = 24, 40
+BACKGROUND = np.float32([0.9, 0.2, 0.5])
+OUTPUTS = ("rgb", "opacity", "depth", "disparity")
+
+
+def scene(x, viewdirs):
+    """Fog around the origin, coloured by place and direction."""
+    return 4 * jnp.exp(-2 * (x**2).sum(axis=-1)), jax.nn.sigmoid(3 * x + viewdirs)
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return rays_past_origin(0, RAYS)
+
+
+@pytest.fixture(scope="module")
+def samples(rays):
+    edges = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=SEGMENTS)
+    return jaxnerf.samples_from_edges(jax.random.key(1), edges)
+
+
+@compiled
+def dense(rays, samples):
+    return jaxnerf.render_samples(scene, rays, samples, background=BACKGROUND)
+
+
+@compiled
+def dense_and_restricted(grid, rays, samples):
+    restricted = jaxnerf.mask_scene(scene, grid)
+    return jaxnerf.render_samples(restricted, rays, samples, background=BACKGROUND)
+
+
+packed = compiled(
+    lambda grid, rays, samples, max_samples, early_stop_eps=0.0: jaxnerf.render_packed(
+        scene,
+        grid,
+        rays,
+        samples,
+        max_samples=max_samples,
+        early_stop_eps=early_stop_eps,
+        background=BACKGROUND,
+    ),
+    "max_samples",
+    "early_stop_eps",
+)
+
+
+def assert_close(got, want, atol=1e-6):
+    for name in OUTPUTS:
+        np.testing.assert_allclose(getattr(got, name), getattr(want, name), rtol=1e-6, atol=atol)
+
+
+def test_a_full_grid_changes_nothing(rays, samples):
+    got = packed(full_grid(), rays, samples, max_samples=RAYS * SEGMENTS)
+    assert_close(got, dense(rays, samples))
+    assert got.weights is None and got.num_dropped.shape == (RAYS,) and not got.num_dropped.any()
+
+
+def test_a_full_grid_changes_no_gradient(rays, samples):
+    slopes = np.float32(np.random.default_rng(2).normal(size=(RAYS, 6)))
+
+    def total(render):
+        def value(rays, samples, strength):
+            def own(x, viewdirs):
+                density, rgb = scene(x, viewdirs)
+                return strength * density, rgb
+
+            seen = render(own, rays, samples)
+            parts = jnp.stack([seen.opacity, seen.depth, seen.disparity], axis=-1)
+            return (jnp.concatenate([seen.rgb, parts], axis=-1) * slopes).sum()
+
+        return jax.jit(jax.grad(value, argnums=(0, 1, 2)))
+
+    def in_pool(scene, rays, samples):
+        return jaxnerf.render_packed(scene, full_grid(), rays, samples, max_samples=RAYS * SEGMENTS)
+
+    given = jax.tree.map(jnp.asarray, (rays, samples)), jnp.float32(1.3)
+    got = total(in_pool)(*given[0], given[1])
+    want = total(jaxnerf.render_samples)(*given[0], given[1])
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-6 * max(1.0, np.abs(b).max()))
+
+
+def test_an_empty_cell_is_as_if_the_scene_were_empty_there(rays, samples):
+    """By samples that count for nothing, and by a scene with nothing there."""
+    grid = checked_grid()
+    kept = np.asarray(is_occupied(grid, rays, samples.t))
+    assert 0.05 < kept.mean() < 0.6
+    got = packed(grid, rays, samples, max_samples=RAYS * SEGMENTS)
+    assert_close(got, dense(rays, dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))))
+    assert_close(got, dense_and_restricted(grid, rays, samples))
+    assert np.abs(got.rgb - dense(rays, samples).rgb).max() > 0.05
+
+
+def test_what_is_masked_already_needs_no_grid(rays, samples):
+    grid = checked_grid()
+    masked, _ = compiled(mask_samples)(grid, rays, samples)
+    got = packed(None, rays, masked, max_samples=RAYS * SEGMENTS)
+    assert_close(got, packed(grid, rays, samples, max_samples=RAYS * SEGMENTS))
+
+
+def test_rays_that_miss_everything_see_the_background(rays, samples):
+    nothing = dataclasses.replace(full_grid(), occupied=jnp.zeros((6, 5, 8), bool))
+    for early_stop_eps in (0.0, 1e-3):
+        got = packed(nothing, rays, samples, max_samples=RAYS * SEGMENTS, early_stop_eps=early_stop_eps)
+        np.testing.assert_allclose(got.rgb, np.broadcast_to(BACKGROUND, (RAYS, 3)), rtol=1e-6)
+        np.testing.assert_array_equal(got.depth, rays.far)
+        np.testing.assert_array_equal(got.disparity, 0)
+        np.testing.assert_array_equal(got.opacity, 0)
+
+
+def test_an_overflow_is_counted_and_spares_the_rays_that_fit(rays, samples):
+    got = packed(full_grid(), rays, samples, max_samples=10 * SEGMENTS + 5)
+    np.testing.assert_array_equal(got.num_dropped, [0] * 10 + [SEGMENTS - 5] + [SEGMENTS] * (RAYS - 11))
+    first = jax.tree.map(lambda leaf: leaf[:10], got)
+    assert_close(first, jax.tree.map(lambda leaf: leaf[:10], dense(rays, samples)))
+
+
+@pytest.mark.parametrize("early_stop_eps, capacity", [(0.5, RAYS), (0.1, 100), (1e-3, RAYS * SEGMENTS)])
+def test_what_stops_early_is_within_its_bound_and_drops_nothing(rays, samples, early_stop_eps, max_samples):
+    got, want = (
+        packed(full_grid(), rays, samples, max_samples=max_samples, early_stop_eps=early_stop_eps),
+        dense(rays, samples),
+    )
+    assert np.abs(got.rgb - want.rgb).max() <= early_stop_eps + 1e-6
+    assert np.abs(got.opacity - want.opacity).max() <= early_stop_eps + 1e-6 and not got.num_dropped.any()
+    stopped = got.opacity > 1 - 1e-6
+    assert stopped.any() == (early_stop_eps > 1e-3) and (got.depth <= want.depth + 1e-5)[stopped].all()
+    np.testing.assert_allclose(got.rgb[~stopped], want.rgb[~stopped], atol=1e-6)
+
+
+@pytest.mark.parametrize("max_samples", [1, 30])
+def test_lanes_fewer_than_rays_leave_nothing_out(rays, samples, max_samples):
+    """In all outputs, and whichever lane a ray is in: one takes them all, or seven some each."""
+    grid = checked_grid()
+    got = packed(grid, rays, samples, max_samples=max_samples, early_stop_eps=1e-30)
+    assert_close(got, packed(grid, rays, samples, max_samples=RAYS * SEGMENTS), atol=2e-6)
+
+
+def test_a_small_pool_asks_for_less_than_all():
+    """Behind a wall nothing is asked once the pool has come to it."""
+    asked = []
+    wall = analytic.slab(1e4, lower=0.0, upper=1.0).scene
+
+    def counting(x, viewdirs):
+        jax.debug.callback(lambda x: asked.append(float(x[0, :, 2].min())), x)
+        return wall(x, viewdirs)
+
+    one = np.float32([[0.0, 0.0, -1.0]])
+    rays = jaxnerf.Rays(origins=-2 * one, directions=one, viewdirs=one, near=np.zeros(1, "f"), far=np.full(1, 20, "f"))
+    samples = jaxnerf.samples_from_edges(None, jaxnerf.uniform_edges(rays.near, rays.far, num_segments=200))
+    options = {"max_samples": 4, "early_stop_eps": 1e-4}
+    seen = jax.jit(lambda: jaxnerf.render_packed(counting, full_grid(), rays, samples, **options))()
+    jax.effects_barrier()
+    np.testing.assert_allclose(seen.opacity, 1, atol=1e-4)
+    assert len(asked) == 3 and min(asked) > 0.4  # 12 of 200 samples: 10 before the wall, 2 in it
+
+
+def test_packed_weights_are_those_of_each_ray():
+    rng = np.random.default_rng(3)
+    density = np.float32(rng.exponential(size=(5, 7)) * (rng.uniform(size=(5, 7)) < 0.7))
+    density[1, 2], density[3, 0] = np.inf, 1e30
+    length = np.float32(rng.uniform(size=(5, 7)))
+    starts = np.arange(35) % 7 == 0
+    slopes = np.float32(rng.normal(size=35))
+
+    def total(density):
+        weights, _ = volume_rendering.packed_weights(density, length.reshape(-1), starts, longest=7)
+        return (weights * slopes).sum(), weights
+
+    def separate(density):
+        weights = jaxnerf.weights_from_density(density.reshape(5, 7), length).reshape(-1)
+        return (weights * slopes).sum(), weights
+
+    got, want = (compiled(jax.value_and_grad(value, has_aux=True))(density.reshape(-1)) for value in (total, separate))
+    assert all_finite((got, want))
+    assert_same(got, want, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(), (2, 3)])
+def test_leading_axes_do_not_matter(rays, samples, shape):
+    count = int(np.prod(shape))
+
+    def part(leaf):
+        return None if leaf is None else np.asarray(leaf)[:count].reshape((*shape, *np.shape(leaf)[1:]))
+
+    some = jax.tree.map(part, (rays, samples))
+    got = packed(full_grid(), *some, max_samples=count * SEGMENTS)
+    assert_close(got, jax.tree.map(part, dense(rays, samples)))
+
+
+def test_nan_of_a_scene_is_seen_only_where_it_is_asked(rays, samples):
+    grid = checked_grid()
+
+    def half_wrong(x, viewdirs):
+        density, rgb = scene(x, viewdirs)
+        return jnp.where(x[..., 0] > 0.0, jnp.nan, density), rgb
+
+    @jax.jit
+    @jax.value_and_grad
+    def value(rays, kept):
+        masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
+        return jaxnerf.render_packed(half_wrong, grid, rays, masked, max_samples=RAYS * SEGMENTS).rgb.sum()
+
+    kept = np.asarray(jaxnerf.points_on_rays(rays, samples.t))[..., 0] <= 0.0
+    given = jax.tree.map(jnp.asarray, rays)
+    assert all_finite(value(given, kept))
+    assert np.isnan(value(given, np.ones_like(kept))[0])
+
+
+def test_wrong_arguments(rays, samples):
+    pairs, grid = dataclasses.replace(samples, rule="gauss"), full_grid()
+    for message, call in {
+        "capacity is 0": lambda: jaxnerf.render_packed(scene, grid, rays, samples, max_samples=0),
+        "gauss": lambda: jaxnerf.render_packed(scene, grid, rays, pairs, max_samples=30),
+        "the scene returned": lambda: jaxnerf.render_packed(
+            lambda x, viewdirs: (x, x), grid, rays, samples, max_samples=30
+        ),
+    }.items():
+        with pytest.raises(ValueError, match=f"render_packed: .*{message}"):
+            jax.eval_shape(call)
+
+
+def test_render_rays_takes_it_as_its_renderer(rays):
+    def render(scene, rays, samples, *, background=None):
+        return jaxnerf.render_packed(
+            scene, full_grid(), rays, samples, max_samples=RAYS * SEGMENTS, background=background
+        )
+
+    @compiled
+    def seen(key, rays):
+        options = {"num_samples": SEGMENTS, "background": BACKGROUND}
+        got = jaxnerf.render_rays(key, scene, rays, render=render, **options)
+        return got, dataclasses.replace(jaxnerf.render_rays(key, scene, rays, **options), weights=None)
+
+    got, want = seen(jax.random.key(4), rays)
+    assert_same(got, want, atol=2e-6)
+
+
+needed = compiled(
+    lambda scene, grid, rays, samples, error=0.02, background=BACKGROUND: packed_module.visible_samples(
+        scene, grid, rays, samples, error=error, max_samples=100, background=background
+    ),
+    "scene",
+    "error",
+)
+
+
+def without(samples, kept):
+    return dataclasses.replace(samples, delta=np.where(kept, samples.delta, 0))
+
+
+@pytest.mark.parametrize("error", [0.002, 0.02, 0.2])
+def test_without_what_is_not_needed_colours_are_within_the_error(rays, samples, error):
+    grid = checked_grid()
+    kept = needed(scene, grid, rays, samples, error=error)
+    asked = np.asarray(is_occupied(grid, rays, samples.t) & (samples.delta > 0))
+    assert not kept[~asked].any() and 0 < kept.sum() < 0.9 * asked.sum()
+    whole = packed(grid, rays, samples, max_samples=RAYS * SEGMENTS)
+    fewer = packed(grid, rays, without(samples, kept), max_samples=RAYS * SEGMENTS)
+    off = abs(whole.rgb - fewer.rgb).max()
+    assert error / 10 < off <= error + 1e-6
+
+
+@compiled
+def judged(density, colour, rays, samples):
+    """Returns what a ball before white needs for an error of 0.002, and its colours with all and so few."""
+
+    def ball(x, viewdirs):
+        inside = (x**2).sum(axis=-1) < 1
+        return jnp.where(inside, density, 0.0), jnp.broadcast_to(colour, x.shape)
+
+    options = {"error": 0.002, "max_samples": 100, "background": jnp.ones(3)}
+    kept = packed_module.visible_samples(ball, full_grid(), rays, samples, **options)
+    fewer = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
+    colours = [jaxnerf.render_samples(ball, rays, chosen, background=jnp.ones(3)).rgb for chosen in (samples, fewer)]
+    return kept, *colours
+
+
+def test_white_fog_before_white_is_not_needed_and_a_body_of_one_colour_is(rays, samples):
+    """However thinly its samples share it: one by one, none of them would be missed."""
+    for density in (0.05, 0.5):
+        kept, _, _ = judged(density, jnp.ones(3), rays, samples)
+        assert not kept.any()
+    for density, colour in itertools.product((0.3, 3.0, 30.0, 1e6), ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
+        kept, whole, fewer = judged(density, jnp.float32(colour), rays, samples)
+        assert kept.any()
+        np.testing.assert_allclose(fewer, whole, atol=0.0021)
+
+
+def test_what_stops_the_light_is_needed_whatever_its_colour(rays, samples):
+    wall = lambda x, viewdirs: (jnp.full(x.shape[:-1], 1e6), jnp.ones_like(x))  # noqa: E731
+    kept = needed(wall, full_grid(), rays, samples, background=np.ones(3))
+    np.testing.assert_array_equal(kept.sum(axis=-1), 1)
+    assert kept[:, 0].all()
+
+
+@pytest.mark.parametrize("wrong", [{"max_samples": 0}, {"samples": "gauss"}])
+def test_needed_samples_names_what_it_cannot_pack(rays, samples, wrong):
+    given = {"max_samples": 8, "samples": samples} | wrong
+    if given["samples"] == "gauss":
+        given["samples"] = dataclasses.replace(samples, rule="gauss")
+    with pytest.raises(ValueError, match="needed_samples"):
+        packed_module.visible_samples(scene, full_grid(), rays, error=0.1, **given)
+
+
+@pytest.mark.parametrize("most", [7, 2**31 - 1])
+def test_long_rays_come_first_whatever_their_number(most):
+    count = np.random.default_rng(0).integers(0, 8, 100).astype(np.int32)
+    order = early_termination._longest_first(jnp.asarray(count), most)
+    np.testing.assert_array_equal(order, np.argsort(-count, kind="stable"))

@@ -1,0 +1,228 @@
+"""The Blender reader: what it returns, and that every bad input is named."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from captures import write_png16
+from jaxnerf.data.images.image_files import average_blocks, read_image, to_straight
+from jaxnerf.data.readers.blender import load_views
+
+_POSE = [[1.0, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
+
+
+def _pixels(seed, shape=(12, 8, 4), dtype=np.uint8):
+    return np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A function that changes and writes the JSON of a good scene of two RGBA frames."""
+    (tmp_path / "train").mkdir()
+    for index in range(2):
+        Image.fromarray(_pixels(index)).save(tmp_path / "train" / f"r_{index}.png")
+    frames = [{"file_path": f"./train/r_{index}", "transform_matrix": _POSE} for index in range(2)]
+    content = {"camera_angle_x": 0.8, "frames": frames}
+
+    def write(change=lambda content: None):
+        change(content)
+        (tmp_path / "transforms_train.json").write_text(json.dumps(content))
+        return tmp_path
+
+    return write
+
+
+def test_returns_every_frame_untouched_at_factor_1(scene):
+    views = load_views(scene())
+    assert views.pixels.dtype == np.uint8 and views.background == (1.0, 1.0, 1.0)
+    np.testing.assert_array_equal(views.pixels, np.concatenate([_pixels(k).reshape(-1, 4) for k in range(2)]))
+    np.testing.assert_array_equal(views.offset, [0, 96])
+    np.testing.assert_array_equal(views.size, [[12, 8]] * 2)
+    assert views.names == ("r_0", "r_1")
+    assert (views.cameras.height, views.cameras.width) == (12, 8)
+    np.testing.assert_allclose(views.cameras.focal, 4 / math.tan(0.4), rtol=1e-6)
+    np.testing.assert_array_equal(views.cameras.center, [[4, 6]] * 2)
+    np.testing.assert_array_equal(views.cameras.to_world, np.float32([_POSE[:3]] * 2))
+    np.testing.assert_array_equal(views.near, [2, 2])
+    np.testing.assert_array_equal(views.far, [6, 6])
+
+
+def test_file_path_may_carry_its_extension_or_no_dot(scene):
+    def change(content):
+        content["frames"][0]["file_path"] = "train/r_0.png"
+        content.update(w=8, h=12)
+
+    assert load_views(scene(change)).names == ("r_0", "r_1")
+
+
+def test_factor_scales_pixels_and_camera_together(scene):
+    views = load_views(scene(), factor=4)
+    assert views.pixels.shape == (12, 4) and views.pixels.dtype == np.uint16
+    np.testing.assert_allclose(views.cameras.focal, 1 / math.tan(0.4), rtol=1e-6)
+    np.testing.assert_array_equal(views.cameras.center, [[1, 1.5]] * 2)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.2, 0.0, 0.7)])
+def test_shrinking_commutes_with_compositing(dtype, background):
+    pixels = _pixels(0, (40, 60, 4), dtype)
+    pixels[:20, :30, 3] = 0
+
+    def over(straight):
+        values = straight / np.iinfo(straight.dtype).max
+        return values[..., :3] * values[..., 3:] + np.array(background) * (1 - values[..., 3:])
+
+    wanted = over(pixels).reshape(8, 5, 12, 5, 3).mean((1, 3))
+    found = over(average_blocks(pixels, 5, background=background))
+    assert np.abs(found - wanted).max() < 1e-5
+
+
+def test_hidden_colour_does_not_bleed_over_an_edge():
+    pixels = np.zeros((2, 2, 4), np.uint8)
+    pixels[:, 0] = 200, 100, 0, 255  # beside it: transparent black
+    shrunk = average_blocks(pixels, 2)[0, 0] / 65535
+    np.testing.assert_allclose(shrunk, [200 / 255, 100 / 255, 0, 0.5], atol=2e-5)
+
+
+def test_straight_alpha_is_finite_where_nothing_covers():
+    np.testing.assert_array_equal(to_straight(np.zeros((1, 3)), np.zeros(1), background=(1, 1, 1)), [[0] * 4])
+
+
+def test_rgb_is_taken_only_without_a_background(scene, tmp_path):
+    for index in range(2):
+        Image.fromarray(_pixels(index)[..., :3]).save(tmp_path / "train" / f"r_{index}.png")
+    assert load_views(scene(), background=None).pixels.shape == (192, 3)
+    with pytest.raises(ValueError, match=r"r_0\.png: has no alpha.*background=None"):
+        load_views(tmp_path)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_sixteen_bits_survive(tmp_path, channels):
+    pixels = _pixels(3, (5, 7, channels), np.uint16)
+    write_png16(tmp_path / "deep.png", pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), pixels)
+
+
+def test_grey_and_palette_become_colour(tmp_path):
+    grey = Image.fromarray(_pixels(0, (5, 7)))
+    grey.save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png"), np.asarray(grey)[..., None].repeat(3, -1))
+    grey.convert("P").save(tmp_path / "palette.png", transparency=0)
+    assert read_image(tmp_path / "palette.png").shape == (5, 7, 4)
+
+
+def _set(key, value):
+    return lambda content: content.__setitem__(key, value)
+
+
+def _frame(key, value):
+    return lambda content: content["frames"][1].__setitem__(key, value)
+
+
+def _pose(row, column, value):
+    changed = [list(line) for line in _POSE]
+    changed[row][column] = value
+    return _frame("transform_matrix", changed)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_set("frames", []), "frames is an empty list"),
+        (_set("frames", {}), "frames is '{}'"),
+        (lambda content: content.pop("frames"), "has no frames"),
+        (lambda content: content.pop("camera_angle_x"), "has no camera_angle_x"),
+        (_set("camera_angle_x", math.nan), "camera_angle_x is nan"),
+        (_set("camera_angle_x", 39.6), "camera_angle_x is 39.6.*degrees"),
+        (_set("camera_angle_x", 0), "camera_angle_x is 0"),
+        (_set("camera_angle_x", "wide"), "camera_angle_x is 'wide'"),
+        (_set("camera_angle_x", 10**400), "camera_angle_x is 1000"),
+        (_set("w", 9), r"r_0\.png: is 8 x 12, wanted w = 9"),
+        (_set("h", "12"), "h is '12'"),
+        (lambda content: content["frames"][1].pop("file_path"), "frame 1: has no file_path"),
+        (lambda content: content["frames"][1].pop("transform_matrix"), "frame 1: has no transform_matrix"),
+        (_frame("file_path", 7), "frame 1: file_path is 7"),
+        (_frame("file_path", "./train/r_9"), r"frame 1: .*r_9\.png does not exist"),
+        (_frame("file_path", "train/../../r_1"), "frame 1: file_path .* leaves the folder"),
+        (_frame("file_path", "/etc/passwd"), "frame 1: file_path .* leaves the folder"),
+        (_frame("file_path", "."), "frame 1: file_path '.' leaves the folder"),  # would read ../<folder>.png
+        (_frame("file_path", "train/a\nb"), "frame 1: file_path is"),
+        (_frame("transform_matrix", _POSE[:3]), r"frame 1: .*shape \(3, 4\)"),
+        (_frame("transform_matrix", [[1, 2], [3]]), "frame 1: .*unequal length"),
+        (_frame("transform_matrix", [["a"] * 4] * 4), "frame 1: .*not numbers"),
+        (_pose(0, 3, math.inf), r"frame 1: .*inf at \[0, 3\]"),
+        (_pose(0, 0, -1.0), "frame 1: .*mirrors"),
+        (_pose(0, 0, 1.01), "frame 1: .*no rotation.*1.01"),
+        (_pose(0, 1, 0.01), "frame 1: .*no rotation"),
+        (_pose(0, 0, 1e30), "frame 1: .*no rotation"),
+        (_pose(3, 3, 2.0), "frame 1: .*last row"),
+    ],
+)
+def test_bad_json_is_named(scene, change, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        load_views(scene(change))
+    assert "\n" not in str(caught.value)
+    assert "transforms_train.json" in str(caught.value) or ".png" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"split": "val"}, r"transforms_val\.json: no such file \(the folder has transforms_train\.json\)"),
+        ({"factor": 3}, r"r_0\.png: factor 3 does not divide 8 x 12.*one of 1, 2, 4$"),
+        ({"factor": 0}, "factor is 0"),
+        ({"factor": 2.5}, "factor is 2.5"),
+        ({"near": 6.0}, "near, far is 6.0, 6.0"),
+        ({"near": -1.0}, "near, far is -1.0"),
+        ({"far": math.inf}, "near, far is 2.0, inf"),
+        ({"far": math.nan}, "near, far is 2.0, nan"),
+        ({"background": "white"}, "background is 'white'"),
+        ({"background": (255, 255, 255)}, "background is"),
+    ],
+)
+def test_bad_arguments_are_named(scene, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        load_views(scene(), **arguments)
+
+
+def test_bad_files_are_named(scene, tmp_path):
+    scene()
+    second = tmp_path / "train" / "r_1.png"
+    whole = second.read_bytes()
+    for body in (whole[: len(whole) // 2], whole[:30], b"", b"no image"):
+        second.write_bytes(body)
+        with pytest.raises(ValueError, match=r"r_1\.png: unreadable") as caught:
+            load_views(tmp_path)
+        assert "\n" not in str(caught.value)
+    Image.fromarray(_pixels(1, (12, 12, 4))).save(second)
+    with pytest.raises(ValueError, match=r"r_1\.png: is 12 x 12 uint8.*wanted 8 x 12 uint8 as r_0\.png"):
+        load_views(tmp_path)
+    write_png16(second, _pixels(1, dtype=np.uint16))
+    with pytest.raises(ValueError, match=r"r_1\.png: is 8 x 12 uint16"):
+        load_views(tmp_path)
+    for text in ("{", "[1]", "\xff"):
+        (tmp_path / "transforms_train.json").write_bytes(text.encode("latin-1"))
+        with pytest.raises(ValueError, match=r"transforms_train\.json: (malformed|holds)"):
+            load_views(tmp_path)
+    with pytest.raises(ValueError, match="the folder does not exist"):
+        load_views(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="folder is None"):
+        load_views(None)
+
+
+@pytest.mark.scenes("lego")
+def test_the_real_lego(scenes_dir):
+    test = load_views(scenes_dir / "lego", split="test")
+    assert test.pixels.shape == (25 * 800 * 800, 4) and test.pixels.dtype == np.uint8
+    np.testing.assert_allclose(test.cameras.focal, 1111.111, rtol=1e-6)
+    train = load_views(scenes_dir / "lego", factor=8)
+    assert train.pixels.shape == (100 * 100 * 100, 4) and len(train.names) == 100
+    np.testing.assert_allclose(train.cameras.focal, 138.8889, rtol=1e-6)
+    alpha = train.pixels[:, 3]
+    assert 0.3 < (alpha == 0).mean() < 0.9 and 0.1 < (alpha == 65535).mean()
+    np.testing.assert_allclose(np.linalg.norm(train.cameras.to_world[:, :, 3], axis=-1), 4.0311, rtol=1e-3)
+    with pytest.raises(ValueError, match=r"transforms_test\.json, transforms_train\.json"):
+        load_views(scenes_dir / "lego", split="val")

@@ -1,0 +1,384 @@
+"""Camera paths: every pose rigid and where its closed form says; files of paths, right and wrong."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers import compiled
+from jaxnerf import Camera, Views, pixel_grid
+from jaxnerf.core import poses as poses_module
+from jaxnerf.data.ray_batches import view_rays
+from jaxnerf.evaluation.paths import camera_path as camera_paths
+from jaxnerf.evaluation.paths.from_views import up_of
+from jaxnerf.evaluation.paths.path_files import read_path_file
+
+UP = np.float32([0, 0, 1])
+look_at, interpolate = (
+    compiled(poses_module.look_at),
+    compiled(poses_module.interpolate, "num_frames", "closed"),
+)
+
+
+def turn(axis, degrees):
+    """Returns the rotation about an axis (Rodrigues)."""
+    axis = np.asarray(axis, float) / np.linalg.norm(axis)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    angle = math.radians(degrees)
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def pose(rotation, eye):
+    return np.concatenate([rotation, np.reshape(eye, (3, 1))], axis=1)
+
+
+def ring(count, half_axes=(4.0, 4.0), height=1.0, tilt=None):
+    """Returns poses [count, 3, 4] around the origin that look at it; the world is turned by tilt."""
+    angle = 2 * np.pi * np.arange(count) / count
+    eyes = np.stack([half_axes[0] * np.cos(angle), half_axes[1] * np.sin(angle), 0 * angle + height], axis=-1)
+    flat = [look_at(np.float32(eye), np.zeros(3, np.float32), UP) for eye in eyes]
+    return np.stack([each if tilt is None else tilt @ each for each in flat])
+
+
+def views_of(poses, focal=100.0, names=None, to_file=None, near=2.0, far=6.0, size=(48, 64)):
+    count = len(poses)
+    return Views(
+        pixels=np.zeros((0, 3), np.uint8),
+        offset=np.zeros(count, np.int32),
+        size=np.tile(np.int32([size]), (count, 1)),
+        cameras=Camera(
+            to_world=np.float32(poses),
+            focal=np.broadcast_to(np.float32(focal), (2, count)).T.copy(),
+            center=np.tile(np.float32([[31, 25]]), (count, 1)),
+            height=size[0],
+            width=size[1],
+        ),
+        near=np.full(count, near, np.float32),
+        far=np.full(count, far, np.float32),
+        names=names or tuple(f"v_{index}" for index in range(count)),
+        to_file=to_file,
+    )
+
+
+def assert_rigid(poses):
+    rotation = np.asarray(poses, np.float64)[:, :, :3]
+    assert np.isfinite(poses).all()
+    product = np.swapaxes(rotation, 1, 2) @ rotation
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=2e-6)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=2e-6)
+
+
+def assert_looks_at(poses, target):
+    towards = np.asarray(target) - poses[:, :, 3]
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    np.testing.assert_allclose(-poses[:, :, 2], towards, atol=2e-6)
+
+
+def test_a_turntable_is_a_circle_at_its_elevation():
+    center = np.array([1.0, -2.0, 0.5])
+    poses = np.asarray(poses_module.turntable(16, center=center, radius=3.0, elevation=0.4))
+    assert_rigid(poses)
+    assert_looks_at(poses, center)
+    np.testing.assert_allclose(np.linalg.norm(poses[:, :, 3] - center, axis=-1), 3, rtol=1e-6)
+    np.testing.assert_allclose(poses[:, 2, 3] - 0.5, 3 * math.sin(0.4), rtol=1e-5)
+    steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
+    np.testing.assert_allclose(steps, 2 * 3 * math.cos(0.4) * math.sin(math.pi / 16), rtol=1e-5)
+    assert (poses[:, 2, 1] > 0).all(), "up is up"
+
+
+def test_an_ellipse_has_its_half_axes():
+    middle, axes = np.array([0.0, 1.0, 2.0]), np.array([[3.0, 0, 0], [0, 0.5, 0]])
+    poses = np.asarray(poses_module.ellipse(16, middle=middle, axes=axes, target=np.zeros(3), up=UP))
+    assert_rigid(poses)
+    assert_looks_at(poses, np.zeros(3))
+    x, y, z = (poses[:, :, 3] - middle).T
+    np.testing.assert_allclose((x / 3) ** 2 + (y / 0.5) ** 2, 1, atol=1e-6)
+    np.testing.assert_allclose(z, 0, atol=1e-6)
+    np.testing.assert_allclose(poses[[0, 4], :, 3], middle + axes, atol=1e-6)
+
+
+def test_a_spiral_is_the_llff_codes():
+    """Against render_path_spiral, written out anew, from a pose that is no identity."""
+    middle, radii = pose(turn([1, 2, 3], 40), [1.0, 2.0, 3.0]), np.array([0.5, 0.3, 0.1])
+    poses = np.asarray(poses_module.spiral(120, pose=middle, radii=radii, focus=4.0))
+    assert_rigid(poses)
+    assert_looks_at(poses, middle @ [0, 0, -4, 1])
+    angle = np.linspace(0, 4 * np.pi, 121)[:-1]
+    local = np.stack([np.cos(angle), -np.sin(angle), -np.sin(0.5 * angle), 1 + 0 * angle]) * [
+        *radii[:, None],
+        [1],
+    ]
+    np.testing.assert_allclose(poses[:, :, 3], (middle @ local).T, atol=2e-6)
+    assert ((poses[:, :, 1] @ middle[:, 1]) > 0.9).all()
+
+
+def test_interpolation_passes_through_every_pose():
+    knots = np.stack([pose(turn([1, k, 2], 50 * k), [k * k, -k, k % 2]) for k in range(5)])
+    for closed, count in ((False, 4 * 6 + 1), (True, 5 * 6)):
+        path = interpolate(count, poses=np.float32(knots), closed=closed)
+        assert_rigid(path)
+        np.testing.assert_allclose(path[::6], knots, atol=2e-5)
+        assert np.linalg.norm(np.diff(path[:, :, 3], axis=0), axis=-1).max() < 20 / 6 * 1.5, "no leap"
+    np.testing.assert_allclose(poses_module.path_times(25, 5)[::6], range(5), atol=1e-6)
+
+
+def test_interpolation_is_even_between_two_poses_and_on_a_line():
+    start, end = pose(np.eye(3), [0, 0, 0]), pose(turn([1, 1, 0], 80), [4, 0, 8])
+    path = interpolate(5, poses=np.float32([start, end]))
+    for part, found in zip(np.linspace(0, 1, 5), path, strict=True):
+        wanted = pose(turn([1, 1, 0], 80 * part), [4 * part, 0, 8 * part])
+        np.testing.assert_allclose(found, wanted, atol=2e-6)
+    line = np.stack([pose(np.eye(3), [k, 2 * k, 0]) for k in range(4)])
+    path = interpolate(13, poses=np.float32(line))
+    np.testing.assert_allclose(path[:, :, 3], np.linspace(0, 3, 13)[:, None] * [1, 2, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 179.99, 180.0, 270.0])
+def test_interpolation_turns_the_shorter_way(degrees):
+    knots = np.float32([pose(np.eye(3), [0, 0, 0]), pose(turn([2, -1, 0.5], degrees), [0, 0, 0])])
+    path = interpolate(3, poses=knots)
+    assert_rigid(path)
+    shorter = min(degrees, 360 - degrees)
+    cosine = (np.trace(path[1, :, :3]) - 1) / 2
+    assert math.degrees(math.acos(min(cosine, 1))) == pytest.approx(shorter / 2, abs=0.05)
+
+
+def test_a_single_pose_and_a_single_frame():
+    knots = np.float32([pose(turn([1, 0, 0], 30), [1, 2, 3])])
+    for closed in (False, True):
+        np.testing.assert_allclose(interpolate(1, poses=knots, closed=closed), knots, atol=1e-6)
+    np.testing.assert_allclose(interpolate(1, poses=np.float32(ring(4))), ring(4)[:1], atol=1e-6)
+
+
+def test_the_mean_of_a_pose_and_its_mirror_image_lies_between():
+    left, right = (pose(turn([0, 1, 0], angle), [angle, 0, 5]) for angle in (-20, 20))
+    np.testing.assert_allclose(poses_module.mean_pose([left, right]), pose(np.eye(3), [0, 0, 5]), atol=1e-6)
+
+
+def test_the_path_suits_the_views():
+    assert camera_paths.default_kind(views_of(ring(12))) == "turntable"
+    forward = np.stack([pose(turn([0, 1, 0], angle), [angle / 10, 0, 0]) for angle in (-30, 0, 30)])
+    assert camera_paths.default_kind(views_of(forward)) == "spiral"
+
+
+def test_an_ellipse_passes_through_cameras_on_one():
+    for tilt in (np.eye(3), turn([1, 0, 0], 70)):  # z is up; y is, nearly
+        cameras = ring(16, (5.0, 3.0), 2.0, tilt)
+        path = camera_paths.make_path("ellipse", views_of(cameras), num_frames=16)
+        np.testing.assert_allclose(up_of(cameras), tilt @ UP, atol=1e-6)
+        assert_rigid(path.poses)
+        eyes = path.poses[:, :, 3] @ tilt
+        np.testing.assert_allclose((eyes[:, 0] / 5) ** 2 + (eyes[:, 1] / 3) ** 2, 1, atol=1e-4)
+        np.testing.assert_allclose(eyes[:, 2], 2, atol=1e-4)
+        center = camera_paths.make_path("turntable", views_of(cameras), num_frames=16).poses
+        assert_rigid(center)
+        np.testing.assert_allclose(center[:, :, 3] @ tilt @ UP, center[0, :, 3] @ tilt @ UP, atol=1e-4)
+
+
+def test_up_is_across_the_horizons_of_an_arc_and_the_mean_of_views_that_look_one_way():
+    tilt = turn([1, 0, 0], 70)
+    np.testing.assert_allclose(up_of(ring(16, height=4.0, tilt=tilt)[:6]), tilt @ UP, atol=1e-5)
+    forward = np.stack([pose(tilt @ turn([0, 1, 0], angle), [0, 0, 0]) for angle in (-5, 5)])
+    np.testing.assert_allclose(up_of(forward), tilt[:, 1], atol=1e-6)
+
+
+def test_a_spiral_sways_as_the_cameras_do():
+    offsets = np.random.default_rng(0).normal(size=(20, 3)) * [1.0, 0.5, 0.1]
+    cameras = np.stack([pose(np.eye(3), offset) for offset in offsets - offsets.mean(0)])
+    path = camera_paths.make_path("spiral", views_of(cameras, near=2.0, far=8.0))
+    assert path.poses.shape == (120, 3, 4)
+    assert_rigid(path.poses)
+    eyes = path.poses[:, :, 3]
+    widest = np.percentile(np.abs(cameras[:, :, 3]), 90, axis=0)
+    np.testing.assert_allclose(np.abs(eyes).max(0), widest, rtol=1e-2)
+    focus = 1 / (0.25 / 1.8 + 0.75 / 40)
+    assert_looks_at(path.poses, [0, 0, -focus])
+
+
+def test_views_are_met_in_the_order_of_their_names_with_their_focal_lengths():
+    cameras = ring(3)
+    views = views_of(cameras, focal=[100.0, 200.0, 300.0], names=("a_10", "a_2", "b_1"))
+    path = camera_paths.make_path("interpolate", views)
+    np.testing.assert_allclose(path.poses[::6], cameras[[1, 0, 2]], atol=1e-5)
+    np.testing.assert_allclose(path.focal[[0, 3, 6, 9, 12], 0], [200, 150, 100, 200, 300], rtol=1e-5)
+    closed = camera_paths.make_path("interpolate", views, closed=True)
+    assert len(closed.poses) == 18
+    np.testing.assert_allclose(closed.focal[[0, 6, 12, 15], 1], [200, 100, 300, 250], rtol=1e-5)
+
+
+def test_another_size_shows_the_same():
+    path = camera_paths.make_path("turntable", views_of(ring(4)), num_frames=16)
+
+    def corners(path):
+        sides = np.array([[0, 0], [path.width, path.height]])
+        return (sides - path.center[0]) / path.focal[0]
+
+    for size in ((128, None), (None, 96), (128, 96)):
+        twice = camera_paths.resize(path, *size)
+        assert (twice.width, twice.height) == (128, 96)
+        np.testing.assert_allclose(corners(twice), corners(path), rtol=1e-12)
+    wide = camera_paths.resize(path, 640, 48)
+    np.testing.assert_allclose(corners(wide)[:, 1], corners(path)[:, 1])
+    assert wide.focal[0, 0] == wide.focal[0, 1], "square pixels"
+
+
+@pytest.mark.parametrize("ndc", [False, True])
+def test_rays_of_a_frame_are_those_of_its_own_camera(ndc):
+    """And in NDC they lie in the space that the first view's lens drew in training, whatever their own."""
+    views = views_of([pose(np.eye(3), [0, 0, 0])] * 2)
+    path = camera_paths.CameraPath(
+        "p",
+        "p",
+        np.stack([pose(turn([0, 1, 0], 5), [0.1, 0, 0])] * 2),
+        np.array([[50.0, 60.0], [70.0, 70.0]]),
+        np.array([[10.0, 9.0], [8.0, 8.0]]),
+        20,
+        16,
+    )
+    posed = camera_paths.posed_views(views, path)
+    rays = view_rays(posed, 1, camera_paths.path_pixels(posed, path, 1), ndc=ndc)
+    own = Camera(to_world=np.float32(path.poses), focal=np.float32(path.focal), center=np.float32(path.center))
+    plain = view_rays(dataclasses.replace(posed, cameras=own), 1, pixel_grid(16, 20))
+    np.testing.assert_allclose(rays.viewdirs, plain.viewdirs, atol=1e-6)
+    if not ndc:
+        np.testing.assert_allclose(rays.directions, plain.directions, atol=1e-6)
+        assert (np.asarray(rays.near) == 2).all() and (np.asarray(rays.far) == 6).all()
+        return
+    # Eq. 25 at the near plane: x' = -(f / (W / 2)) x / z with the first view's f and W.
+    direction, origin = np.asarray(plain.directions), np.asarray(plain.origins)
+    point = origin + (-1 - origin[..., 2:]) / direction[..., 2:] * direction
+    np.testing.assert_allclose(rays.origins[..., 0], 100 / 32 * point[..., 0], atol=1e-5)
+
+
+def written(tmp_path, content, name="my path.json"):
+    (tmp_path / name).write_text(json.dumps(content))
+    return tmp_path / name
+
+
+def matrix(each):
+    return [*np.asarray(each, float).tolist(), [0, 0, 0, 1]]
+
+
+SIMILARITY = np.block([[0.02 * turn([3, 1, 2], 100), np.array([[5.0], [-7.0], [9.0]])], [np.eye(4)[3:]]])
+
+
+@pytest.mark.parametrize("to_file", [None, SIMILARITY])
+def test_a_files_poses_are_in_the_captures_world(tmp_path, to_file):
+    wanted = ring(3)
+    in_file = wanted
+    if to_file is not None:
+        eyes = wanted[:, :, 3] @ to_file[:3, :3].T + to_file[:3, 3]
+        in_file = np.concatenate([to_file[:3, :3] / 0.02 @ wanted[:, :, :3], eyes[:, :, None]], axis=-1)
+    frames = [{"transform_matrix": matrix(each)} for each in in_file]
+    views = views_of(ring(5), to_file=to_file)
+    path = camera_paths.make_path(str(written(tmp_path, {"frames": frames})), views)
+    np.testing.assert_allclose(path.poses, wanted, atol=1e-6)
+    assert_rigid(path.poses)
+    assert (path.name, path.width, path.height, path.fps) == ("my path", 64, 48, None)
+    assert (path.focal == 100).all() and (path.center == [31, 25]).all(), "the first view's lens"
+
+
+def test_a_file_may_state_its_own_lens(tmp_path):
+    bare = {"transform_matrix": matrix(ring(1)[0])}
+    frames = [bare, {**bare, "fl_x": 70, "cx": 3}, {**bare, "fl_x": 80, "fl_y": 90}]
+    content = {"frames": frames, "w": 200, "h": 100, "camera_angle_x": math.pi / 2, "fps": 12, "cy": 40}
+    path = camera_paths.make_path(written(tmp_path, content), views_of(ring(5)))
+    np.testing.assert_allclose(path.focal, [[100, 100], [70, 70], [80, 90]])
+    np.testing.assert_allclose(path.center, [[100, 40], [3, 40], [100, 40]])
+    assert (path.width, path.height, path.fps) == (200, 100, 12)
+    path = camera_paths.make_path(written(tmp_path, {"frames": [bare], "h": 96}), views_of(ring(5)))
+    assert (path.width, path.height) == (128, 96) and (path.focal == 200).all()
+
+
+def test_a_path_of_nerfstudios_viewer(tmp_path):
+    poses = ring(2)
+    flat = np.reshape(matrix(poses[0]), -1).tolist()
+    content = {
+        "camera_type": "perspective",
+        "render_height": 100,
+        "render_width": 150,
+        "seconds": 0.5,
+        "camera_path": [
+            {"camera_to_world": flat, "fov": 90, "aspect": 1.5},
+            {"camera_to_world": matrix(poses[1]), "fov": 60, "aspect": 1.5},
+        ],
+    }
+    path = camera_paths.make_path(written(tmp_path, content), views_of(ring(5)))
+    np.testing.assert_allclose(path.poses, poses, atol=1e-6)
+    np.testing.assert_allclose(path.focal[:, 0], [50, 50 * math.sqrt(3)])
+    assert (path.width, path.height, path.fps) == (150, 100, 4) and (path.center == [75, 50]).all()
+    del content["render_width"]
+    assert camera_paths.make_path(written(tmp_path, content), views_of(ring(5))).width == 150
+
+
+GOOD = matrix(ring(1)[0])
+WRONG = {
+    "has w, wanted frames or camera_path": {"w": 3},
+    "frames is not a list": {"frames": {}},
+    "frames is not a list of 1": {"frames": []},
+    r"frames\[1\]: is no object": {"frames": [{"transform_matrix": GOOD}, 3]},
+    r"frames\[0\]: has fl_x, wanted transform_matrix": {"frames": [{"fl_x": 3}]},
+    r"frames\[0\]: the camera-to-world matrix has shape \(2,\)": {"frames": [{"transform_matrix": [1, 2]}]},
+    r"frames\[0\]: .* determinant -1": {"frames": [{"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}]},
+    r"frames\[0\]: fl_x is -1, wanted a number above 0": {"frames": [{"transform_matrix": GOOD, "fl_x": -1}]},
+    r"frames\[0\]: has fl_y but no fl_x": {"frames": [{"transform_matrix": GOOD, "fl_y": 1}]},
+    "w is 0.5, wanted 1 to 16384": {"frames": [{"transform_matrix": GOOD}], "w": 0.5},
+    "camera_angle_x but no w": {"frames": [{"transform_matrix": GOOD}], "camera_angle_x": 1},
+    "fps is 'fast', wanted a number": {"frames": [{"transform_matrix": GOOD}], "fps": "fast"},
+    "wanted render_height too": {"camera_path": [{"camera_to_world": GOOD, "fov": 50}]},
+    r"camera_path\[0\]: fov is 180": {
+        "render_height": 9,
+        "camera_path": [{"camera_to_world": GOOD, "fov": 180}],
+    },
+    r"camera_path\[0\]: has fov, wanted camera_to_world": {"render_height": 9, "camera_path": [{"fov": 50}]},
+    "camera_type is 'fisheye'": {
+        "render_height": 9,
+        "camera_type": "fisheye",
+        "camera_path": [{"camera_to_world": GOOD, "fov": 50}],
+    },
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_a_wrong_file_is_an_error_that_names_file_and_entry(tmp_path, message):
+    with pytest.raises(ValueError, match=message) as error:
+        read_path_file(written(tmp_path, WRONG[message]))
+    assert str(tmp_path / "my path.json") in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_wrong_kind_is_an_error(tmp_path):
+    views = views_of(ring(3))
+    with pytest.raises(ValueError, match="path is 'circle', wanted one of turntable, spiral, ellipse, inter"):
+        camera_paths.make_path("circle", views)
+    with pytest.raises(ValueError, match="No such file"):
+        camera_paths.make_path(tmp_path / "none.json", views)
+    with pytest.raises(ValueError, match="wanted no --frames"):
+        camera_paths.make_path(written(tmp_path, {"frames": [{"transform_matrix": GOOD}]}), views, num_frames=3)
+
+
+NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from([0, 1, 1e-300, 1e300, 10**400]))
+VALUES = st.recursive(st.one_of(st.none(), st.booleans(), NUMBERS, st.text(max_size=3)), st.lists, max_leaves=5)
+KEYS = ["frames", "w", "h", "fl_x", "fl_y", "cx", "camera_angle_x", "fps", "camera_path", "render_height"]
+KEYS += ["render_width", "seconds", "camera_type", "transform_matrix", "camera_to_world", "fov", "aspect"]
+FUZZED_WITH = views_of(ring(2))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.booleans(), st.sampled_from(KEYS), VALUES)
+def test_whatever_stands_in_a_field_it_is_read_or_a_clear_error(tmp_path_factory, own, key, value):
+    frame = {"transform_matrix": GOOD, "camera_to_world": GOOD, "fov": 50, "fl_x": 30}
+    content = {"w": 30, "h": 20, "render_height": 9}
+    content["frames" if own else "camera_path"] = [{**frame, key: value}, frame]
+    file = tmp_path_factory.getbasetemp() / "fuzzed.json"
+    file.write_text(json.dumps({**content, key: value}))
+    try:
+        path = camera_paths.make_path(file, FUZZED_WITH)
+    except ValueError as error:
+        assert str(file) in str(error)
+    else:
+        assert np.isfinite(path.poses).all() and np.isfinite(path.focal).all() and (path.focal > 0).all()
+        assert 1 <= path.width <= 16384 and 1 <= path.height <= 16384

@@ -1,0 +1,259 @@
+"""The fast field: what its grids interpolate, what its harmonics are, and what it costs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
+from jaxnerf.fields.hash_grid import harmonics, hash_grid_field, interpolate, vertices
+
+BOX = {"lower": (-1.0, 0.0, 2.0), "upper": (1.0, 3.0, 3.0)}
+SIZE = (3, 5, 4)  # vertices of the level that is dense
+COUNT = int(np.prod(SIZE))
+fast_harmonics = compiled(harmonics)
+
+
+@compiled
+def dense(table, place):
+    """What a level that begins at row 7 gives."""
+    return interpolate(table, list(place), SIZE, rows=range(7, 7 + COUNT))
+
+
+@compiled
+def shared(table, place):
+    """What a level of 9 x 9 x 9 vertices in 64 rows from row 5 on gives."""
+    return interpolate(table, list(place), (9, 9, 9), rows=range(5, 69))
+
+
+def level(values):
+    """Returns a table with the values [COUNT, F] from row 7 on, and rows that nothing may read around."""
+    return np.pad(np.float32(values), ((7, 4), (0, 0)), constant_values=np.nan)
+
+
+def places(count, seed=0, low=0.0, high=1.0):
+    return np.random.default_rng(seed).uniform(low, high, (3, count)).astype(np.float32)
+
+
+def directions(shape, seed=1):
+    vectors = np.random.default_rng(seed).normal(size=(*shape, 3))
+    return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def inside(shape, seed=2):
+    """Returns points [..., 3] of BOX."""
+    lower, upper = np.float32(BOX["lower"]), np.float32(BOX["upper"])
+    return lower + np.random.default_rng(seed).uniform(size=(*shape, 3)).astype(np.float32) * (upper - lower)
+
+
+@pytest.fixture(scope="module")
+def field():
+    """A small field with a dense level and one that shares rows, parameters, and its compiled functions."""
+    # A list, as JSON gives it.
+    field = hash_grid_field(**BOX, resolutions=[4, 9], table_size=100, features=2, view_width=8)
+    init = compiled(field.init)
+    rng = np.random.default_rng(3)
+    params = jax.tree.map(
+        lambda leaf: leaf + jnp.float32(rng.normal(scale=0.3, size=leaf.shape)), init(jax.random.key(0))
+    )
+    return field, params, compiled(field.apply), init
+
+
+def test_a_dense_level_holds_trilinear_functions_exactly():
+    factors = np.random.default_rng(4).normal(size=(2, 2, 2, 3))  # of 1, x, y, z and their products
+
+    def trilinear(x, y, z):
+        powers = [np.stack([np.ones_like(value), value]) for value in np.float64([x, y, z])]
+        return np.einsum("an,bn,cn,abcf->nf", *powers, factors)
+
+    corners = np.stack(np.meshgrid(*(np.linspace(0, 1, size) for size in SIZE), indexing="ij"))
+    table = level(trilinear(*corners.reshape(3, -1)))
+    points = places(200)
+    np.testing.assert_allclose(dense(table, points), trilinear(*points), atol=3e-6)
+
+
+def test_at_its_vertices_a_dense_level_is_its_table():
+    values = np.random.default_rng(5).normal(size=(COUNT, 2)).astype(np.float32)
+    corners = np.stack(np.meshgrid(*(np.linspace(0, 1, size) for size in SIZE), indexing="ij"))
+    got = dense(level(values), np.resize(np.float32(corners.reshape(3, -1)), (3, COUNT)))
+    np.testing.assert_allclose(got, values, atol=2e-6)
+
+
+@pytest.mark.parametrize("at", [dense, shared], ids=["dense", "shared"])
+def test_places_that_try_to_leave_the_table_stay_in_it(at):
+    """All around are NaN rows: at 0, at 1, one float beside them, outside, and far outside."""
+    table = level(np.ones((COUNT, 2))) if at is dense else np.pad(np.ones((64, 2), "f"), ((5, 3), (0, 0)))
+    if at is shared:
+        table[:5] = table[-3:] = np.nan
+    edges = [0, 1, np.nextafter(np.float32(1), 0), np.nextafter(np.float32(0), 1), -1e-7, 1.5, -3e38, np.inf]
+    grid = np.stack(np.meshgrid(edges, edges, edges, indexing="ij")).reshape(3, -1).astype(np.float32)
+    np.testing.assert_allclose(at(table, grid), np.ones((grid.shape[1], 2)), rtol=1e-6)
+
+
+def test_outside_the_answer_is_that_of_the_nearest_place_inside():
+    table = level(np.random.default_rng(6).normal(size=(COUNT, 2)))
+    points = places(100, low=-1.0, high=2.0)
+    np.testing.assert_array_equal(dense(table, points), dense(table, np.clip(points, 0, 1)))
+
+
+def test_a_place_that_is_nan_shows_and_harms_nothing_else():
+    table = np.random.default_rng(7).normal(size=(100, 2)).astype(np.float32)
+    points = places(10)
+    wrong = points.copy()
+    wrong[[0, 1, 2], [3, 5, 7]] = np.nan
+    for at in (dense, shared):
+        got, want = at(table, wrong), at(table, points)
+        assert np.isnan(got[[3, 5, 7]]).all()
+        whole = np.setdiff1d(range(10), [3, 5, 7])
+        np.testing.assert_array_equal(got[whole], want[whole])
+
+
+def test_a_level_with_more_vertices_than_rows_shares_them_all():
+    """Every one of the 64 rows is read by some vertex, and about as often as any other."""
+    corners = np.stack(np.meshgrid(*[np.float32(np.arange(9) / 8)] * 3, indexing="ij")).reshape(3, -1)
+    rows = np.pad(np.eye(64, dtype=np.float32), ((5, 0), (0, 0)))
+    read = shared(rows, corners)
+    np.testing.assert_allclose(read.sum(-1), 1, atol=1e-6)
+    counts = read.round().sum(0)
+    assert counts.sum() == 729 and counts.min() >= 1 and counts.max() < 40
+
+
+def test_slopes_are_those_of_the_linear_pieces():
+    table, points = level(np.random.default_rng(8).normal(size=(COUNT, 2))), places(6, low=0.02, high=0.23)
+
+    def first(place):
+        return interpolate(jnp.asarray(table), list(place), SIZE, rows=range(7, 7 + COUNT))[:, 0].sum()
+
+    slopes = jax.jit(jax.grad(first))(points)
+    step = np.float32(1 / 64)
+    for axis in range(3):  # the function is linear along each axis, so that differences are exact
+        moved = points.copy()
+        moved[axis] += step
+        np.testing.assert_allclose(slopes[axis], (dense(table, moved) - dense(table, points))[:, 0] / step, atol=1e-3)
+
+
+def test_vertices_are_as_many_as_sides_are_long():
+    assert vertices([2, 2, 2], 16) == (16, 16, 16)
+    assert vertices([2, 3, 1], 13) == (9, 13, 5)
+    assert vertices([1e-6, 1, 1e3], 5) == (2, 2, 5)  # two at least: a cell
+    for resolution in (2, 17, 128):
+        sides = np.float64([1.0, 0.7, 0.33])
+        cells = np.array(vertices(sides, resolution)) - 1
+        assert cells.max() == resolution - 1
+        assert (np.abs(cells - sides * (resolution - 1)) <= np.maximum(0.5, 1 - sides)).all()
+
+
+def test_harmonics_are_orthonormal():
+    """Gauss points along the axis and equal steps around it integrate products of degree 2 exactly."""
+    z, weights = np.polynomial.legendre.leggauss(4)
+    turn = 2 * np.pi * np.arange(8) / 8
+    ring = np.sqrt(1 - z[:, None] ** 2)
+    points = np.stack([ring * np.cos(turn), ring * np.sin(turn), z[:, None] + 0 * turn], -1).reshape(-1, 3)
+    values = np.float64(fast_harmonics(np.float32(points)))
+    each = np.repeat(weights, 8) * 2 * np.pi / 8
+    np.testing.assert_allclose(values.T @ (each[:, None] * values), np.eye(9), atol=1e-6)
+
+
+def test_harmonics_are_their_closed_forms():
+    x, y, z = np.float64(directions((4, 5))).transpose(2, 0, 1)
+    root = lambda value: np.sqrt(value / np.pi)  # noqa: E731
+    wanted = [
+        root(1) / 2 + 0 * x,
+        *(root(3 / 4) * value for value in (y, z, x)),
+        *(root(15) / 2 * value for value in (x * y, y * z, x * z)),
+        root(5) / 4 * (3 * z**2 - 1),
+        root(15) / 4 * (x**2 - y**2),
+    ]
+    got = fast_harmonics(directions((4, 5)))
+    assert got.shape == (4, 5, 9)
+    np.testing.assert_allclose(got, np.stack(wanted, -1), atol=1e-6)
+
+
+def test_a_direction_a_ray_is_a_direction_a_sample(field):
+    _, params, apply, _ = field
+    x, viewdirs = inside((6, 4)), directions((6, 1))
+    density, rgb = apply(params, x, viewdirs)
+    assert density.shape == (6, 4) and rgb.shape == (6, 4, 3)
+    assert density.dtype == rgb.dtype == np.float32
+    assert (density > 0).all() and (rgb > 0).all() and (rgb < 1).all()
+    assert_same(apply(params, x, np.broadcast_to(viewdirs, x.shape)), (density, rgb))
+    other_density, other_rgb = apply(params, x, -viewdirs)
+    np.testing.assert_array_equal(other_density, density)
+    assert (np.abs(other_rgb - rgb).max(-1) > 1e-4).all()
+
+
+def test_batch_is_vmap_is_jit(field):
+    plain, params, _, _ = field
+    x, viewdirs = inside((6, 4)), directions((6, 1))
+    assert_batch_is_vmap_is_jit(lambda *given: plain.apply(params, *given), x, viewdirs)
+
+
+def test_outside_the_box_the_field_is_that_of_the_nearest_point(field):
+    _, params, apply, _ = field
+    x = np.float32(inside((6, 4)) * 3 - 2)
+    nearest = np.clip(x, np.float32(BOX["lower"]), np.float32(BOX["upper"]))
+    assert (x != nearest).any(-1).mean() > 0.5
+    assert_same(apply(params, x, directions((6, 1))), apply(params, nearest, directions((6, 1))), atol=2e-6)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1.0, 1e4, 1e30])
+def test_whatever_the_features_answers_and_slopes_are_finite(field, size, finite={}):  # noqa: B006
+    plain, params, _, _ = field
+
+    def total(params, x, viewdirs):
+        density, rgb = plain.apply(params, x, viewdirs)
+        return density.sum() + rgb.sum(), (density, rgb)
+
+    run = finite.setdefault("run", compiled(jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True)))
+    params = {**params, "table": np.sign(params["table"]) * np.float32(size)}
+    (_, (density, rgb)), slopes = run(params, inside((6, 4)), directions((6, 1)))
+    assert all_finite((density, rgb, slopes))
+    assert density.max() <= np.exp(15) * 1.001 and (density >= 0).all()
+
+
+def test_what_is_drawn_at_first_depends_on_the_key_alone(field):
+    init, apply = field[3], field[2]
+    first, again, other = (init(jax.random.key(seed)) for seed in (0, 0, 1))
+    assert_same(first, again, rtol=0, atol=0)
+    assert (first["table"] != other["table"]).mean() > 0.99
+    assert first["table"].shape == (3 * 4 * 2 + 100, 2)  # the box is 2 x 3 x 1
+    assert not first["bias"].any() and np.abs(first["table"]).max() <= 0.025
+    density, _ = apply(first, inside((6, 4)), directions((6, 1)))
+    np.testing.assert_allclose(density, 1, atol=0.5)  # thin fog to begin with
+
+
+def test_without_view_directions_there_is_nothing_for_them():
+    flops, rows = {}, {}
+    x, viewdirs = inside((32, 16)), directions((32, 1))
+    for use_viewdirs in (True, False):
+        plain = hash_grid_field(**BOX, resolutions=(4,), table_size=100, use_viewdirs=use_viewdirs)
+        params = jax.eval_shape(plain.init, jax.random.key(0))
+        rows[use_viewdirs] = params["view_0"]["kernel"].shape[0]
+        apply = jax.jit(plain.apply).lower(params, x, viewdirs).compile()
+        flops[use_viewdirs] = apply.cost_analysis()["flops"]
+    assert rows == {True: 15 + 9, False: 15}
+    # At least the hidden layer's product with 9 harmonics a sample.
+    assert flops[True] - flops[False] >= 2 * 9 * 128 * 32 * 16
+    params = jax.tree.map(lambda leaf: np.ones(leaf.shape, leaf.dtype), params)
+    assert_same(apply(params, x, viewdirs), apply(params, x, -viewdirs), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "options, wanted",
+    [
+        ({"lower": (0, 0, 0), "upper": (1, 0, 1)}, "the box is .* wanted lower < upper"),
+        ({"lower": (0, 0), "upper": (1, 1)}, "the box is"),
+        ({"lower": (), "upper": ()}, "the box is"),
+        ({"lower": (0,) * 3, "upper": (float("nan"),) * 3}, "the box is"),
+        ({**BOX, "resolutions": ()}, r"resolutions are \(\), wanted one, of at least 2"),
+        ({**BOX, "resolutions": (8, 1)}, r"resolutions are \(8, 1\)"),
+    ],
+)
+def test_what_cannot_be_a_grid_is_named(options, wanted):
+    with pytest.raises(ValueError, match=f"grid_field: {wanted}"):
+        hash_grid_field(**options)
+
+
+def test_a_table_without_rows_of_features_is_named():
+    with pytest.raises(ValueError, match="interpolate: table"):
+        interpolate(jnp.ones(8), [jnp.zeros(3)] * 3, (2, 2, 2), rows=range(8))

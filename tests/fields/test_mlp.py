@@ -1,0 +1,201 @@
+"""The paper's network, against a plain float64 one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import oracle
+from helpers import assert_same
+from jaxnerf.fields.hash_grid import hash_grid_field
+from jaxnerf.fields.mlp import mlp_field
+
+
+def count(params):
+    return sum(leaf.size for leaf in jax.tree.leaves(params))
+
+
+def inputs(seed=0, num_rays=6, num_samples=4):
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1.5, 1.5, (num_rays, num_samples, 3)).astype(np.float32)
+    viewdirs = rng.normal(size=(num_rays, 1, 3))
+    return x, (viewdirs / np.linalg.norm(viewdirs, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def paper():
+    """The network, parameters with biases that are not 0, and the compiled apply."""
+    field = mlp_field()
+    params = jax.jit(field.init)(jax.random.key(0))
+    rng = np.random.default_rng(1)
+    biased = {
+        name: {**layer, "bias": rng.normal(scale=0.1, size=layer["bias"].shape).astype(np.float32)}
+        for name, layer in params.items()
+    }
+    biased["density"]["bias"] -= np.float32(0.05)
+    return field, params, biased, jax.jit(field.apply)
+
+
+def plain_forward(params, x, viewdir):
+    """Returns density and colour at one point: Fig. 7 of the paper in float64."""
+    layer = {name: (np.float64(p["kernel"]), np.float64(p["bias"])) for name, p in params.items()}
+
+    def dense(name, value):
+        kernel, bias = layer[name]
+        return value @ kernel + bias
+
+    encoded = oracle.positional_encoding(np.float64(x), 10)
+    hidden = encoded
+    for index in range(8):
+        hidden = np.maximum(dense(f"trunk_{index}", hidden), 0)
+        if index == 4:
+            hidden = np.concatenate([encoded, hidden])
+    density = np.maximum(dense("density", hidden)[0], 0)
+    features = np.concatenate([dense("bottleneck", hidden), oracle.positional_encoding(np.float64(viewdir), 4)])
+    rgb = dense("rgb", np.maximum(dense("view", features), 0))
+    return density, 1 / (1 + np.exp(-rgb))
+
+
+def test_the_papers_network_has_595844_parameters(paper):
+    assert count(paper[1]) == 595_844
+
+
+def test_it_is_the_papers_network(paper):
+    _, _, params, apply = paper
+    x, viewdirs = inputs()
+    density, rgb = apply(params, x, viewdirs)
+    assert density.shape == (6, 4) and rgb.shape == (6, 4, 3)
+    wanted = [[plain_forward(params, point, viewdirs[i, 0]) for point in x[i]] for i in range(6)]
+    wanted_density = np.array([[pair[0] for pair in row] for row in wanted])
+    wanted_rgb = np.array([[pair[1] for pair in row] for row in wanted])
+    assert 0 < (wanted_density > 0).mean() < 1, "the test's inputs prove nothing"
+    np.testing.assert_allclose(density, wanted_density, atol=1e-5)
+    np.testing.assert_allclose(rgb, wanted_rgb, atol=1e-5)
+
+
+def test_density_is_of_position_alone_and_colour_is_not(paper):
+    _, _, params, apply = paper
+    x, viewdirs = inputs()
+    density, rgb = apply(params, x, viewdirs)
+    other_density, other_rgb = apply(params, x, -viewdirs)
+    np.testing.assert_array_equal(density, other_density)
+    assert (np.abs(rgb - other_rgb).max(axis=-1) > 1e-4).all()
+
+
+def test_a_direction_a_sample_is_a_direction_a_ray(paper):
+    _, _, params, apply = paper
+    x, viewdirs = inputs()
+    each = np.broadcast_to(viewdirs, x.shape)
+    for a, b in zip(apply(params, x, viewdirs), apply(params, x, each), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_it_starts_with_glorot_and_no_bias(paper):
+    for name, layer in paper[1].items():
+        kernel = np.asarray(layer["kernel"])
+        bound = np.sqrt(6 / sum(kernel.shape))
+        assert not np.any(layer["bias"]), name
+        assert np.abs(kernel).max() <= bound * (1 + 1e-6), name
+        if kernel.size > 1000:
+            np.testing.assert_allclose(kernel.std(), bound / np.sqrt(3), rtol=0.05, err_msg=name)
+
+
+def test_without_view_directions_there_is_nothing_for_them():
+    field = mlp_field(use_viewdirs=False)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    assert not {"bottleneck", "view"} & set(params)
+    assert params["rgb"]["kernel"].shape == (256, 3)
+    assert count(params) == 595_844 - (256 * 257) - (283 * 128 + 128) - (128 * 3) + 256 * 3
+    small = mlp_field(use_viewdirs=False, depth=2, width=8, num_freqs=2)
+    params, (x, viewdirs), apply = jax.jit(small.init)(jax.random.key(0)), inputs(), jax.jit(small.apply)
+    for a, b in zip(apply(params, x, viewdirs), apply(params, x, -viewdirs), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_layers_with_no_activation_between_them_cost_no_sample_two_products():
+    width, view_width, samples = 64, 32, 2**12
+    field = mlp_field(depth=2, width=width, view_width=view_width, num_freqs=1, num_view_freqs=1)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    x, viewdirs = (jax.ShapeDtypeStruct((1, count, 3), jnp.float32) for count in (samples, 1))
+    flops = jax.jit(field.apply).lower(params, x, viewdirs).cost_analysis()["flops"]
+    products = samples * (9 * width + width**2 + width + width * view_width + 3 * view_width)
+    products += 9 * view_width + width**2 * view_width + width * view_width
+    others = flops - 2 * products
+    assert 0 < others < samples * width**2, "a product for each sample is more than there should be"
+
+
+@pytest.mark.parametrize("options", [{}, {"key": True}, {"density_noise": 1.0}])
+def test_noise_that_is_off_is_absent(options):
+    assert "random_bits" not in _jaxpr(**options)
+
+
+def test_noise_that_is_on_is_one_normal_number_a_sample():
+    assert "random_bits" in _jaxpr(key=True, density_noise=1.0)
+    field = mlp_field(depth=1, width=4, density_activation="softplus")
+    params = jax.jit(field.init)(jax.random.key(0))
+    x, viewdirs = np.zeros((1000, 5, 3), np.float32), np.ones((1000, 1, 3), np.float32)
+    apply = jax.jit(field.apply, static_argnames="density_noise")
+    density, rgb = apply(params, x, viewdirs, key=jax.random.key(1), density_noise=0.5)
+    raw = np.log(np.expm1(np.float64(density)))  # before softplus
+    assert abs(raw.std() - 0.5) < 0.03
+    assert np.ptp(rgb, axis=(0, 1)).max() < 1e-6
+
+
+def _jaxpr(key=None, density_noise=0.0):
+    field = mlp_field(depth=1, width=4)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    return str(
+        jax.make_jaxpr(
+            lambda params, k, x, d: field.apply(params, x, d, key=k if key else None, density_noise=density_noise)
+        )(params, jax.random.key(0), *inputs())
+    )
+
+
+def test_bfloat16_is_for_the_layers_alone():
+    options = {"depth": 2, "width": 16, "num_freqs": 4}
+    exact, rough = mlp_field(**options), mlp_field(**options, compute_dtype=jnp.bfloat16)
+    params, points = jax.jit(rough.init)(jax.random.key(0)), inputs()
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+    answers = [jax.jit(field.apply)(params, *points) for field in (rough, exact)]
+    for a, b in zip(*answers, strict=True):
+        assert a.dtype == b.dtype == jnp.float32
+        assert 0 < np.abs(a - b).max() < 0.05
+
+
+def test_an_unknown_activation_is_named():
+    with pytest.raises(ValueError, match="density_activation is 'tanh', wanted one of .*relu"):
+        mlp_field(density_activation="tanh")
+
+
+FIELDS = {
+    "mlp": mlp_field(depth=2, width=16, view_width=8, num_freqs=3),
+    "grid": hash_grid_field(lower=(-1, -1, -1), upper=(1, 1, 1), resolutions=(8,), width=16, view_width=8),
+}
+
+
+@pytest.mark.parametrize(
+    "name, rays, samples, directions",
+    [("mlp", 16, 64, 1), ("mlp", 16, 64, 64), ("mlp", 512, 1, 1), ("mlp", 2, 512, 1), ("grid", 2, 512, 1)],
+)
+def test_rows_that_collide_in_the_cache_are_parted_and_none_can_tell(name, rays, samples, directions):
+    """Answers and slopes for 512 samples or 1024 are those of the first ray and of the others."""
+    field, rng = FIELDS[name], np.random.default_rng(0)
+    x, pull = rng.uniform(-1, 1, (2, rays, samples, 3)).astype(np.float32)
+    viewdirs = rng.normal(size=(rays, directions, 3)).astype(np.float32)
+    params = jax.jit(field.init)(jax.random.key(0))
+
+    @jax.jit
+    def ask(params, x, viewdirs, pull):
+        def total(params, x):
+            density, rgb = field.apply(params, x, viewdirs)
+            return (pull * (density[..., None] + rgb)).sum(), (density, rgb)
+
+        return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(params, x)
+
+    (_, answers), (slopes, moves) = ask(params, x, viewdirs, pull)
+    first, rest = ([value[rows] for value in (x, viewdirs, pull)] for rows in (slice(1), slice(1, None)))
+    parts = [ask(params, *part) for part in (first, rest)]
+    close = {"rtol": 1e-5, "atol": 1e-5}
+    assert_same(answers, jax.tree.map(lambda *some: jnp.concatenate(some), *(part[0][1] for part in parts)))
+    assert_same(moves, jnp.concatenate([part[1][1] for part in parts]), **close)
+    assert_same(slopes, jax.tree.map(jnp.add, *(part[1][0] for part in parts)), **close)

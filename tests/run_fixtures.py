@@ -1,0 +1,61 @@
+"""Fixtures that the tests of the engine share, by pytest_plugins = ["run_fixtures"]."""
+
+import contextlib
+import fcntl
+import os
+
+import jax
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from jaxnerf.evaluation.evaluate import train_and_evaluate
+from runs import smoke_config
+
+
+@pytest.fixture(scope="session")
+def compiled_once(tmp_path_factory):
+    """Keeps what takes long to compile on disk: many processes of these tests run the same step."""
+    options = {"jax_persistent_cache_min_compile_time_secs": 0.5}
+    with _options(**options, jax_compilation_cache_dir=str(_shared(tmp_path_factory) / "compiled")):
+        compilation_cache.reset_cache()
+        yield
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module")
+def unoptimized(compiled_once):
+    """Compiles in two thirds of the time what runs for a dozen steps, also in processes that are started."""
+    with _options(jax_disable_most_optimizations=True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def trained(compiled_once, tmp_path_factory):
+    """The workdir of configs/smoke.py: 20 steps, checkpoints of 5, 10, 15 and 20 of which 3 are kept."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    with (_shared(tmp_path_factory) / "trained.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # what one worker compiles, the others then find
+        with _options(jax_disable_most_optimizations=True):
+            assert train_and_evaluate(smoke_config(), folder)
+    return folder
+
+
+def _shared(tmp_path_factory):
+    """Returns the folder that all workers share."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
+@contextlib.contextmanager
+def _options(**options):
+    """Sets options of JAX here and in processes that are started."""
+    old = {name: jax.config.values[name] for name in options}
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in options.items():
+                patch.setenv(name.upper(), str(value))
+                jax.config.update(name, value)
+            yield
+    finally:
+        for name, value in old.items():
+            jax.config.update(name, value)

@@ -1,0 +1,141 @@
+"""One device, four devices as one program, four devices as four: the same run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from test_step import toy_draw, toy_model
+
+from helpers import assert_same, random_rays
+from jaxnerf.runtime import devices
+from jaxnerf.training.build import build
+from jaxnerf.training.state import create_state
+from jaxnerf.training.step import TrainData, make_train_step
+from runs import smoke_config
+
+pytest_plugins = ["run_fixtures"]
+
+
+def run_steps(step, state, data, num_steps, mode, **options):
+    """Returns the last state, in numpy, and all metrics."""
+    run, state, data = devices.compile_step(step, state, data, mode=mode, **options)
+    rows = []
+    for _ in range(num_steps):
+        state, metrics = run(state, data)
+        rows.append(jax.device_get(metrics))
+    return jax.device_get(state), rows
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    assert jax.local_device_count() == 4
+    return build(smoke_config())
+
+
+@pytest.fixture(scope="module")
+def views(experiment):
+    return experiment.load_views("train")
+
+
+@pytest.fixture(scope="module")
+def runs(unoptimized, experiment, views):
+    """Ten steps of configs/smoke.py on one device and on four; device_matrix.py has pmap, too."""
+    model, optimizer = experiment.model, experiment.optimizer
+    step = make_train_step(model, optimizer, experiment.draw)
+    return {
+        mode: run_steps(
+            step,
+            create_state(model, optimizer, 0),
+            TrainData(np.uint32(0), views, None, None),
+            10,
+            mode,
+            batch_size=64,
+            samples_per_ray=16,
+        )
+        for mode in ("jit", "sharded")
+    }
+
+
+def test_ten_steps_give_the_same_parameters(runs):
+    (one, one_rows), (many, many_rows) = runs["jit"], runs["sharded"]
+    start = create_state(build(smoke_config()).model, optax.adam(1e-3), 0).params
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), one.params, start)
+    assert min(jax.tree.leaves(moved)) > 1e-4, "nothing was learned, so nothing is proved"
+    assert_same(many.params, one.params, rtol=0, atol=1e-6)
+    assert int(many.step) == 10
+    for row, many_row in zip(one_rows, many_rows, strict=True):
+        assert_same(many_row, row, rtol=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["sharded", "pmap"])
+@pytest.mark.parametrize("microbatch_size", [4, 2])
+def test_the_gradient_is_not_multiplied_by_the_devices(mode, microbatch_size):
+    """Plain descent follows the gradient's length, which Adam would hide."""
+    optimizer = optax.sgd(0.1)
+    step = make_train_step(toy_model(), optimizer, toy_draw)
+    data = random_rays(0, (16,)), jnp.array([-1])
+    states = {}
+    for name in ("jit", mode):
+        state = create_state(toy_model(), optimizer, 0)
+        states[name], rows = run_steps(step, state, data, 3, name, batch_size=16, microbatch_size=microbatch_size)
+    assert rows[0]["loss"] > 2 * rows[2]["loss"] or rows[0]["grad_norm"] > 0.1
+    assert_same(states[mode], states["jit"], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["sharded", "pmap"])
+def test_the_batch_is_the_same_ray_for_ray(experiment, views, mode):
+    def probe(state, data, positions, *, axis_name=None):
+        keys, batch = experiment.draw(state["step"], positions.reshape(-1), data)
+        seen = {"key": jax.random.key_data(keys), "rgb": batch.rgb, "rays": batch.rays}
+        gather = lambda leaf: jax.lax.all_gather(leaf, axis_name, tiled=True)  # noqa: E731
+        return state, jax.tree.map(gather, seen) if axis_name else seen
+
+    state = {"step": jnp.int32(3)}
+    data = TrainData(np.uint32(0), views, None, None)
+    _, (seen,) = run_steps(probe, state, data, 1, mode, batch_size=64, microbatch_size=8)
+    keys, batch = jax.jit(experiment.draw)(3, jnp.arange(64), data)
+    np.testing.assert_array_equal(seen["key"], jax.random.key_data(keys))
+    assert_same((seen["rgb"], seen["rays"]), (batch.rgb, batch.rays))
+
+
+@pytest.mark.parametrize(
+    "batch_size, num_devices, block_size",
+    [(10, 4, 0), (3, 4, 0), (0, 1, 0), (16, 4, 3), (64, 1, 48), (-4, 4, 0)],
+)
+def test_what_does_not_come_out_even_is_named(batch_size, num_devices, microbatch_size):
+    with pytest.raises(ValueError, match=f"batch_size {batch_size} on {num_devices} .*change train.batch_size"):
+        devices.split_positions(batch_size, num_devices, microbatch_size)
+
+
+def test_every_place_in_the_batch_is_taken_once():
+    positions = devices.split_positions(48, 4, 6)
+    assert positions.shape == (4, 2, 6)
+    np.testing.assert_array_equal(positions.ravel(), np.arange(48))
+
+
+@pytest.mark.parametrize("mode", ["sharded", "pmap"])
+def test_an_uneven_batch_does_not_train(mode):
+    step = make_train_step(toy_model(), optax.sgd(0.1), toy_draw)
+    state = create_state(toy_model(), optax.sgd(0.1), 0)
+    with pytest.raises(ValueError, match="batch_size 30 on 4 device.*does not come out even"):
+        devices.compile_step(step, state, None, batch_size=30, mode=mode)
+
+
+def test_an_unknown_mode_is_named():
+    with pytest.raises(ValueError, match="parallel is 'tpu', wanted one of"):
+        devices.compile_step(None, None, None, batch_size=4, mode="tpu")
+
+
+def test_runs_of_other_seeds_are_one_program():
+    texts, drawn = [], []
+    for seed in (0, 1):
+        config = smoke_config()
+        config.seed = seed
+        experiment = build(config)._replace(model=toy_model())
+        _, data = experiment.survey(experiment.load_views("train"))
+        state = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, 0))  # noqa: B023
+        step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
+        texts.append(jax.jit(step).lower(state, data, np.arange(64)[None]).as_text())
+        drawn.append(np.asarray(jax.jit(experiment.ids)(0, np.arange(64), data)))
+    assert texts[0] == texts[1] and (drawn[0] != drawn[1]).mean() > 0.9

@@ -1,0 +1,216 @@
+"""Each fault by itself, on real processes and disks; a line says what came of it.
+
+    sudo python tests/faults/each.py --out=FOLDER
+
+Root is needed to mount the disks that get full or read-only.
+"""
+
+import argparse
+import contextlib
+import logging
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+
+ROOT = pathlib.Path(__file__).resolve().parents[3]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from jaxnerf.training import build, workdir  # noqa: E402
+from jaxnerf.training.checkpoint import Checkpoints  # noqa: E402
+from jaxnerf.training.metric_log import read_rows  # noqa: E402
+from jaxnerf.training.state import create_state  # noqa: E402
+
+OPTIONS = {"save_every": 10, "log_every": 1, "keep": 1000}
+TRAIN = ("--config=configs/smoke.py", *(f"--config.train.{name}={value}" for name, value in OPTIONS.items()))
+FOREVER = (*TRAIN, "--config.train.max_steps=1000000")
+
+
+def main(out):
+    out = pathlib.Path(out)
+    out.mkdir(parents=True)
+    logging.disable()  # of orbax, which tells of each file that it cannot read
+    for fault in (damage, second, signals, full_disk, read_only, devices):
+        for line in fault(out):
+            print(f"{fault.__name__:9}  {line}", flush=True)
+
+
+def damage(out):
+    """Every file of a checkpoint cut, removed, or with one bit changed: true numbers or the one before."""
+    finish("train", out / "run", *TRAIN)
+    wanted = jax.device_put(state(out / "run", 20))
+    names = [path for path in (out / "run/checkpoints/20").rglob("*") if path.is_file()]
+    for kind in (cut, os.remove, change):
+        steps = []
+        for name in names:
+            copy = shutil.copytree(out / "run", out / "damaged")
+            kind(copy / name.relative_to(out / "run"))
+            try:
+                found, said = Checkpoints(copy, max_to_keep=3).load_newest(wanted)
+                assert len(said) == (int(found.step) == 10), said
+                if not said:
+                    jax.tree.map(np.testing.assert_array_equal, found, wanted)
+                steps.append(int(found.step))
+            except ValueError as error:  # both in one breath: named, and both still there
+                assert "checkpoints/20" in str(error) and Checkpoints(copy).steps() == [10, 20]
+                steps.append(None)
+            shutil.rmtree(copy)
+        yield f"{kind.__name__} in one of {len(names)} files: went on from steps {steps}"
+
+
+def second(out):
+    """A second training is refused, evaluation beside the first is not."""
+    with training(out / "two") as (process, _):
+        code, err = finish("train", out / "two", *FOREVER)
+        assert code == 1 and f"process {process.pid} on " in err[-1], err
+        yield f"exit {code}, {err[-1]}"
+        code, err = finish("eval", out / "two", "--step", str(wait_for(out / "two", process, 10)))
+        assert code == 0, err
+        yield f"eval beside it: exit {code}"
+
+
+def signals(out):
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with training(out / f"signal{int(number)}") as (process, folder):
+            process.send_signal(number)
+            err = process.communicate(timeout=300)[1].splitlines()
+            assert process.returncode == 0 and "saved; the same command goes on" in err[-1], err
+            yield f"{number.name} in training: exit 0, {err[-1]}"
+    folder = out / "scored"
+    process = start("train", folder, *TRAIN, "--config.eval.at_end")
+    while process.poll() is None and not (folder / "eval").exists():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    err = process.communicate(timeout=300)[1].splitlines()
+    assert process.returncode == 0 and "stopped while scoring" in err[-1], err
+    yield f"SIGTERM while scoring: exit 0, {err[-1]}"
+    for _ in range(2):
+        code, _ = finish("train", folder, *TRAIN, "--config.eval.at_end")
+        assert code == 0 and (folder / "eval/20/results.json").exists()
+
+
+def full_disk(out):
+    with disk(out / "full") as place:
+        with training(place / "run") as (process, folder):
+            fill(place)
+            err = process.communicate(timeout=300)[1].splitlines()
+        assert process.returncode == 1 and err[-1].startswith("error: "), err
+        yield f"while training: exit 1, {err[-1]}"
+        before = Checkpoints(folder).steps()
+        for program, options in (("train", FOREVER), ("eval", ())):
+            code, err = finish(program, folder, *options)
+            assert code == 1 and Checkpoints(folder).steps() == before, err
+            assert not list(folder.glob("eval/*/results.json")), err
+            yield f"{program} then: exit 1, {err[-1]}"
+        code, err = finish("train", place / "new", *TRAIN)
+        assert code == 1, err
+        yield f"a new run: exit 1, {err[-1]}"
+        os.remove(place / "filler")
+        end = before[-1] + 10
+        code, err = finish("train", folder, *TRAIN, f"--config.train.max_steps={end}")
+        assert code == 0 and any(line.startswith(f"steps       {before[-1]} of") for line in err), err
+        assert [row["step"] for row in read_rows(folder)] == list(range(1, end + 1))
+        yield f"with room again: went on from {before[-1]}"
+
+
+def read_only(out):
+    with disk(out / "read") as place:
+        code, err = finish("train", place / "run", *TRAIN)
+        assert code == 0, err
+        subprocess.run(["mount", "-o", "remount,ro", place], check=True)
+        for program, name in (("train", "run"), ("train", "new"), ("eval", "run")):
+            code, err = finish(program, place / name, *(TRAIN if program == "train" else ()))
+            assert code == 1 and "Read-only file system" in err[-1], err
+            yield f"{program} in {name}: exit 1, {err[-1]}"
+
+
+def devices(out):
+    """Four devices, then two, then one, against one and against four all the way."""
+    shares = {"mixed": (4, 2, 1), "one": (1, 1, 1), "four": (4, 4, 4)}
+    for name, counts in shares.items():
+        for end, count in zip((20, 40, 60), counts, strict=True):
+            os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={count}"
+            code, err = finish("train", out / name, *TRAIN, f"--config.train.max_steps={end}")
+            assert code == 0, err
+    params = {name: jax.tree.leaves(state(out / name, 60).params) for name in shares}
+    for name in ("one", "four"):
+        pairs = zip(params["mixed"], params[name], strict=True)
+        largest = max(float(np.abs(a - b).max()) for a, b in pairs)
+        assert largest < 1e-5
+        yield f"4, then 2, then 1, against {name} all the way, 60 steps: parameters within {largest:.1e}"
+
+
+def start(program, folder, *flags):
+    command = [sys.executable, "-m", f"jaxnerf.{program}", f"--workdir={folder}", *map(str, flags)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def finish(program, folder, *flags):
+    """Returns the exit code and the lines of what was said."""
+    process = start(program, folder, *flags)
+    said = process.communicate(timeout=600)[1]
+    assert "Traceback" not in said, said
+    return process.returncode, said.splitlines()
+
+
+@contextlib.contextmanager
+def training(folder):
+    """Gives a process that trains without an end, past its first checkpoint, and its workdir."""
+    process = start("train", folder, *FOREVER)
+    try:
+        wait_for(folder, process, 12)
+        yield process, folder
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(folder, process, step):
+    while max([row["step"] for row in read_rows(folder)], default=0) < step:
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.01)
+    return max(Checkpoints(folder).steps())
+
+
+@contextlib.contextmanager
+def disk(place, size="8m"):
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", place], check=True)
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
+def fill(place):
+    with contextlib.suppress(OSError), open(place / "filler", "wb", buffering=0) as file:
+        while file.write(bytes(2**12)):
+            pass
+
+
+def state(folder, step):
+    experiment = build.build(workdir.read_config(folder))
+    like = create_state(experiment.model, experiment.optimizer, experiment.seed)
+    return jax.device_get(Checkpoints(folder).load(step, like))
+
+
+def cut(path):
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def change(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--out", required=True)
+    main(**vars(parser.parse_args()))
