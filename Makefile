@@ -1,9 +1,10 @@
-# make demo: train and score the embedded scene. make test: the tests. Both need python3 with venv alone.
+# make demo: trains and scores the embedded scene. make test: runs the fast tests. Both need only python3 with venv.
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
+PYTEST := $(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile
 
-.PHONY: demo test lint clean
+.PHONY: demo test test-slow test-extra lint clean
 
 $(BIN)/.installed: setup.cfg pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -11,17 +12,26 @@ $(BIN)/.installed: setup.cfg pyproject.toml
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
-	$(BIN)/pip install --quiet --editable '.[dev,tensorboard]'
+	$(BIN)/pip install --quiet --editable '.[dev,check,tensorboard]'
 	touch $@
 
 demo: $(BIN)/.installed
-	$(BIN)/python -m jaxnerf.train --config=configs/quickstart.py --workdir=$(DEMO)
-	$(BIN)/python -m jaxnerf.eval --workdir=$(DEMO) --overwrite
-	$(BIN)/python -m jaxnerf.render --workdir=$(DEMO) --overwrite
-	$(BIN)/python experiments/table.py $(DEMO)
+	$(BIN)/jaxnerf-train --config=quickstart --workdir=$(DEMO)
+	$(BIN)/jaxnerf-eval --workdir=$(DEMO) --overwrite
+	$(BIN)/jaxnerf-render --workdir=$(DEMO) --overwrite
+	$(BIN)/python experiments/results/table.py $(DEMO)
 
 test: $(BIN)/.dev
-	$(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile
+	$(PYTEST) -m "not slow"
+
+test-slow: $(BIN)/.dev
+	$(PYTEST) -m slow
+
+# These take longer, or need root to mount small disks; .ci/run does not call them.
+test-extra: $(BIN)/.dev
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/device_matrix.py runs/extra/device_matrix
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/kill_many.py --kills=20 --seed=1 --out=runs/extra/kill_many
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .

@@ -1,15 +1,15 @@
-"""The complete model of experiments/ablation.py: the paper's, smaller in proportion, on lego at 100 x 100.
+"""Lego at 100 x 100: the paper's model scaled down in proportion, for experiments/ablation.
 
-Two networks alike, half as deep and a fifth as wide. As pixels are eight times as large, an eighth of the
-samples, which are then as many pixels apart, and three octaves less. Softplus and the learning rate are
-those of lego_small.py; the paper's Adam moves all of it.
+The two networks have equal sizes: half the paper's depth and a fifth of its width. Pixels are eight times as
+large, so the model has an eighth of the samples, which keeps their distance in pixels, and three octaves less.
+Softplus and the learning rate come from lego_small.py. Adam updates all parameters, as in the paper.
 """
 
-from configs import lego_small
+from jaxnerf.configs import lego_small
 
 
 def get_config():
-    """Returns the configuration; --steps of the experiment says how long."""
+    """Returns the config; the experiment's --steps sets the number of steps."""
     config = lego_small.get_config()
     for network in (config.coarse, config.fine):
         network.depth, network.width, network.skip_layer, network.view_width = 4, 48, 2, 24

@@ -1,18 +1,18 @@
-"""A dataset of one's own, by --data_dir alone: format, world and sizes are inferred from it."""
+"""Your own dataset, from --data_dir alone: format, world and sizes are inferred from it."""
 
-from configs import lego_fast
+from jaxnerf.configs import lego_fast
 
 
 def get_config():
-    """Returns the configuration; ten minutes on a CPU core."""
+    """Returns the config; it trains for ten minutes on one CPU core."""
     config = lego_fast.get_config()
     data = config.data
     data.format, data.dir, data.factor, data.width = "auto", "", "auto", 200
     data.background, data.ndc = "auto", "auto"
-    # Without alpha nothing is known to be empty at first, and faint matter in photographs is mostly fog.
+    # Without alpha no cell is known to be empty at first, and thin density in real images is mostly fog.
     config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 27.0
     train = config.train
-    # These differ from lego_fast.py, whose values were chosen on lego alone.
+    # lego_fast.py has other values here, chosen on lego alone.
     config.hash_grid.view_width, config.eval.sample_multiplier, train.averaging_power = 128, 1.0, 0.0
     train.batch_size, train.max_steps, train.lr_steps, train.max_seconds = 384, 12_000, 12_000, 600.0
     return config

@@ -1,13 +1,14 @@
-"""Lego at 100 x 100 in minutes on one CPU core: a hash grid under the occupancy sampler.
+"""Lego at 100 x 100 in minutes on one CPU core: a hash grid with the occupancy sampler.
 
-Sizes are inferred from cameras, alpha and images; the rest was chosen on views held out of the training set.
+Sizes are inferred from cameras, alpha and images. The other values were chosen on views held out of the
+training set.
 """
 
-from configs import default
+from jaxnerf.configs import default
 
 
 def get_config():
-    """Returns the configuration."""
+    """Returns the config."""
     config = default.get_config()
     config.data.format, config.data.dir, config.data.factor = "blender", "lego", 8
     config.field, config.sampler = "hash_grid", "occupancy"
@@ -16,10 +17,10 @@ def get_config():
     train.batch_size, train.max_steps, train.lr_steps = 512, "auto", "auto"
     train.lr_init, train.lr_final, train.warmup_steps = 5e-3, 1.5e-4, 50
     train.muon = 0.6
-    train.beta2, train.epsilon = 0.99, 1e-15  # a feature that is rarely hit moves as far as any other
+    train.beta2, train.epsilon = 0.99, 1e-15  # features that few samples reach move as far as the others
     train.averaging_power = 10.0
     train.log_every, train.save_every = 200, 4000
     config.occupancy.occlusion_start_step = 300
-    config.eval.sample_multiplier = 1.5  # no jitter averages over a step in images, so steps are finer
-    config.eval.chunk = 8192  # fills the sample buffer, and is not much more than a small image needs
+    config.eval.sample_multiplier = 1.5  # rendering has no jitter that averages over a step, so its steps are shorter
+    config.eval.chunk = 8192  # enough to fill the sample buffer, and not much more than a small image needs
     return config

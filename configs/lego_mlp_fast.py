@@ -1,15 +1,15 @@
-"""Lego at 100 x 100: a small network of the paper's kind under the occupancy sampler, without a hash grid."""
+"""Lego at 100 x 100: a small network of the paper's kind with the occupancy sampler, without a hash grid."""
 
-from configs import lego_fast
+from jaxnerf.configs import lego_fast
 
 
 def get_config():
-    """Returns the configuration; eight minutes of training on one CPU core."""
+    """Returns the config; it trains for eight minutes on one CPU core."""
     config = lego_fast.get_config()
     config.field = "mlp"
     network = config.fine
     network.depth, network.width, network.view_width, network.num_freqs = 4, 64, 32, "auto"
-    # A ReLU that has died cannot come back, and this learning rate is high.
+    # A dead ReLU has no gradient and cannot recover, and this learning rate is high.
     network.density_activation, network.density_bias = "softplus", -1.0
     train = config.train
     train.batch_size, train.max_steps, train.lr_steps = 320, 30_000, 30_000

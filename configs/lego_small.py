@@ -1,25 +1,25 @@
-"""Lego at 100 x 100, a coarse and a fine network of the paper's kind, small enough for two CPU cores.
+"""Lego at 100 x 100: a coarse and a fine network of the paper's kind, small enough for two CPU cores.
 
-No empty space is left out and no alpha guides the samples. What was made smaller was chosen on views
-held out of the training set.
+Samples are evaluated in empty space, too, and alpha does not guide them. The sizes were chosen on views held
+out of the training set.
 """
 
-from configs import default
+from jaxnerf.configs import default
 
 
 def get_config():
-    """Returns the configuration; ten minutes of training on two cores."""
+    """Returns the config; it trains for ten minutes on two cores."""
     config = default.get_config()
     config.data.format, config.data.dir, config.data.factor = "blender", "lego", 8
     coarse, fine = config.coarse, config.fine
-    # The coarse network only has to say where matter is: no colour by direction, few octaves.
+    # The coarse network only guides samples, so it needs no view dependence and few octaves.
     coarse.depth, coarse.width, coarse.num_freqs, coarse.use_viewdirs = 2, 32, 6, False
     fine.depth, fine.width, fine.view_width, fine.num_freqs = 4, 80, 64, 7
     for network in (coarse, fine):
-        # A ReLU that has died cannot come back, and this learning rate is high.
+        # A dead ReLU has no gradient and cannot recover, and this learning rate is high.
         network.density_activation, network.density_bias = "softplus", -1.0
     config.sampling.num_coarse, config.sampling.num_fine = 24, 16
-    # Guided by a coarse network, Gauss points reach an error soonest: experiments/trained_quadrature.py.
+    # With a coarse network, Gauss points need the least time for a given error (experiments/quadrature).
     config.sampling.rule = "gauss"
     train = config.train
     train.batch_size = 256

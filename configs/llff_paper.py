@@ -1,17 +1,17 @@
-"""The paper's run on forward-facing photographs at 1008 x 756 (Section 5.3 and the released code)."""
+"""The paper's run on the forward-facing scenes at 1008 x 756 (Section 5.3 and the released code)."""
 
-from configs import default
+from jaxnerf.configs import default
 
 
 def get_config():
-    """Returns the configuration; give the scene with --data_dir."""
+    """Returns the config; --data_dir selects the dataset."""
     config = default.get_config()
     config.data.format = "llff"
     config.data.dir = "fern"
     config.data.factor = 4
     config.data.background = "black"
     config.data.ndc = True
-    config.data.pixel_offset = 0.0  # the code looks through pixel corners; the paper says nothing
+    config.data.pixel_offset = 0.0  # the code traces rays through pixel corners; the paper does not say
     config.sampling.rule = "points"
     config.sampling.importance_padding = 1e-5  # the code's padding; the paper has none
     config.sampling.density_noise = 1.0  # Appendix A: noise of unit variance for real scenes

@@ -1,10 +1,10 @@
-"""The demo: the embedded scene at 100 x 100 in two to three minutes on two CPU cores."""
+"""The demo: the embedded scene at 100 x 100, in two to three minutes on two CPU cores."""
 
-from configs import lego_small
+from jaxnerf.configs import lego_small
 
 
 def get_config():
-    """Returns the configuration of lego_small on the embedded scene."""
+    """Returns the config of lego_small on the embedded scene."""
     config = lego_small.get_config()
     config.data.format, config.data.dir, config.data.factor = "synthetic", "", 1
     train = config.train

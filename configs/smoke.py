@@ -1,9 +1,10 @@
-"""A run of seconds on the embedded scene, for tests."""
+"""A run of a few seconds on the embedded scene, for tests."""
 
-from configs import default
+from jaxnerf.configs import default
 
 
 def get_config():
+    """Returns the config."""
     config = default.get_config()
     config.data.size = 24
     for name in ("coarse", "fine"):

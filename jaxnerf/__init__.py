@@ -1,11 +1,12 @@
 """Neural radiance fields as pure functions: rays, samples, weights and images of any scene.
 
 A scene is any function (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S], rgb [..., S, 3]).
-Importing this package needs jax and jaxtyping only. What reads data or runs is imported when it is first used.
+Importing this package needs jax and jaxtyping only. The functions that read datasets or runs are imported when they
+are first used.
 """
 
 import importlib as _importlib
-from typing import TYPE_CHECKING as _TYPE_CHECKING
+import typing as _typing
 
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, rays_from_pixels, undistort
 from jaxnerf.core.encoding import positional_encoding
@@ -46,7 +47,7 @@ from jaxnerf.core.volume_rendering import (
 )
 from jaxnerf.registry import register_field, register_loss, register_reader, register_sampler
 
-if _TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from jaxnerf.data.dataset import load_dataset
     from jaxnerf.data.ray_batches import draw_batch
     from jaxnerf.evaluation.evaluate import train_and_evaluate
@@ -69,11 +70,12 @@ _ON_DEMAND = {
     "train_and_evaluate": "jaxnerf.evaluation.evaluate",
 }
 
+if not _typing.TYPE_CHECKING:  # a type checker would accept every name
 
-def __getattr__(name):
-    if name not in _ON_DEMAND:
-        raise AttributeError(f"module 'jaxnerf' has no attribute {name!r}")
-    return getattr(_importlib.import_module(_ON_DEMAND[name]), name)
+    def __getattr__(name):
+        if name not in _ON_DEMAND:
+            raise AttributeError(f"module 'jaxnerf' has no attribute {name!r}")
+        return getattr(_importlib.import_module(_ON_DEMAND[name]), name)
 
 
 def __dir__():

@@ -1,6 +1,7 @@
-"""python -m jaxnerf.check --data_dir=DIR: looks a capture over before hours of training are spent on it.
+"""Checks a dataset before training: jaxnerf-check --data_dir=DIR.
 
-Exits 0 when nothing was found that would ruin training, 1 when something was or the capture is unreadable.
+`python -m jaxnerf.check` is the same program. It prints a report and writes a plot of the cameras. It exits
+with 0 if it finds no error that would make training useless, and with 1 if it does or if the dataset is unreadable.
 """
 
 import pathlib
@@ -10,48 +11,67 @@ from absl import flags
 
 from jaxnerf.runtime import cli
 
-_DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder.")
-_FORMAT = flags.DEFINE_string("format", "auto", "blender, transforms, colmap or llff; auto: as training would.")
-_NEAR = flags.DEFINE_float("near", None, "Where training's rays begin, in t; its default when not given.")
-_FAR = flags.DEFINE_float("far", None, "Where they end.")
-_OUT = flags.DEFINE_string("out", None, "PNG of cameras and points; check-<folder>.png here when not given.")
-_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier picture.")
+_DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder.", required=True)
+_FORMAT = flags.DEFINE_string("format", "auto", "The dataset's format, or auto, which selects the one training uses.")
+_NEAR = flags.DEFINE_float("near", None, "The t at which rays will begin. When it is not given, training's default.")
+_FAR = flags.DEFINE_float("far", None, "The t at which rays will end. When it is not given, training's default.")
+_OUT = flags.DEFINE_string(
+    "out", None, "The PNG with the cameras and points. When it is not given, check-FOLDER.png is written here."
+)
+_OVERWRITE = flags.DEFINE_bool(
+    "overwrite", False, "Whether to replace the PNG if it is not an earlier plot of the same dataset."
+)
 
 
 def main(argv):
     del argv
-    from jaxnerf.capture_check import camera_plot
+    try:
+        import cv2  # noqa: F401
+    except ImportError as error:
+        raise ValueError(
+            f"jaxnerf-check compares images with OpenCV, which is unavailable ({error}); install it with "
+            "`pip install opencv-python-headless`"
+        ) from None
+    # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.capture_check.report import inspect
-    from jaxnerf.data.dataset import scene_folder
+    from jaxnerf.data.dataset import dataset_folder
     from jaxnerf.data.readers.validation import check_range
 
-    if not _DATA_DIR.value:
-        raise ValueError("nothing to check: give --data_dir=DIR of a capture")
     if None not in (_NEAR.value, _FAR.value):
         check_range(_NEAR.value, _FAR.value)
-    folder = scene_folder(_DATA_DIR.value)
-    out = _picture(folder)
+    folder = dataset_folder(_DATA_DIR.value)
+    try:
+        from jaxnerf.capture_check import camera_plot
+    except ImportError as error:
+        camera_plot, plot = None, f"none: matplotlib is unavailable ({error}); install it with `pip install matplotlib`"
+    else:
+        plot = _plot_path(folder, camera_plot.is_plot_of)
     report = inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value)
-    flagged = {index for finding in report.findings for index in finding.frames}
-    camera_plot.plot_cameras(report.capture, report.poses, report.places, flagged=flagged).save(out)
     print(report.text())
-    print(f"picture: {out}")
-    sys.exit(1 if report.ruined else 0)
+    if camera_plot:
+        camera_plot.save(camera_plot.plot_cameras(report), plot, folder)
+    print(f"plot: {plot}")
+    sys.exit(1 if report.num_errors else 0)
 
 
-def _picture(folder):
-    """Returns the path of the picture, outside of the capture's folder and not there yet."""
+def _plot_path(folder, is_plot_of):
+    """Returns the path of the plot, outside the dataset's folder and where it replaces no other file."""
     out = pathlib.Path(_OUT.value or f"check-{folder.resolve().name}.png")
     if out.suffix.lower() != ".png":
-        raise ValueError(f"--out is {str(out)!r}, wanted a name that ends in .png; correct it")
+        raise ValueError(f"--out is {str(out)!r}, expected a name that ends in .png; correct it")
     if not out.parent.is_dir():
-        raise ValueError(f"--out is {str(out)!r}, and {out.parent} is no folder; make it first")
+        raise ValueError(f"--out is {str(out)!r}, but {out.parent} is not a folder; create it first")
     if folder.resolve() in out.resolve().parents:
-        raise ValueError(f"the picture {out} would lie in the capture's folder, wanted another; give --out")
-    if out.exists() and not _OVERWRITE.value:
-        raise ValueError(f"{out} is there already; give --overwrite or another --out")
+        raise ValueError(f"the plot {out} would be written into the dataset's folder; choose another path with --out")
+    if out.exists() and not _OVERWRITE.value and not is_plot_of(out, folder):
+        raise ValueError(f"{out} exists and is not a plot of {folder}; add --overwrite or choose another --out")
     return out
 
 
-if __name__ == "__main__":
+def run():
+    """Runs the program."""
     cli.run(main)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,97 +1,105 @@
-"""python -m jaxnerf.eval --workdir=DIR: scores a run's checkpoint on held-out views."""
+"""Scores a run on held-out views: jaxnerf-eval --workdir=DIR, or images: jaxnerf-eval --predictions=DIR.
+
+`python -m jaxnerf.eval` is the same program. It writes DIR/eval/STEP/results.json, or DIR/results.json.
+"""
 
 from absl import flags
-from ml_collections import config_flags
 
 from jaxnerf.runtime import cli
 
-_CONFIG = config_flags.DEFINE_config_file("config", None, "In place of the workdir's own.", lock_config=True)
-_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.")
-_DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
-_SPLIT = flags.DEFINE_string("split", None, "Of the scene; config.eval.split when not given.")
-_STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
-_CHUNK = cli.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
-_WATCH = flags.DEFINE_bool("watch", False, "Score new checkpoints as they come, until training's last step.")
-_POLL = flags.DEFINE_float("poll_seconds", 10.0, "How often --watch looks.", lower_bound=0.01)
-_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an earlier result.")
-_BAKE_OCCUPANCY = flags.DEFINE_bool("bake_occupancy", None, "Leave out what is not seen of a dense model.")
+_CONFIG = cli.define_config("A config that replaces the workdir's: a name, or the path of a file.")
+_WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.")
+_DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
+_SPLIT = flags.DEFINE_string("split", None, "The split of the dataset. It overrides config.eval.split.")
+_STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is scored.")
+_CHUNK = cli.define_count(
+    "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
+)
+_WATCH = flags.DEFINE_bool("watch", False, "Whether to score each new checkpoint until training ends.")
+_POLL = flags.DEFINE_float(
+    "poll_seconds", 10.0, "The time between two searches for a checkpoint with --watch.", lower_bound=0.01
+)
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an earlier result.")
+_BAKE_OCCUPANCY = flags.DEFINE_bool(
+    "bake_occupancy",
+    None,
+    "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
+    "config.eval.bake_occupancy.",
+)
 _ERROR_BUDGET = flags.DEFINE_float(
     "error_budget",
     None,
-    "Render as cheaply as the RMS colour error against the model's own exact rendering stays within this.",
+    "The largest RMS colour error, against the model's own exact rendering. The program searches the fastest "
+    "settings that stay within it, and scores with them.",
     lower_bound=0.0,
 )
 _PREDICTIONS = flags.DEFINE_string(
-    "predictions", None, "Score the images in this folder (or its color/) in place of a run's renderings."
+    "predictions", None, "A folder of images, or of color/ with images, that are scored in place of a run."
 )
 _SHARD = flags.DEFINE_string(
     "shard",
     None,
-    "K/N: only each N-th view, from K on, where K counts from 0; auto: as srun or mpirun has started. Any "
-    "number of calls may run at once; the one that finishes last writes results.json.",
+    "K/N scores each N-th view from view K on, where K counts from 0; auto takes K and N from srun or mpirun. "
+    "Any number of processes may run at once; the last one to finish writes results.json.",
 )
 
 
 def main(argv):
     del argv
+    # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation import evaluate, external, quality_search, watch
     from jaxnerf.runtime import shards
-    from jaxnerf.training import workdir
 
-    if not (_WORKDIR.value or _PREDICTIONS.value):
-        raise ValueError("nothing to score: give --workdir=DIR of a run, or --predictions=DIR of images")
     shard = shards.parse(_SHARD.value)
-    for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):
-        if shard != shards.WHOLE and value:
-            raise ValueError(f"--shard splits the views of one checkpoint, not --{name}; drop one of them")
-    if shard != shards.WHOLE and _ERROR_BUDGET.value is not None:
-        raise ValueError("--error_budget chooses by the clock, so shards would differ; drop --shard")
-    config = _CONFIG.value
-    if config is None and _WORKDIR.value and not _WATCH.value:
-        config = workdir.read_config(_WORKDIR.value)
-    if config is not None:
-        cli.use_data(config, _DATA_DIR.value)
+    _check_flags(is_sharded=shard != shards.WHOLE)
+    overrides = {"bake_occupancy": _BAKE_OCCUPANCY.value, "chunk": _CHUNK.value}
+    options = {
+        "config": _CONFIG.value,
+        "split": _SPLIT.value,
+        "settings": {name: value for name, value in overrides.items() if value is not None},
+    }
     if _PREDICTIONS.value:
         results = external.score_folder(
-            _PREDICTIONS.value, config=config, split=_SPLIT.value, overwrite=_OVERWRITE.value
+            _PREDICTIONS.value, config=_reference_config(), split=_SPLIT.value, overwrite=_OVERWRITE.value
         )
     elif _WATCH.value:
-        watch.watch(
-            _WORKDIR.value,
-            config=config,
-            data_dir=_DATA_DIR.value,
-            split=_SPLIT.value,
-            chunk=_CHUNK.value,
-            poll_seconds=_POLL.value,
-        )
+        watch.watch(_WORKDIR.value, data_dir=_DATA_DIR.value, poll_seconds=_POLL.value, **options)
         return
     else:
-        settings = {} if _BAKE_OCCUPANCY.value is None else {"bake_occupancy": _BAKE_OCCUPANCY.value}
+        options |= {"step": _STEP.value, "data_dir": _DATA_DIR.value, "overwrite": _OVERWRITE.value}
         if _ERROR_BUDGET.value is not None:
-            settings = quality_search.choose(
-                _WORKDIR.value,
-                _ERROR_BUDGET.value,
-                config=config,
-                split=_SPLIT.value,
-                step=_STEP.value,
-                chunk=_CHUNK.value,
-                overwrite=_OVERWRITE.value,
-            )
-        results = evaluate.evaluate(
-            _WORKDIR.value,
-            config=config,
-            split=_SPLIT.value,
-            step=_STEP.value,
-            chunk=_CHUNK.value,
-            settings=settings,
-            overwrite=_OVERWRITE.value,
-            shard=shard,
-        )
+            options["settings"] |= quality_search.choose(_WORKDIR.value, _ERROR_BUDGET.value, **options)
+        results = evaluate.evaluate(_WORKDIR.value, shard=shard, **options)
     if results is None:
-        print(f"shard {_SHARD.value} is done; views of other shards are missing still")
+        print(f"shard {_SHARD.value} is done; views of other shards are missing")
         return
     print(evaluate.summary(results))
 
 
+def _check_flags(is_sharded):
+    if not (_WORKDIR.value or _PREDICTIONS.value):
+        raise ValueError("there is nothing to score; give --workdir=DIR of a run, or --predictions=DIR of images")
+    for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):
+        if is_sharded and value:
+            raise ValueError(f"--shard splits the views of one checkpoint, not --{name}; drop one of them")
+    if is_sharded and _ERROR_BUDGET.value is not None:
+        raise ValueError("--error_budget measures times, so shards would choose different settings; drop --shard")
+
+
+def _reference_config():
+    """Returns the config whose dataset --predictions are compared with; None without one."""
+    from jaxnerf.training.workdir import read_config
+
+    config = _CONFIG.value
+    if config is None and _WORKDIR.value:
+        config = read_config(_WORKDIR.value)
+    return None if config is None else cli.use_data(config, _DATA_DIR.value)
+
+
+def run():
+    """Runs the program."""
+    cli.run(main, stopped="between two views; the same command continues from there")
+
+
 if __name__ == "__main__":
-    cli.run(main, stopped="between two views; the same command goes on from there")
+    run()

@@ -1,7 +1,7 @@
-"""The parts of a run that can be replaced by name: fields, samplers, losses and dataset readers.
+"""The parts of a run that a config selects by name: fields, samplers, losses and dataset readers.
 
-Built-in parts are imported when they are first used. Code outside the package registers its own with the
-`register_*` functions; a program imports such code with `--plugins=module,...`.
+Built-in parts are imported when they are first used. Code outside the package adds parts with the `register_*`
+functions; a program imports such code with `--plugins=module,...`.
 """
 
 import importlib
@@ -10,35 +10,52 @@ from typing import Any, NamedTuple
 
 
 class Loss(NamedTuple):
-    """A loss and what it is computed from."""
+    """A loss, or a regularizer of the parameters.
+
+    Attributes:
+        function: see `register_loss`.
+        on: "renderings" if the function is (outputs, batch) -> [B], "params" if it is (params) -> scalar.
+        needs: the optional fields of Batch that it reads.
+    """
 
     function: Callable[..., Any]
-    on: str  # "renderings": (outputs, batch) -> [B]; "params": (params) -> scalar
-    needs: tuple[str, ...]  # optional fields of Batch that it reads
+    on: str = "renderings"
+    needs: tuple[str, ...] = ()
 
 
 class Reader(NamedTuple):
-    """A reader of one dataset format."""
+    """A reader of one dataset format.
 
-    read: Callable[..., Any]  # folder -> Capture
-    detect: Callable[..., bool]  # folder -> whether the folder holds this format
+    Attributes:
+        read: folder -> Capture.
+        detect: folder -> whether the folder holds this format.
+    """
+
+    read: Callable[..., Any]
+    detect: Callable[..., bool]
 
 
 class Registry:
     """Parts of one kind by name."""
 
     def __init__(self, kind: str, register: str, builtin: dict[str, str]):
-        """kind: for messages; register: the function to call; builtin: name -> "module:attribute"."""
+        """Creates a registry of built-in parts.
+
+        Args:
+            kind: what the parts are, for messages.
+            register: the public function that adds a part, for messages.
+            builtin: "module:attribute" by name.
+        """
         self._kind, self._register, self._parts = kind, register, dict(builtin)
 
     def add(self, name: str, part: Any) -> None:
-        """Adds a part; raises ValueError if another part has that name."""
+        """Adds a part; raises a ValueError if another part has that name."""
         if name in self._parts and self._parts[name] != part:
             raise ValueError(f"there is already a {self._kind} {name!r}; register yours under another name")
         self._parts[name] = part
 
     def get(self, name: str) -> Any:
-        """Returns the part of that name; raises ValueError with the known names if there is none."""
+        """Returns the part of that name; raises a ValueError with the known names if there is none."""
         if name not in self._parts:
             known = ", ".join(repr(known) for known in self._parts)
             raise ValueError(
@@ -87,12 +104,12 @@ READERS = Registry(
 
 
 def register_field(name: str, make: Callable[..., Any]) -> None:
-    """Registers a field under the name that the config's `field` selects.
+    """Registers a field under a name for the config's `field`.
 
     Args:
-        name: its options are the section of this name in the config, if there is one.
-        make: (options, box) -> Field, see `jaxnerf.fields.base.Field`. `options` is a dict; `box` is the
-            scene's box (lower [3], upper [3]) in world units, or None where a run has none.
+        name: of the field, and of the config's section that holds its options, if there is one.
+        make: (options, box) -> Field, see `jaxnerf.fields.base.Field`. `options` is that section as a dict;
+            `box` is the scene's box (lower [3], upper [3]) in world units, or None if the run has none.
 
     Raises:
         ValueError: if another field has that name.
@@ -101,10 +118,10 @@ def register_field(name: str, make: Callable[..., Any]) -> None:
 
 
 def register_sampler(name: str, make: Callable[..., Any]) -> None:
-    """Registers a way to place samples under the name that the config's `sampler` selects.
+    """Registers a way to place samples under a name for the config's `sampler`.
 
     Args:
-        name: its options are the section of this name in the config, if there is one.
+        name: of the sampler. Its options may be in a section of the config, see `SamplerContext.sections`.
         make: (context) -> Model, see `jaxnerf.models.base.SamplerContext` and `Model`.
 
     Raises:
@@ -116,14 +133,16 @@ def register_sampler(name: str, make: Callable[..., Any]) -> None:
 def register_loss(
     name: str, function: Callable[..., Any], *, on: str = "renderings", needs: Iterable[str] = ()
 ) -> None:
-    """Registers a loss under the name that the config's `losses` gives a weight.
+    """Registers a loss under a name for the config's `losses`, which gives it a weight.
 
     Args:
         name: of the loss.
-        function: for "renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
-            of a step, the one that counts last, and `batch` is a Batch. For "params" (params) -> scalar.
+        function: with on="renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
+            of a step, with weights and samples, and the last is the one that images show; `batch` is a Batch.
+            With on="params" (params) -> scalar.
         on: "renderings" or "params".
         needs: the optional fields of Batch that the function reads, of "image_index", "pixel" and "alpha".
+            Fields that no loss needs are None.
 
     Raises:
         ValueError: if another loss has that name, or on another value of `on`.
@@ -134,12 +153,12 @@ def register_loss(
 
 
 def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[..., bool] | None = None) -> None:
-    """Registers a dataset format under the name that `--format` and the config's `data.format` select.
+    """Registers a dataset format under a name for `--format` and the config's `data.format`.
 
     Args:
         name: of the format.
-        read: (folder) -> Capture, see `jaxnerf.data.readers.base.Capture`.
-        detect: (folder) -> whether the folder holds this format, for `data.format` "auto"; None: never.
+        read: (folder: Path) -> Capture, see `jaxnerf.data.readers.base.Capture`.
+        detect: (folder: Path) -> whether the folder holds this format, for `data.format` "auto"; None: never.
 
     Raises:
         ValueError: if another format has that name.

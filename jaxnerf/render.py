@@ -1,4 +1,7 @@
-"""python -m jaxnerf.render --workdir=DIR: pictures and a video of a trained scene along a camera path."""
+"""Renders images and a video of a run along a camera path: jaxnerf-render --workdir=DIR.
+
+`python -m jaxnerf.render` is the same program. It writes DIR/renders/PATH-STEP/ and a video beside it.
+"""
 
 import sys
 
@@ -7,48 +10,73 @@ from absl import flags
 from jaxnerf.runtime import cli
 
 _SIDE = {"lower_bound": 1, "upper_bound": 16384}
-_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
-_DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
-_STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
-_CHUNK = cli.define_count("chunk", "Rays at once, or auto: what fits; config.eval.chunk when not given.")
-_BAKE_OCCUPANCY = flags.DEFINE_bool("bake_occupancy", None, "Leave out what is not seen of a dense model.")
-_PATH = flags.DEFINE_string(
-    "path", None, "turntable, spiral, ellipse, interpolate or FILE.json; chosen by the views when not given."
+_WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
+_DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
+_STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is rendered.")
+_CHUNK = cli.define_count(
+    "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
 )
-_FRAMES = flags.DEFINE_integer("frames", None, "Of the path; 48 a turn, else 120 or 6 a view.", lower_bound=1)
-_CLOSED = flags.DEFINE_bool("closed", False, "Let --path=interpolate come back to the first view.")
-_WIDTH = flags.DEFINE_integer("width", None, "px; the first view's when not given.", **_SIDE)
-_HEIGHT = flags.DEFINE_integer("height", None, "px; as --width asks when not given.", **_SIDE)
-_FPS = flags.DEFINE_float("fps", None, "Frames a second; the file's, or 24.", lower_bound=0.1)
-_VIDEO = flags.DEFINE_string("video", "auto", "mp4, gif, none, or auto: mp4 where there is ffmpeg.")
-_DEPTH = flags.DEFINE_bool("depth", False, "Make a video of the depth, too.")
-_RGBA = flags.DEFINE_bool("rgba", False, "Write rgba/0000.png, too: straight alpha, no background.")
-_NAME = flags.DEFINE_string("name", None, "Of the folder and video, in place of the path's.")
-_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Delete the frames of an earlier call first.")
+_BAKE_OCCUPANCY = flags.DEFINE_bool(
+    "bake_occupancy",
+    None,
+    "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
+    "config.eval.bake_occupancy.",
+)
+_PATH = flags.DEFINE_string(
+    "path",
+    None,
+    "turntable, spiral, ellipse, interpolate, or FILE.json. When it is not given, the program selects turntable "
+    "or spiral by the views.",
+)
+_FRAMES = flags.DEFINE_integer(
+    "frames",
+    None,
+    "The number of frames. When it is not given, a turntable has 48, a spiral or ellipse 120, interpolate 6 for "
+    "each view.",
+    lower_bound=1,
+)
+_CLOSED = flags.DEFINE_bool("closed", False, "Whether --path=interpolate returns to the first view.")
+_WIDTH = flags.DEFINE_integer(
+    "width", None, "The width in px. When it is not given, it follows --height, or the first view.", **_SIDE
+)
+_HEIGHT = flags.DEFINE_integer(
+    "height", None, "The height in px. When it is not given, it follows --width, or the first view.", **_SIDE
+)
+_FPS = flags.DEFINE_float(
+    "fps", None, "The frames per second. When it is not given, the path's file states them, or 24.", lower_bound=0.1
+)
+_VIDEO = flags.DEFINE_string(
+    "video", "auto", "The format of the video: mp4, gif, none, or auto: mp4 if imageio finds ffmpeg, otherwise gif."
+)
+_DEPTH = flags.DEFINE_bool("depth", False, "Whether to make a video of the depth, too.")
+_RGBA = flags.DEFINE_bool("rgba", False, "Whether to write rgba/0000.png, too: straight alpha, no background.")
+_NAME = flags.DEFINE_string("name", None, "The name of the folder and the video. It overrides the path's.")
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to delete the frames of an earlier call first.")
 _SHARD = flags.DEFINE_string(
     "shard",
     None,
-    "K/N: only each N-th frame, from K on, where K counts from 0; auto: as srun or mpirun has started. Any "
-    "number of calls may run at once; the one that finishes last makes the video.",
+    "K/N renders each N-th frame from frame K on, where K counts from 0; auto takes K and N from srun or mpirun. "
+    "Any number of processes may run at once; the last one to finish makes the video.",
 )
 
 
 def main(argv):
     del argv
+    # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation.paths.render_path import render_path
     from jaxnerf.runtime import shards
 
+    overrides = {"bake_occupancy": _BAKE_OCCUPANCY.value, "chunk": _CHUNK.value}
     written = render_path(
         _WORKDIR.value,
         path=_PATH.value,
         step=_STEP.value,
         data_dir=_DATA_DIR.value,
-        settings={} if _BAKE_OCCUPANCY.value is None else {"bake_occupancy": _BAKE_OCCUPANCY.value},
+        settings={name: value for name, value in overrides.items() if value is not None},
         size=(_WIDTH.value, _HEIGHT.value),
         num_frames=_FRAMES.value,
         closed=_CLOSED.value,
         fps=_FPS.value,
-        chunk=_CHUNK.value,
         name=_NAME.value,
         rgba=_RGBA.value,
         depth=_DEPTH.value,
@@ -58,8 +86,13 @@ def main(argv):
     )
     print(*written, sep="\n")
     if _VIDEO.value == "auto" and written[-1].suffix == ".gif":
-        print("a GIF, as there is no ffmpeg: pip install 'jaxnerf[video]' for MP4", file=sys.stderr)
+        print("the video is a GIF, as imageio finds no ffmpeg; pip install imageio-ffmpeg for MP4", file=sys.stderr)
+
+
+def run():
+    """Runs the program."""
+    cli.run(main, stopped="between two frames; the same command continues from there")
 
 
 if __name__ == "__main__":
-    cli.run(main, stopped="between two frames; the same command goes on from there")
+    run()

@@ -1,39 +1,48 @@
-"""python -m jaxnerf.train --config=configs/quickstart.py --workdir=DIR: trains, or goes on with, a run."""
+"""Trains a run, or resumes it: jaxnerf-train --config=lego_fast --data_dir=DIR --workdir=DIR.
+
+`python -m jaxnerf.train` is the same program. --config.train.batch_size=2048 sets a field of the config.
+"""
 
 import sys
 
 from absl import flags
-from ml_collections import config_flags
 
 from jaxnerf.runtime import cli
 
-_CONFIG = config_flags.DEFINE_config_file("config", None, "The run's configuration file.", lock_config=True)
-_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run; the same one again resumes it.")
-_DATA_DIR = flags.DEFINE_string("data_dir", None, "The scene's folder, in place of config.data.dir.")
-_FORMAT = flags.DEFINE_enum("format", None, ["auto", *cli.FORMATS], "Of the scene, in place of config.data.format.")
+_CONFIG = cli.define_config("The config of the run: a name, or the path of a file.", required=True)
+_WORKDIR = flags.DEFINE_string(
+    "workdir", None, "The run's folder. Training resumes if the folder holds a run.", required=True
+)
+_DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
+_FORMAT = flags.DEFINE_string("format", None, "The dataset's format, or auto. It overrides config.data.format.")
 _MULTIHOST = flags.DEFINE_bool(
     "multihost",
     None,
-    "Train as one of several processes, that SLURM, Open MPI, Kubernetes or a TPU pod has started. When not "
-    "given: if srun or mpirun has started several.",
+    "Whether this is one of several processes that SLURM, Open MPI, Kubernetes or a TPU pod has started. "
+    "When it is not given, the program detects srun and mpirun.",
 )
-_COORDINATOR = flags.DEFINE_string("coordinator", None, "HOST:PORT of process 0, where all meet.")
-_NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "With --coordinator: of all.", lower_bound=1)
-_PROCESS_ID = flags.DEFINE_integer("process_id", None, "With --coordinator: this one, from 0.", lower_bound=0)
-_JOIN_SECONDS = flags.DEFINE_float("join_seconds", 300.0, "How long to wait for the other processes.", lower_bound=1.0)
+_COORDINATOR = flags.DEFINE_string("coordinator", None, "HOST:PORT of process 0, to which all processes connect.")
+_NUM_PROCESSES = flags.DEFINE_integer(
+    "num_processes", None, "The number of processes; required by --coordinator.", lower_bound=1
+)
+_PROCESS_ID = flags.DEFINE_integer(
+    "process_id", None, "The index of this process, from 0; required by --coordinator.", lower_bound=0
+)
+_JOIN_SECONDS = flags.DEFINE_float("join_seconds", 300.0, "The time to wait for other processes.", lower_bound=1.0)
 _STOPPED_CODE = flags.DEFINE_integer(
-    "stopped_code", 0, "What to exit with after SIGTERM or Ctrl-C; Kubernetes starts again unless it is 0."
+    "stopped_code", 0, "The exit code after SIGTERM or Ctrl-C. Kubernetes restarts a program that does not exit with 0."
 )
 _BATCH = cli.define_count(
-    "batch", "Rays of the batch at once, or auto: what fits; config.train.microbatch_size when not given."
+    "batch",
+    "The rays of a microbatch, or auto: as many as fit into memory. It overrides config.train.microbatch_size.",
 )
-flags.mark_flags_as_required(["config", "workdir"])
 
 
 def main(argv):
     del argv
+    # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation.evaluate import train_and_evaluate
-    from jaxnerf.runtime import processes  # after the flags: a wrong one is said at once
+    from jaxnerf.runtime import processes
 
     config = cli.use_data(_CONFIG.value, _DATA_DIR.value, _FORMAT.value)
     if _BATCH.value is not None:
@@ -50,5 +59,10 @@ def main(argv):
         sys.exit(_STOPPED_CODE.value)
 
 
+def run():
+    """Runs the program."""
+    cli.run(main, stopped="before it could save; the same command resumes from the last checkpoint, if there is one")
+
+
 if __name__ == "__main__":
-    cli.run(main, stopped="before it could save; the same command goes on from the last checkpoint, if any")
+    run()

@@ -1,9 +1,9 @@
-"""Small captures of the built-in scene, written as users have them: one option here for each feature.
+"""Small datasets of the embedded scene in every format that the package reads, for tests.
 
     shots = captures.shoot(captures.orbit(8), captures.orbit(4, height=30, width=20, first=8))
     captures.write_transforms(tmp_path, shots, kind="jpg", masks=True)
 
-A shot is exact: the same ray through the same lens as the readers have to find again.
+Shots are exact: each pixel is the colour along the ray that a reader's camera has to reproduce.
 """
 
 import functools
@@ -24,8 +24,8 @@ from jaxnerf.data import synthetic
 from jaxnerf.fields import still_life
 
 WHITE = (1.0, 1.0, 1.0)
-SKY = 30.0  # radius of the textured sphere around an unbounded capture, world units
-HIDDEN = (0.25, 0.5)  # a mask ignores this part of the height and of the width
+SKY = 30.0  # radius of the textured sphere around an unbounded dataset, world units
+HIDDEN = (0.25, 0.5)  # the interval of the height and of the width that masks exclude
 _LENSES = {
     "pinhole": (1.36, None),  # focal over the shorter side; coefficients
     "opencv": (1.1, (-0.28, 0.09, 0.006, -0.004)),
@@ -35,33 +35,47 @@ _ORIENTATION = 0x0112
 
 
 class Shot(NamedTuple):
-    """One photograph and its camera."""
+    """One image and its camera.
 
-    name: str  # "000"
-    camera: Camera  # one, numpy float32, with its height and width
-    pixels: np.ndarray  # [H, W, 4] uint16, straight alpha
+    Attributes:
+        name: such as "000".
+        camera: a single one in numpy float32, with height and width.
+        pixels: [H, W, 4] uint16, straight alpha.
+    """
+
+    name: str
+    camera: Camera
+    pixels: np.ndarray
 
 
 class Points(NamedTuple):
-    """Places on opaque surfaces, and the shots that see them."""
+    """Points on opaque surfaces, and the shots that see them.
 
-    xyz: np.ndarray  # [N, 3] float64 world
-    rgb: np.ndarray  # [N, 3] uint8
-    seen: np.ndarray  # [V, N] bool
-    at: np.ndarray  # [V, N, 2] px, where seen
-    depth: np.ndarray  # [V, N] along the camera's axis, where seen
+    Attributes:
+        xyz: [N, 3] float64, world units.
+        rgb: [N, 3] uint8.
+        seen: [V, N] bool, whether a shot sees a point.
+        at: [V, N, 2] px, valid where seen.
+        depth: [V, N] along the camera's axis, valid where seen.
+    """
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    seen: np.ndarray
+    at: np.ndarray
+    depth: np.ndarray
 
 
 def orbit(count, *, height=24, width=32, lens="pinhole", distance=4.0, first=0, **changes):
     """Returns Camera [count] on a golden spiral around the origin, looking at it.
 
     Args:
-        count: how many.
+        count: number of cameras.
         height, width: px.
-        lens: "pinhole", "opencv" or "fisheye", with a distortion that is plain to see.
+        lens: "pinhole", "opencv" or "fisheye"; the last two have strong distortion.
         distance: from the origin, above 1.7.
-        first: where on the spiral to begin, so that two stacks do not coincide.
-        **changes: focal [2], center [2] or distortion [K], in place of the lens's own.
+        first: position on the spiral of the first camera, so that two stacks do not coincide.
+        **changes: focal [2], center [2] or distortion [K] instead of the lens's defaults.
     """
     steps = np.arange(first, first + count)
     up = -0.2 + 0.9 * np.mod(0.5 + 0.7548776662 * steps, 1)
@@ -72,7 +86,7 @@ def orbit(count, *, height=24, width=32, lens="pinhole", distance=4.0, first=0, 
 
 
 def front(count, *, height=24, width=32, lens="pinhole", distance=4.0, spread=0.4, **changes):
-    """Returns Camera [count] side by side before the scene, all looking along +y, as LLFF's are."""
+    """Returns Camera [count] side by side in front of the scene, all looking along +y, as in LLFF's datasets."""
     steps = np.arange(count)
     across = spread * (np.mod(0.5 + 0.7548776662 * steps, 1) - 0.5) * 2
     up = spread * (np.mod(0.5 + 0.5698402910 * steps, 1) - 0.5) * 2
@@ -81,7 +95,7 @@ def front(count, *, height=24, width=32, lens="pinhole", distance=4.0, spread=0.
 
 
 def shoot(*stacks, sky=False):
-    """Returns the Shots of stacks of cameras; sky puts a textured sphere behind, else alpha is kept."""
+    """Renders the Shots of stacks of cameras; sky: over a textured sphere, opaque; otherwise with alpha."""
     shots = []
     for stack in stacks:
         count = len(stack.to_world)
@@ -93,7 +107,7 @@ def shoot(*stacks, sky=False):
 
 
 def noise(*stacks, seed=0):
-    """Returns the Shots of stacks of cameras with random pixels at once, for who looks at no picture."""
+    """Returns the Shots of stacks of cameras with random pixels, for tests that do not need the scene's."""
     rng, shots = np.random.default_rng(seed), []
     for stack in stacks:
         for index in range(len(stack.to_world)):
@@ -104,7 +118,7 @@ def noise(*stacks, seed=0):
 
 
 def sky_colour(origins, viewdirs):
-    """Returns [..., 3], what the sphere of radius SKY shows to rays from inside it, in [0.1, 0.9]."""
+    """Returns the colour [..., 3] of the sphere of radius SKY along rays from inside it, in [0.1, 0.9]."""
     origins, viewdirs = np.asarray(origins, np.float64), np.asarray(viewdirs, np.float64)
     along = (origins * viewdirs).sum(-1, keepdims=True)
     way = -along + np.sqrt(along**2 - (origins**2).sum(-1, keepdims=True) + SKY**2)
@@ -114,13 +128,13 @@ def sky_colour(origins, viewdirs):
 
 
 def over(pixels, background=WHITE):
-    """Returns [..., 3] in [0, 1]: pixels [..., 4] of whole numbers, composited over a background."""
+    """Returns integer pixels [..., 4] composited over a background: [..., 3] in [0, 1]."""
     values = pixels / np.iinfo(pixels.dtype).max
     return values[..., :3] * values[..., 3:] + (1 - values[..., 3:]) * np.asarray(background)
 
 
 def hidden(height, width):
-    """Returns the mask [H, W] bool that masks=True writes: False in a rectangle."""
+    """Returns the mask [H, W] bool of masks=True: False in a rectangle."""
     mask = np.ones((height, width), bool)
     rows, columns = (slice(*(int(part * size) for part in HIDDEN)) for size in (height, width))
     mask[rows, columns] = False
@@ -128,17 +142,17 @@ def hidden(height, width):
 
 
 def write_images(folder, shots, *, kind="png", bits=8, background=WHITE, rgba=False, masks=False, orientation=1):
-    """Writes images/<name>.<kind>, and masks/<name>.png, and returns the images' paths below the folder.
+    """Writes images/<name>.<kind> and masks/<name>.png, and returns the images' paths below the folder.
 
     Args:
-        folder: a Path; made if need be.
-        shots: see shoot.
+        folder: a Path; created if it does not exist.
+        shots: see `shoot`.
         kind: "png", "jpg" (lossy, no alpha) or "webp" (lossless).
         bits: 8, or 16 for PNG.
-        background: colour behind the scene, unless rgba keeps its alpha.
-        rgba: see background.
-        masks: a rectangle of each photograph is noise and masked.
-        orientation: of EXIF; 6 stores the pixels a quarter turn against the clock and says so.
+        background: colour behind the scene, unless rgba.
+        rgba: whether alpha is written.
+        masks: whether a rectangle of each image is noise and masked.
+        orientation: of EXIF; 6: the pixels are stored rotated by 90 degrees counterclockwise.
     """
     paths = []
     for index, shot in enumerate(shots):
@@ -158,9 +172,9 @@ def write_images(folder, shots, *, kind="png", bits=8, background=WHITE, rgba=Fa
 
 
 def write_image(path, pixels, *, orientation=1):
-    """Writes [H, W, 3 or 4] uint8 or uint16 as PNG, JPEG or WebP, as the path ends."""
+    """Writes [H, W, 3 or 4] uint8 or uint16 as PNG, JPEG or WebP, by the path's suffix."""
     if orientation not in (1, 6):
-        raise ValueError(f"orientation is {orientation}, wanted 1 or 6")
+        raise ValueError(f"orientation is {orientation}, expected 1 or 6")
     stored = np.ascontiguousarray(np.rot90(pixels) if orientation == 6 else pixels)
     exif = Image.Exif()
     exif[_ORIENTATION] = orientation
@@ -173,7 +187,7 @@ def write_image(path, pixels, *, orientation=1):
 
 
 def write_png16(path, pixels, *, exif=None):
-    """Writes [H, W, 3 or 4] uint16, which Pillow cannot."""
+    """Writes [H, W, 3 or 4] uint16, which Pillow does not support."""
 
     def chunk(kind, body):
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
@@ -187,15 +201,15 @@ def write_png16(path, pixels, *, exif=None):
 
 
 def write_transforms(folder, shots, *, per_frame=None, splits=None, extra=None, masks=False, **images):
-    """Writes a capture in nerfstudio's format and returns the content of its transforms.json.
+    """Writes a dataset in nerfstudio's format and returns the content of its transforms.json.
 
     Args:
         folder: a Path.
-        shots: see shoot.
-        per_frame: intrinsics in every frame; None: where they differ.
+        shots: see `shoot`.
+        per_frame: whether every frame states its intrinsics; None: if they differ.
         splits: {"train": indices, ...} for explicit lists of names.
-        extra: more entries of the file, such as {"aabb_scale": 4}.
-        masks, **images: see write_images.
+        extra: additional entries of the file, such as {"aabb_scale": 4}.
+        masks, **images: see `write_images`.
     """
     paths = write_images(folder, shots, masks=masks, **images)
     stated = [_intrinsics(shot.camera) for shot in shots]
@@ -215,12 +229,26 @@ def write_transforms(folder, shots, *, per_frame=None, splits=None, extra=None, 
     return content
 
 
+def write_blender(folder, shots, *, split="train"):
+    """Writes one split of a dataset in the NeRF paper's Blender format; the shots have one pinhole camera."""
+    (folder / split).mkdir(parents=True, exist_ok=True)
+    frames = []
+    for shot in shots:
+        write_image(folder / split / f"{shot.name}.png", np.uint8(np.rint(shot.pixels / 257)))
+        pose = [*shot.camera.to_world.tolist(), [0.0, 0.0, 0.0, 1.0]]
+        frames.append({"file_path": f"./{split}/{shot.name}", "transform_matrix": pose})
+    camera = shots[0].camera
+    angle = 2 * math.atan(0.5 * camera.width / float(camera.focal[0]))
+    content = {"camera_angle_x": angle, "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
 def write_colmap(folder, shots, *, points=None, **images):
-    """Writes the capture as a COLMAP text model in sparse/0, and returns its Points.
+    """Writes a COLMAP dataset with a text model in sparse/0, and returns its Points.
 
     Args:
-        folder, **images: see write_images.
-        shots: see shoot. Those of one camera share it.
+        folder, **images: see `write_images`.
+        shots: see `shoot`. Those with equal intrinsics share a camera.
         points: Points of the same shots; None: surface_points(shots).
     """
     paths = write_images(folder, shots, **images)
@@ -250,23 +278,23 @@ def write_colmap(folder, shots, *, points=None, **images):
 
 
 def write_llff(folder, shots, *, points=None, **images):
-    """Writes the capture as images/ and poses_bounds.npy; its cameras must be pinholes of one kind."""
+    """Writes an LLFF dataset, images/ and poses_bounds.npy; the shots have one pinhole camera."""
     if len({tuple(_intrinsics(shot.camera).items()) for shot in shots}) > 1 or shots[0].camera.lens != "pinhole":
-        raise ValueError("LLFF has one pinhole camera for all images, these shots have others")
+        raise ValueError("LLFF has one pinhole camera for all images, these shots have several; change the shots")
     write_images(folder, shots, **images)
     points = surface_points(shots) if points is None else points
     rows = []
     for shot, seen, depth in zip(shots, points.seen, points.depth, strict=True):
         right, up, back, place = shot.camera.to_world.T.astype(np.float64)
         size = [shot.camera.height, shot.camera.width, shot.camera.focal[0]]
-        bounds = np.percentile(depth[seen], [0.1, 99.9])  # as LLFF's own tool
+        bounds = np.percentile(depth[seen], [0.1, 99.9])  # as in LLFF's tool
         rows.append([*np.stack([-up, right, back, place, size], axis=-1).ravel(), *bounds])
     np.save(folder / "poses_bounds.npy", np.array(rows))
     return points
 
 
 def write_ply(path, points, *, order="<"):
-    """Writes points [N, 3] as PLY with colours; order "<" or ">" is binary, None ASCII."""
+    """Writes points [N, 3] as a PLY file with colours; order "<" or ">": binary, None: ASCII."""
     kind = {"<": "binary_little_endian", ">": "binary_big_endian", None: "ascii"}[order]
     fields = [("x", "double"), ("y", "double"), ("z", "double"), ("red", "uchar")]
     header = ["ply", f"format {kind} 1.0", f"element vertex {len(points)}"]
@@ -285,11 +313,11 @@ def surface_points(shots, *, count=200, seed=0, sharp=0.06):
     """Returns Points on opaque surfaces, at the expected depth of random pixels with opacity above 0.99.
 
     Args:
-        shots: see shoot.
-        count: of pixels looked through; points that fewer than two shots see are left out.
+        shots: see `shoot`.
+        count: number of pixels; points that fewer than two shots see are dropped.
         seed: of the choice.
-        sharp: world units; light that stops within more than this much met glass and no surface, and a
-            shot sees a point whose depth is nearer than this to what it sees there.
+        sharp: world units. A ray whose termination depth has a larger standard deviation hits no surface. A shot
+            sees a point if the depth along the ray to it differs by less.
     """
     rng = np.random.default_rng(seed)
     found, colours = [], []
@@ -332,7 +360,7 @@ def _aim(eyes, targets, height, width, lens, changes):
 
 
 def _rendered(stack, sky):
-    """Returns the pixels [V * H * W, 4]; the same cameras are rendered once a process."""
+    """Returns the pixels [V * H * W, 4]; equal cameras are rendered once per process."""
     leaves = tuple((leaf.shape, leaf.tobytes()) for leaf in jax.tree.leaves(stack))
     return _render_once(leaves, jax.tree.structure(stack), sky)
 
@@ -351,10 +379,10 @@ def _render_once(leaves, structure, sky):
 
 
 def _depths(rays, chunk=512):
-    """Returns depth in t, opacity and the spread of where light stops in world units, each [R]."""
+    """Returns expected depth in t, opacity, and standard deviation of the depth in world units, each [R]."""
     count, parts = len(rays.near), []
     for start in range(0, count, chunk):
-        index = np.minimum(np.arange(start, start + chunk), count - 1)  # one shape
+        index = np.minimum(np.arange(start, start + chunk), count - 1)  # a single compiled shape
         parts.append(_depth_of(jax.tree.map(lambda leaf, index=index: np.float32(leaf[index]), rays)))
     return tuple(np.concatenate(part)[:count] for part in zip(*parts, strict=True))
 
@@ -372,17 +400,17 @@ _project = jax.jit(cameras.project)
 
 
 def _sight(camera, xyz, sharp):
-    """Returns what one camera sees of points: seen [N], at [N, 2] px, depth [N] along its axis."""
+    """Returns whether a camera sees points [N], their positions [N, 2] px, and depths [N] along its axis."""
     at, depth = (np.asarray(part, np.float64) for part in _project(camera, np.float32(xyz)))
     offset = xyz - camera.to_world[:, 3]
     distance = np.linalg.norm(offset, axis=-1)
     viewdirs = offset / distance[:, None]
     origins = np.broadcast_to(camera.to_world[:, 3], xyz.shape)
-    near = np.maximum(distance - 2.8, 0.05)  # the scene's diameter before the point
+    near = np.maximum(distance - 2.8, 0.05)  # the scene's diameter in front of the point
     rays = Rays(origins=origins, directions=viewdirs, viewdirs=viewdirs, near=near, far=distance + 0.2)
-    stop, opacity, _ = _depths(rays)
+    found, opacity, _ = _depths(rays)
     inside = ((at > 0) & (at < [camera.width, camera.height])).all(axis=-1)
-    return inside & (depth > 0) & (opacity > 0.99) & (np.abs(stop - distance) < sharp), at, depth
+    return inside & (depth > 0) & (opacity > 0.99) & (np.abs(found - distance) < sharp), at, depth
 
 
 def _intrinsics(camera):

@@ -1,17 +1,25 @@
-"""One CPU, seen by JAX as four devices, for every test; and the real scenes, where there are any."""
+"""Four CPU devices, checks of type annotations, and the real scenes, for every test."""
 
 import os
 import pathlib
+import signal
 
 # Both are read once, when JAX starts, so they are set before anything imports it.
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
 
+# A shell that starts pytest in the background makes it ignore SIGINT, and so would the programs that tests start.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+import type_checks  # noqa: E402
+
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+type_checks.install("jaxnerf")
 
 
 def pytest_configure(config):

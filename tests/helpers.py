@@ -1,4 +1,4 @@
-"""What several test files share."""
+"""Helpers that several test files share."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from jaxnerf import Rays, create_grid
 
 
 def compiled(function, *static):
-    """Returns the function jitted, with answers in numpy: compiling is what takes a test its time."""
+    """Returns the function jitted, with results in numpy."""
     run = jax.jit(function, static_argnames=static)
     return lambda *args, **options: jax.tree.map(np.asarray, run(*args, **options))
 
@@ -24,7 +24,7 @@ def assert_same(a, b, rtol=1e-6, atol=1e-6):
 
 
 def assert_batch_is_vmap_is_jit(function, *arrays, **tolerance):
-    """Fails unless a compiled batch gives what its rows give in vmap. The other tests run step by step."""
+    """Fails unless a compiled batch equals a vmap over its rows."""
     whole = jax.jit(function)(*arrays)
     assert_same(jax.jit(jax.vmap(function))(*arrays), whole, **tolerance)
 
@@ -51,12 +51,12 @@ def rays_past_origin(seed, count):
 
 
 def full_grid(half=30.0, shape=(6, 5, 8)):
-    """Returns a Grid of a cube around the origin, all of which is occupied."""
+    """Returns an OccupancyGrid of a cube around the origin, with every cell occupied."""
     return create_grid(np.full(3, -half), np.full(3, half), np.ones(shape, bool), initial_density=1.0)
 
 
 def checked_grid(half=1.5, shape=(6, 5, 8)):
-    """Returns a Grid of a cube around the origin of which every other cell is empty."""
+    """Returns an OccupancyGrid of a cube around the origin, with every other cell empty."""
     valid = np.indices(shape).sum(axis=0) % 2 == 0
     return create_grid(np.full(3, -half), np.full(3, half), valid, initial_density=1.0)
 

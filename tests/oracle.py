@@ -56,39 +56,39 @@ def deltas(t, last_delta=1e10):
 
 
 def weights(density, length):
-    """Returns the weights and what is left of the light."""
-    light, result = 1.0, []
+    """Returns the weights and the transmittance of the whole ray."""
+    transmittance, result = 1.0, []
     for sigma, segment in zip(density, length, strict=True):
         alpha = -math.expm1(-sigma * segment)
-        result.append(light * alpha)  # Eq. 3, Eq. 5
-        light *= 1.0 - alpha
-    return np.array(result), light
+        result.append(transmittance * alpha)  # Eq. 3, Eq. 5
+        transmittance *= 1.0 - alpha
+    return np.array(result), transmittance
 
 
 def render(density, rgb, t, length, far, background=None):
     """Returns rgb, opacity, depth, disparity and weights."""
-    share, light = weights(density, length)
+    weight, transmittance = weights(density, length)
     color = np.zeros(3)
-    for w, c in zip(share, rgb, strict=True):
+    for w, c in zip(weight, rgb, strict=True):
         color = color + w * c  # Eq. 3
     if background is not None:
-        color = color + light * background
-    depth = sum(w * z for w, z in zip(share, t, strict=True)) + (light * far if light > 0 else 0.0)
-    disparity = sum(w / z for w, z in zip(share, t, strict=True))
-    return {"rgb": color, "opacity": sum(share), "depth": depth, "disparity": disparity, "weights": share}
+        color = color + transmittance * background
+    depth = sum(w * z for w, z in zip(weight, t, strict=True)) + (transmittance * far if transmittance > 0 else 0.0)
+    disparity = sum(w / z for w, z in zip(weight, t, strict=True))
+    return {"rgb": color, "opacity": sum(weight), "depth": depth, "disparity": disparity, "weights": weight}
 
 
-def inverse_cdf(edges, share, u):
-    """Returns where the piecewise-constant density of `share` reaches the part u of its sum (Sec. 5.2)."""
-    total = sum(share)
-    part = [w / total for w in share] if total > 0 else [1 / len(share)] * len(share)
+def inverse_cdf(edges, weight, u):
+    """Returns where the piecewise-constant density of `weight` reaches the fraction u of its sum (Sec. 5.2)."""
+    total = sum(weight)
+    fraction = [w / total for w in weight] if total > 0 else [1 / len(weight)] * len(weight)
     points = []
-    for wanted in u:
+    for target in u:
         i, below = 0, 0.0
-        while i < len(part) - 1 and below + part[i] <= wanted:
-            below += part[i]
+        while i < len(fraction) - 1 and below + fraction[i] <= target:
+            below += fraction[i]
             i += 1
-        points.append(edges[i] + (edges[i + 1] - edges[i]) * min(1.0, (wanted - below) / part[i]))
+        points.append(edges[i] + (edges[i + 1] - edges[i]) * min(1.0, (target - below) / fraction[i]))
     return np.array(points)
 
 
@@ -100,7 +100,7 @@ def middles(edges):
     return np.array([(a + b) / 2 for a, b in zip(edges[:-1], edges[1:], strict=True)])
 
 
-def ask(scene, origin, direction, t, delta, far, background):
+def evaluate(scene, origin, direction, t, delta, far, background):
     norm = math.sqrt(sum(direction**2))
     density, rgb = scene(np.array([origin + z * direction for z in t]), (direction / norm)[None])
     return render(density, rgb, t, delta * norm, far, background)
@@ -110,15 +110,15 @@ def hierarchy(coarse, fine, origin, direction, near, far, num_coarse, num_fine, 
     """Returns both renderings of Sec. 5.2 without randomness; "points" is the paper."""
     if rule == "points":
         t = uniform_points(near, far, num_coarse)
-        first = ask(coarse, origin, direction, t, deltas(t), far, background)
+        first = evaluate(coarse, origin, direction, t, deltas(t), far, background)
         more = inverse_cdf(middles(t), first["weights"][1:-1], middle_u(num_fine))
         t = np.array(sorted([*t, *more]))
-        return first, ask(fine, origin, direction, t, deltas(t), far, background)
+        return first, evaluate(fine, origin, direction, t, deltas(t), far, background)
     edges = uniform_edges(near, far, num_coarse)
-    first = ask(coarse, origin, direction, middles(edges), np.diff(edges), far, background)
+    first = evaluate(coarse, origin, direction, middles(edges), np.diff(edges), far, background)
     more = inverse_cdf(edges, first["weights"], middle_u(num_fine))
     edges = np.array(sorted([*edges, *more]))
-    return first, ask(fine, origin, direction, middles(edges), np.diff(edges), far, background)
+    return first, evaluate(fine, origin, direction, middles(edges), np.diff(edges), far, background)
 
 
 def psnr(a, b):

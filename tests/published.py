@@ -1,7 +1,7 @@
-"""The networks of three other codes in float64 numpy, from their descriptions, and the files that they write.
+"""The networks of three other codes in float64 numpy, written from their descriptions, and their files.
 
-Independent of jaxnerf: a network here is a list of (kernel [in, out], bias) in its own code's order, and its
-forward pass is written out as that code does it.
+Independent of jaxnerf: a network is a list of (kernel [in, out], bias) in the order of its own code, and its
+forward pass follows that code.
 """
 
 import pickle
@@ -13,7 +13,7 @@ DEPTH, WIDTH, SKIP, VIEW_WIDTH = 8, 256, 4, 128
 
 
 def octaves(x, count):
-    """The original code and nerf-pytorch: x, then sine and cosine of an octave before the next one's."""
+    """Encodes as the original code and nerf-pytorch: x, then sine and cosine of each octave."""
     parts = [x]
     for k in range(count):
         parts += [np.sin(2.0**k * x), np.cos(2.0**k * x)]
@@ -21,7 +21,7 @@ def octaves(x, count):
 
 
 def sines_then_cosines(x, count):
-    """JaxNeRF: x, sines of all octaves, then the same a quarter of a turn on."""
+    """Encodes as JaxNeRF: x, the sines of all octaves, then the same shifted by pi / 2."""
     angles = np.concatenate([2.0**k * x for k in range(count)], axis=-1)
     return np.concatenate([x, np.sin(np.concatenate([angles, angles + np.pi / 2], axis=-1))], axis=-1)
 
@@ -39,7 +39,7 @@ def activated(density, rgb):
 
 
 def original(layers, x, viewdirs, num_freqs=10, num_view_freqs=4, skip=SKIP):
-    """Layers as in Keras' get_weights: trunk, bottleneck, view, rgb, alpha; or trunk, output."""
+    """Evaluates layers in the order of Keras' get_weights: trunk, bottleneck, view, rgb, alpha; or trunk, output."""
     heads = 4 if layers[-1][0].shape[1] == 1 else 1
     inputs = octaves(x, num_freqs)
     h = inputs
@@ -60,7 +60,7 @@ def torch_linear(x, weight, bias):
 
 
 def nerf_pytorch(state, x, viewdirs, num_freqs=10, num_view_freqs=4, skip=SKIP):
-    """state: a state dict's arrays, weights [out, in]."""
+    """Evaluates the arrays of a state dict, whose kernels are [out, in]."""
 
     def linear(name, value):
         return torch_linear(value, state[f"{name}.weight"], state[f"{name}.bias"])
@@ -81,7 +81,7 @@ def nerf_pytorch(state, x, viewdirs, num_freqs=10, num_view_freqs=4, skip=SKIP):
 
 
 def jaxnerf_2020(tree, x, viewdirs, num_freqs=10, num_view_freqs=4, skip=SKIP, encode=sines_then_cosines):
-    """tree: {"Dense_0": {"kernel", "bias"}, ...}; a layer is made when the code comes to it."""
+    """Evaluates a tree {"Dense_0": {"kernel", "bias"}, ...}, numbered in the order in which the code uses layers."""
     made = iter(range(len(tree)))
 
     def layer(value):
@@ -102,7 +102,7 @@ def jaxnerf_2020(tree, x, viewdirs, num_freqs=10, num_view_freqs=4, skip=SKIP, e
 
 
 def random_layer(rng, rows, columns, shift=0.0):
-    """Weights of He's deviation, so that deep features neither fade nor grow, and of mean 0; float32."""
+    """Draws a float32 layer of mean 0 and He's deviation, with which activations of deep layers keep their scale."""
     kernel = rng.normal(size=(rows, columns)) * np.sqrt(2 / rows)
     kernel -= kernel.mean(axis=0)
     return kernel.astype(np.float32), (shift + 0.1 * rng.normal(size=columns)).astype(np.float32)
@@ -129,7 +129,7 @@ def as_state_dict(layers):
     state = {}
     for name, (kernel, bias) in zip(names, layers, strict=True):
         state[f"{name}.weight"], state[f"{name}.bias"] = np.ascontiguousarray(kernel.T), bias
-    if len(heads) == 1:  # made and never used
+    if len(heads) == 1:  # exists and is never used
         width = trunk[-1][0].shape[1]
         state["views_linears.0.weight"] = np.ones((width // 2, width), np.float32)
         state["views_linears.0.bias"] = np.ones(width // 2, np.float32)
@@ -147,7 +147,7 @@ def as_flax(layers):
 
 
 def flax_content(trees, step):
-    """Returns what JaxNeRF's checkpoint holds."""
+    """Returns the content of a checkpoint of JaxNeRF."""
     params = {f"MLP_{i}": tree for i, tree in enumerate(trees)}
     moments = {"MLP_0": {"Dense_0": {"kernel": {"grad_ema": np.zeros(2, np.float32)}}}}
     state = {"step": np.int32(step), "param_states": {"params": moments}}
@@ -155,7 +155,7 @@ def flax_content(trees, step):
 
 
 def write_npy(path, arrays, *, protocol=None, numpy_1=False):
-    """Writes a list of arrays as numpy.save does, in a pickle of any protocol and, in names, of numpy 1."""
+    """Writes a list of arrays as numpy.save does, with any pickle protocol, and with the module names of numpy 1."""
     array = np.empty(len(arrays), object)
     for i, part in enumerate(arrays):
         array[i] = part
@@ -164,13 +164,13 @@ def write_npy(path, arrays, *, protocol=None, numpy_1=False):
         return path
     content = pickle.dumps(array, protocol=protocol)
     if numpy_1:
-        assert protocol < 4  # where names have no length
+        assert protocol < 4  # later ones store the length of names
         content = content.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
     return write_pickle(path, content, len(arrays))
 
 
 def write_pickle(path, content, count):
-    """Writes a .npy file whose objects are a pickle."""
+    """Writes a .npy file of objects with the given pickle."""
     header = f"{{'descr': '|O', 'fortran_order': False, 'shape': ({count},), }}"
     header = header.ljust(117).encode() + b"\n"
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + content)

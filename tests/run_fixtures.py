@@ -1,4 +1,4 @@
-"""Fixtures that the tests of the engine share, by pytest_plugins = ["run_fixtures"]."""
+"""Fixtures of tests that train, used with pytest_plugins = ["run_fixtures"]."""
 
 import contextlib
 import fcntl
@@ -14,7 +14,7 @@ from runs import smoke_config
 
 @pytest.fixture(scope="session")
 def compiled_once(tmp_path_factory):
-    """Keeps what takes long to compile on disk: many processes of these tests run the same step."""
+    """Caches compiled programs on disk, as many processes of these tests run the same step."""
     options = {"jax_persistent_cache_min_compile_time_secs": 0.5}
     with _options(**options, jax_compilation_cache_dir=str(_shared(tmp_path_factory) / "compiled")):
         compilation_cache.reset_cache()
@@ -24,7 +24,7 @@ def compiled_once(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def unoptimized(compiled_once):
-    """Compiles in two thirds of the time what runs for a dozen steps, also in processes that are started."""
+    """Switches most optimizations off, here and in child processes: compiling is faster and runs are short."""
     with _options(jax_disable_most_optimizations=True):
         yield
 
@@ -34,21 +34,21 @@ def trained(compiled_once, tmp_path_factory):
     """The workdir of configs/smoke.py: 20 steps, checkpoints of 5, 10, 15 and 20 of which 3 are kept."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     with (_shared(tmp_path_factory) / "trained.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # what one worker compiles, the others then find
+        fcntl.flock(lock, fcntl.LOCK_EX)  # what one worker compiles, the others find in the cache
         with _options(jax_disable_most_optimizations=True):
             assert train_and_evaluate(smoke_config(), folder)
     return folder
 
 
 def _shared(tmp_path_factory):
-    """Returns the folder that all workers share."""
+    """Returns a folder that all workers share."""
     folder = tmp_path_factory.getbasetemp()
     return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
 
 @contextlib.contextmanager
 def _options(**options):
-    """Sets options of JAX here and in processes that are started."""
+    """Sets options of JAX here and in child processes."""
     old = {name: jax.config.values[name] for name in options}
     try:
         with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""The run of seconds that the tests of the engine share, and the programs as processes."""
+"""A run of seconds that tests share, and programs as processes."""
 
 import os
 import pathlib
@@ -7,22 +7,29 @@ import subprocess
 import sys
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))  # for configs, however pytest was started
+sys.path.insert(0, str(ROOT))  # for configs, wherever pytest was started
 
-from configs import smoke  # noqa: E402
+from jaxnerf.configs import smoke  # noqa: E402
 
 SMOKE_FLAGS = ("--config=configs/smoke.py", "--config.train.save_every=5")
 
 
 def smoke_config(**train):
-    """Returns configs/smoke.py with a checkpoint every 5 steps and other fields of train as given."""
+    """Returns configs/smoke.py with a checkpoint every 5 steps and the given fields of its section `train`."""
     config = smoke.get_config()
     config.train.update({"save_every": 5, **train})
     return config
 
 
-# What makes configs/smoke.py a grid field asked only where something is. Its pool has room for all samples,
-# so that nothing depends on how many devices share it.
+def smoke_experiment(**train):
+    """Returns the Experiment of smoke_config."""
+    from jaxnerf.training import auto_config, build
+
+    return build.build(auto_config.resolve_for_device(smoke_config(**train))[0])
+
+
+# Makes configs/smoke.py a hash grid with the occupancy sampler. All samples fit into its buffer, so nothing
+# depends on how many devices share the batch.
 PACKED = {
     "field": "hash_grid",
     "sampler": "occupancy",
@@ -39,12 +46,12 @@ PACKED = {
 
 
 def as_flags(fields):
-    """Returns the flags that set fields of a configuration, by name."""
+    """Returns the flags that set fields of a config."""
     return [f"--config.{name}={value}" for name, value in fields.items()]
 
 
 def start(program, *flags, **environment):
-    """Starts python -m jaxnerf.<program>, or a program here that ends in .py, with its output in pipes."""
+    """Starts python -m jaxnerf.<program>, or a script in tests/ that ends in .py, with its output in pipes."""
     what = [str(ROOT / "tests" / program)] if program.endswith(".py") else ["-m", f"jaxnerf.{program}"]
     command = [sys.executable, *what, *map(str, flags)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -52,14 +59,14 @@ def start(program, *flags, **environment):
 
 
 def free_port():
-    """Returns a port that nothing listens at."""
+    """Returns a free port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return free.getsockname()[1]
 
 
 def start_together(count, program, *flags, **environment):
-    """Starts so many processes of one training."""
+    """Starts `count` processes of one training run."""
     flags = (*flags, f"--coordinator=127.0.0.1:{free_port()}", f"--num_processes={count}")
     return [start(program, *flags, f"--process_id={index}", **environment) for index in range(count)]
 

@@ -2,18 +2,22 @@
 
 import importlib
 import sys
+from types import ModuleType
 
 from absl import flags
 
 from runs import ROOT
 
 if str(ROOT / "experiments") not in sys.path:
-    sys.path.insert(0, str(ROOT / "experiments"))
+    sys.path.append(str(ROOT / "experiments"))
+
+import common  # noqa: F401  before `study` removes flags: --readme stays
 
 
-def study(name):
-    """Returns experiments/<name>.py, without its flags: studies have flags of the same names."""
-    module = importlib.import_module(name)
-    for flag in tuple(flags.FLAGS.flags_by_module_dict().get(name, ())):
-        delattr(flags.FLAGS, flag.name)
+def study(name: str) -> ModuleType:
+    """Imports experiments/<name>.py without its flags: studies have flags of the same names."""
+    known = set(flags.FLAGS)
+    module = importlib.import_module(name.replace("/", "."))
+    for flag in set(flags.FLAGS) - known:
+        delattr(flags.FLAGS, flag)
     return module

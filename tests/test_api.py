@@ -1,4 +1,4 @@
-"""The public surface is a contract: names, parameters, docstrings, and what an import costs."""
+"""The public API is a contract: names, parameters, docstrings, and what an import loads."""
 
 import inspect
 import pathlib
@@ -20,11 +20,11 @@ SURFACE = {
     "ndc_to_t": "t rays camera=None | near_plane=1.0",
     "look_at": "eye target up |",
     "uniform_edges": "near far | num_segments in_disparity=False",
-    "stepped_edges": "key near far | step num_segments",
+    "stepped_edges": "key near far | step_size num_segments",
     "samples_from_edges": "key edges | rule='segments'",
     "samples_from_points": "t | last_delta=10000000000.0",
     "inverse_cdf": "edges weights u |",
-    "importance_points": "key edges weights | num_points floor=0.0",
+    "importance_points": "key edges weights | num_points padding=0.0",
     "merge_edges": "edges points |",
     "points_on_rays": "rays t |",
     "weights_from_density": "density length | rule='segments'",
@@ -35,29 +35,48 @@ SURFACE = {
     "render_samples": "scene rays samples | background=None",
     "render_rays": "key scene rays | num_samples rule='segments' in_disparity=False background=None render",
     "render_hierarchical": "key coarse fine rays | num_coarse num_fine rule='segments' in_disparity=False "
-    "importance_floor=0.0 background=None",
+    "importance_padding=0.0 background=None",
     "render_image": "render rays | chunk",
-    "create_grid": "lower upper possible | assumed contracted=False",
+    "create_grid": "lower upper valid | initial_density contracted=False",
     "update_grid": "key grid scene cells | threshold decay=0.6 smoothing=0.2 spread=True chunk=8192",
-    "grid_of_scene": "key scene lower upper shape | threshold contracted=False looks=4 chunk=8192",
-    "restrict_scene": "scene grid |",
-    "render_packed": "scene grid rays samples | capacity stop=0.0 background=None",
+    "grid_from_scene": "key scene lower upper shape | threshold contracted=False num_updates=4 chunk=8192",
+    "mask_scene": "scene grid |",
+    "render_packed": "scene grid rays samples | max_samples early_stop_eps=0.0 background=None",
+    "mse": "a b | mask=None",
     "psnr": "a b | mask=None",
     "ssim": "a b |",
+    "round_to_8_bits": "image |",
+    "distortion_loss": "outputs batch |",
+    "turntable": "num_frames | center radius elevation up=(0.0, 0.0, 1.0)",
+    "load_dataset": "dir | split='train' **options",
+    "draw_batch": "seed step positions views active_pixels=None | batching='all_images' pixel_offset=0.5 ndc=False "
+    "extras=()",
+    "mlp_field": "| **options",
+    "hash_grid_field": "| **options",
+    "still_life": "x viewdirs |",
     "load_scene": "workdir |",
+    "restore_run": "workdir config=None | data_dir=None settings=None",
+    "train_and_evaluate": "config workdir | views=None",
+    "register_field": "name make |",
+    "register_sampler": "name make |",
+    "register_loss": "name function | on='renderings' needs=()",
+    "register_reader": "name read | detect=None",
 }
-TYPES = ["Rays", "Samples", "Rendering", "Camera", "Views", "Batch", "Grid", "SceneFn"]
+TYPES = ["Rays", "Samples", "PackedSamples", "Rendering", "Camera", "Views", "Batch", "OccupancyGrid", "SceneFn"]
+TYPES += ["TrainedRun"]
 SOURCE = r"Eqs?\. ?\d|Section \d|Appendix|arXiv|\d{4} code|released codes?|\([A-Z][a-z]+ .*\d{4}"
 
 
 def described(function):
-    """Returns the signature in the notation above; a default that is a function goes without its address."""
+    """Returns the signature in the notation above; a default that is a function is omitted."""
     positional, keyword = [], []
     for name, parameter in inspect.signature(function).parameters.items():
         default = parameter.default
         if default is not parameter.empty and not callable(default):
             name = f"{name}={default!r}"
-        (keyword if parameter.kind is parameter.KEYWORD_ONLY else positional).append(name)
+        if parameter.kind is parameter.VAR_KEYWORD:
+            name = f"**{name}"
+        (keyword if parameter.kind in (parameter.KEYWORD_ONLY, parameter.VAR_KEYWORD) else positional).append(name)
     return " ".join([*positional, "|", *keyword])
 
 
@@ -72,6 +91,10 @@ def test_types_are_public(name):
     assert name in jaxnerf.__all__ and hasattr(jaxnerf, name)
 
 
+def test_every_public_name_is_listed_here():
+    assert set(jaxnerf.__all__) == {*SURFACE, *TYPES}
+
+
 def test_every_public_name_exists_once():
     assert len(set(jaxnerf.__all__)) == len(jaxnerf.__all__)
     assert [name for name in jaxnerf.__all__ if not hasattr(jaxnerf, name)] == []
@@ -81,46 +104,36 @@ FUNCTIONS = [name for name in jaxnerf.__all__ if inspect.isfunction(getattr(jaxn
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_docstring_says_what_goes_in_and_what_comes_out(name):
+def test_docstring_describes_arguments_and_result(name):
     function = getattr(jaxnerf, name)
     text = inspect.getdoc(function) or ""
-    assert text.startswith("Returns ")
-    if name in SURFACE:
-        parameters = inspect.signature(function).parameters
-        assert [p for p in parameters if not re.search(rf"\b{p}\b", text)] == [], "parameters it does not name"
-    if name in SURFACE and name not in ("points_on_rays", "look_at"):  # these say it all in a line
-        assert "Args:" in text and ("Returns:" in text or "Returns [" in text)
+    assert re.match(r"[A-Z][a-z]+s ", text), "expected a verb in the third person"
+    parameters = inspect.signature(function).parameters
+    assert [p for p in parameters if not re.search(rf"\b{p}\b", text)] == [], "parameters it does not name"
+    if name != "points_on_rays":  # its docstring is one line
+        assert "Args:" in text
+        result = inspect.signature(function).return_annotation
+        # A type with a docstring of its own needs no description.
+        assert result in (None, jaxnerf.Views, jaxnerf.TrainedRun) or "Returns:" in text
 
 
-# What has a source in the paper, its code or the literature names it; the others are one plain line of maths.
+# Functions with a source in the paper, its code or the literature name it. These are plain mathematics or read files.
 PLAIN = {
-    "uniform_edges",
-    "merge_edges",
-    "points_on_rays",
-    "render_image",
-    "load_scene",
-    "look_at",
-    "turntable",
-}
-PLAIN |= {
-    "mse",
-    "round_to_8_bits",
-    "expected_depth",
-    "expected_disparity",
-    "ndc_to_t",
-    "transmittance",
-    "psnr",
+    *("uniform_edges", "merge_edges", "points_on_rays", "render_image", "look_at", "turntable", "ndc_to_t"),
+    *("mse", "psnr", "round_to_8_bits", "expected_depth", "expected_disparity", "transmittance"),
+    *("load_dataset", "draw_batch", "still_life", "mlp_field", "load_scene", "restore_run", "train_and_evaluate"),
+    *("register_field", "register_sampler", "register_loss", "register_reader"),
 }
 
 
 @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name not in PLAIN])
 def test_docstring_names_its_source(name):
     text = " ".join((inspect.getdoc(getattr(jaxnerf, name)) or "").split())
-    assert re.search(SOURCE, text), "wanted an equation, a section, a paper or the released code"
+    assert re.search(SOURCE, text), "expected an equation, a section, a paper or the released code"
 
 
 def test_import_is_light():
-    heavy = ["absl", "ml_collections", "imageio", "flax", "optax"]
+    heavy = ["absl", "ml_collections", "imageio", "flax", "optax", "orbax", "beartype"]
     code = f"import sys, jaxnerf; print([name for name in {heavy} if name in sys.modules])"
     root = pathlib.Path(__file__).resolve().parent.parent
     result = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)

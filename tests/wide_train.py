@@ -1,7 +1,7 @@
-"""python -m jaxnerf.train whose cameras, and so rays and samples, are float64: for device_matrix.py.
+"""python -m jaxnerf.train with float64 cameras, and so float64 rays and samples: for device_matrix.py.
 
-Under JAX_ENABLE_X64 parameters and densities are float64 by themselves, but cameras are read as float32, and
-roundings of what follows from them depend on how many rays a device has.
+Under JAX_ENABLE_X64 parameters and densities are float64, but cameras are read as float32, and the rounding of
+what is computed from them depends on how many rays a device has.
 """
 
 import dataclasses
@@ -10,14 +10,14 @@ import jax
 import numpy as np
 
 from jaxnerf import train
+from jaxnerf.data import dataset
 from jaxnerf.runtime import cli
-from jaxnerf.training import build
 
-_load_views = build.load_views
+_load_split = dataset.load_split
 
 
-def load_views(data, split):
-    views = _load_views(data, split)
+def load_split(data, split):
+    views = _load_split(data, split)
     cameras, near, far = jax.tree.map(_widen, (views.cameras, views.near, views.far))
     return dataclasses.replace(views, cameras=cameras, near=near, far=far)
 
@@ -27,5 +27,5 @@ def _widen(leaf):
 
 
 if __name__ == "__main__":
-    build.load_views = load_views
+    dataset.load_split = load_split
     cli.run(train.main)

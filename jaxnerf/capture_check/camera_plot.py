@@ -1,48 +1,74 @@
-"""A picture of where the cameras stand, what they look at and what they see, from above and from a side."""
+"""Plots the cameras of a dataset and the points that its images show, from above and from a side."""
+
+import os
+import pathlib
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from jaxtyping import Float
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from PIL import Image
 
-_SIZE = 640  # px, each of the two panels
-_RIM = 46
-_INK, _CAMERA, _FLAGGED, _POINT, _PALE = "#202020", "#2060c0", "#e02020", "#9a9a9a", "#d8d8d8"
+from jaxnerf.capture_check.report import Report
+from jaxnerf.core.types import Camera
+from jaxnerf.runtime.atomic_files import partial_file
+
+CAMERA, FLAGGED, POINT = "#2060c0", "#e02020", "#9a9a9a"
+_SOFTWARE = "jaxnerf-check"
 
 
-def plot_cameras(capture, poses, places, *, flagged=()):
-    """Returns a Pillow image of a capture's cameras and points.
+def plot_cameras(report: Report) -> Figure:
+    """Returns a figure of the cameras, those of findings in red, and of the points.
 
-    Args:
-        capture: Capture of V frames.
-        poses: [V, 3, 4], where they are drawn.
-        places: [N, 3] world units, points; where there are none, and the capture has some, its own.
-        flagged: indices of frames to draw in red.
+    If the images agree on no points, those of the dataset's own model are drawn.
     """
-    if not len(places) and capture.points is not None:
-        places = capture.points
+    capture, poses, points = report.capture, report.poses, report.points
+    if not len(points) and capture.points is not None:
+        points = capture.points
+    flagged = {index for finding in report.findings for index in finding.frames}
+    eyes = poses[:, :, 3]
+    length = 0.1 * max(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max(), 1e-9)
+    frusta = np.stack([_frustum(frame.camera, pose, length) for frame, pose in zip(capture.frames, poses, strict=True)])
+    # Outliers among the points do not shrink the rest.
+    inner = np.percentile(points, [5, 95], axis=0) if len(points) else np.zeros((0, 3))
+    shown = np.concatenate([frusta.reshape(-1, 3), inner])
+    points = points[:: max(1, len(points) // 6000)]
+    colours = [FLAGGED if index in flagged else CAMERA for index in range(len(poses))]
+    figure = Figure(figsize=(13, 6.7), dpi=100, layout="constrained")
     right, deep, up = _axes(poses)
-    frusta = [_frustum(frame.camera, pose) for frame, pose in zip(capture.frames, poses, strict=True)]
-    frusta = _scaled(np.stack(frusta), poses)
-    sheet = Image.new("RGB", (2 * _SIZE, _SIZE + 30), "white")
-    draw = ImageDraw.Draw(sheet)
-    text = ImageFont.load_default(13)
-    for panel, along in enumerate((deep, up)):
-        view = np.stack([right, along])
-        place = _view(np.concatenate([frusta.reshape(-1, 3), _middle_of(places)]), view, panel)
-        _draw_scale(draw, place, view, panel, text)
-        for x, y in place(places[:: max(1, len(places) // 6000)]):
-            if panel * _SIZE < x < (panel + 1) * _SIZE and 0 < y < _SIZE:
-                draw.rectangle((x, y, x + 1, y + 1), fill=_POINT)
-        for index, corners in enumerate(frusta):
-            _draw_frustum(draw, place(corners), _FLAGGED if index in flagged else _CAMERA)
-    draw.line([(_SIZE, 0), (_SIZE, _SIZE)], fill=_PALE)
-    legend = f"{len(frusta)} cameras (blue, open towards what they see), {len(places)} places (grey)"
-    legend += f", {len(flagged)} cameras with findings (red)" if len(flagged) else ""
-    draw.text((10, _SIZE + 8), f"{capture.source}: {legend}", fill=_INK, font=text)
-    return sheet
+    for plot, vertical, title in zip(figure.subplots(1, 2), (deep, up), ("from above", "from a side"), strict=True):
+        view = np.stack([right, vertical], axis=-1)
+        plot.scatter(*(points @ view).T, s=2, color=POINT, linewidths=0)
+        plot.add_collection(LineCollection(frusta @ view, colors=colours, linewidths=0.8))
+        low, high = (shown @ view).min(axis=0), (shown @ view).max(axis=0)
+        middle, reach = (low + high) / 2, 0.55 * max((high - low).max(), 1e-9)
+        plot.set(xlim=middle[0] + [-reach, reach], ylim=middle[1] + [-reach, reach], aspect="equal", title=title)
+        plot.set(xlabel=_name(right), ylabel=_name(vertical))
+    text = f"{len(poses)} cameras (blue, open in viewing direction), {len(report.points)} points (grey)"
+    text += f", {len(flagged)} cameras with findings (red)" if flagged else ""
+    figure.suptitle(f"{capture.source}: {text}", fontsize="medium")
+    return figure
 
 
-def _axes(poses):
-    """Returns the world's axes, or their opposites, that go right, away and up in the picture, [3, 3]."""
+def save(figure: Figure, path: str | os.PathLike, folder: str | os.PathLike) -> None:
+    """Writes a PNG that names the dataset's folder; see `is_plot_of`."""
+    metadata = {"Software": _SOFTWARE, "Source": str(pathlib.Path(folder).resolve())}
+    with partial_file(path) as partial:
+        figure.savefig(partial, format="png", metadata=metadata)
+
+
+def is_plot_of(path: str | os.PathLike, folder: str | os.PathLike) -> bool:
+    """Returns whether a file was written by `save` for the dataset in a folder."""
+    try:
+        with Image.open(path) as image:
+            found = image.info.get("Software"), image.info.get("Source")
+    except (OSError, ValueError, SyntaxError):
+        return False
+    return found == (_SOFTWARE, str(pathlib.Path(folder).resolve()))
+
+
+def _axes(poses: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, "3 3"]:
+    """Returns the signed world axes that point right, away and up in the plots, as rows."""
     mean = poses[:, :, 1].sum(axis=0)
     up = int(np.abs(mean).argmax())
     right, deep, up = np.roll(np.eye(3), -1 - up, axis=0)
@@ -50,66 +76,14 @@ def _axes(poses):
     return np.stack([sign * right, deep, sign * up])
 
 
-def _frustum(camera, pose):
-    """Returns the eye, the image's four corners at distance 1 along the axis, and its top, [6, 3]."""
+def _frustum(camera: Camera, pose: Float[np.ndarray, "3 4"], length: float) -> Float[np.ndarray, "13 3"]:
+    """Returns a line through the eye and the image's corners; a triangle on its top edge shows up."""
     width, height = camera.width or 2 * camera.center[0], camera.height or 2 * camera.center[1]
     pixels = np.array([[0, 0], [width, 0], [width, height], [0, height], [width / 2, -height / 5]])
     x, y = ((pixels - camera.center) / camera.focal).T
-    local = np.stack([x, -y, -np.ones_like(x)], axis=-1)
-    return np.concatenate([pose[None, :, 3], pose[:, 3] + local @ pose[:, :3].T])
+    corners = pose[:, 3] + length * np.stack([x, -y, -np.ones_like(x)], axis=-1) @ pose[:, :3].T
+    return np.stack([pose[:, 3], *corners])[[0, 1, 2, 0, 3, 4, 0, 1, 5, 2, 3, 4, 1]]
 
 
-def _scaled(frusta, poses):
-    """Returns the frusta, as long as a tenth of how far apart the cameras stand."""
-    eyes = poses[:, :, 3]
-    length = 0.1 * max(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max(), 1e-9)
-    return frusta[:, :1] + length * (frusta - frusta[:, :1])
-
-
-def _middle_of(places):
-    """Returns the places but for strays far out, so that these do not shrink the picture."""
-    if not len(places):
-        return np.zeros((0, 3))
-    low, high = np.percentile(places, [5, 95], axis=0)
-    return np.stack([low, high])
-
-
-def _view(points, view, panel):
-    """Returns the function from points [N, 3] to px [N, 2] of a panel that holds all of the given ones."""
-    flat = points @ view.T
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    scale = (_SIZE - 2 * _RIM) / max((high - low).max(), 1e-12)
-    middle = (low + high) / 2
-
-    def place(points):
-        moved = (points @ view.T - middle) * scale * [1, -1]
-        return moved + [panel * _SIZE + _SIZE / 2, _SIZE / 2]
-
-    place.scale = scale
-    return place
-
-
-def _draw_frustum(draw, corners, colour):
-    eye, *rim, top = (tuple(corner) for corner in corners)
-    for corner in rim:
-        draw.line([eye, corner], fill=colour)
-    draw.line([*rim, rim[0]], fill=colour)
-    draw.line([rim[0], top, rim[1]], fill=colour)  # the roof shows what the camera takes for up
-
-
-def _draw_scale(draw, place, view, panel, text):
-    unit = 10.0 ** np.floor(np.log10((_SIZE - 2 * _RIM) / place.scale / 2))
-    left, bottom = panel * _SIZE + 16, _SIZE - 16
-    end = left + unit * place.scale
-    draw.line([(left, bottom), (end, bottom)], fill=_INK, width=2)
-    draw.text((left, bottom - 18), f"length {unit:g}", fill=_INK, font=text)
-    corner = panel * _SIZE + 16
-    draw.line([(corner, 60), (corner + 30, 60)], fill=_INK)
-    draw.line([(corner, 60), (corner, 30)], fill=_INK)
-    draw.text((corner + 34, 52), _name(view[0]), fill=_INK, font=text)
-    draw.text((corner - 6, 12), _name(view[1]), fill=_INK, font=text)
-    draw.text((corner + 70, 12), ("from above", "from a side")[panel], fill=_INK, font=text)
-
-
-def _name(axis):
-    return f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]}"
+def _name(axis: Float[np.ndarray, "3"]) -> str:
+    return f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]} (world units)"

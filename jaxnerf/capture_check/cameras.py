@@ -1,192 +1,287 @@
-"""What is wrong with the cameras of a capture, judged by what its photographs show."""
+"""Judges the cameras of a dataset by its images: axes, focal length, and the pose of each image.
 
+A track of matched corners fits the cameras if one point in space explains it to within two pixels. About one
+in twenty random matches does.
+"""
+
+import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from jaxnerf.capture_check import consistency, features, tracks
 from jaxnerf.capture_check.findings import Finding, axes_change, axes_name, focal_change, percent
+from jaxnerf.capture_check.images import ImageSummary
+from jaxnerf.capture_check.tracks import (
+    INLIER,
+    Keypoints,
+    Tracks,
+    circles,
+    count_fits,
+    errors,
+    follow,
+    keypoints_of,
+    match,
+    subset,
+    triangulate,
+)
 from jaxnerf.data.geometry.world import poses_of
+from jaxnerf.data.readers.base import Capture
 
-_ENOUGH = 60  # tracks, to judge anything
-_CLEARLY = 0.1  # share of tracks by which other axes must fit better, and a third more
-_OFF = 0.07  # of the focal length, from where it is reported: lens and noise reach 0.02
-_WITNESSES = 3  # views, from where the spread among them tells anything
-_LEAST_GAIN = 0.02  # px: less is nothing, however sure
+_MIN_TRACKS = 60  # to judge axes and the focal length
+_SCREENING, _RANKING = 400, 3000  # tracks that screen all axes, and that rank the best and focal lengths
+_CLEARLY = 0.1  # fraction of tracks by which other axes must fit better, beside a third more
+_FACTORS = np.geomspace(0.55, 1.8, 21)  # of the focal length
+_MIN_ERROR = 0.07  # of the focal length, to be reported; lens and noise reach 0.02
+_MIN_VIEWS = 3  # with tracks, for a standard error over views
+_MIN_GAIN = 0.02  # px
 _SURE = 5.0  # standard errors
-_STRANGE = 0.35  # of the usual share of matches that fit: below, a photograph is not from its camera
-_RARE = 0.2  # share of matches that fit, where views share too little, or nothing is right
-_CIRCLES = 15  # matches that close a circle, to be sure
-_CLOSED = 0.5  # of these, where the poses are right: mostly above 0.8
-_NONE = 0.1  # of these, where all poses are wrong; a can with one label twice closes circles that fit to 0.2
-_TRUSTED = 0.33  # usual share of matches that fit, for one photograph alone to be called wrong
-_PARALLAX = np.deg2rad(1.5)  # between rays, for a place to have a depth
+_UNUSUAL = 0.35  # of the median fraction of matches that fit, below which an image is examined
+_RARE = 0.2  # median fraction of matches that fit, below which views share too little or all poses are wrong
+_MIN_CIRCLES = 15  # matches that close a circle
+_CLOSED = 0.5  # fraction of these that fits if poses are right; mostly above 0.8
+_NONE = 0.1  # the same if all poses are wrong; an object with two equal sides closes circles that fit to 0.2
+_TRUSTED = 0.33  # median fraction of matches that fit, above which one unusual image is an error
+_PARALLAX = np.deg2rad(1.5)  # between the rays of a point whose depth counts
 
 
 class Evidence(NamedTuple):
-    """What the photographs say about the cameras."""
+    """The matches between images, and the cameras as corrected so far.
 
-    found: list  # Features of each view
-    points: list  # where their corners lie on the plane at distance 1, see tracks.on_plane
-    near: np.ndarray  # [V, K] views beside each
-    tracks: tracks.Tracks
-    poses: np.ndarray  # [V, 3, 4], as they are meant where that is clear
-    scale: np.ndarray  # [V] px of the shrunk image that 1 on the plane takes
-    share: float  # of tracks that fit
+    Attributes:
+        keypoints: of each view.
+        near: [V, K] neighbours of each view.
+        tracks: of all keypoints through the neighbours.
+        poses: [V, 3, 4].
+        scale: [V] px of the reduced image per unit on the plane at distance 1.
+        fraction: of the tracks that fit.
+    """
 
-
-def gather(capture, photos, near):
-    """Returns the Evidence in the photographs' corners; a photograph that is None shows nothing."""
-    empty = tracks.no_features()
-    found = [empty if photo is None else photo.features for photo in photos]
-    points = tracks.on_plane(capture, found)
-    scale = []
-    for photo, frame in zip(photos, capture.frames, strict=True):
-        height, factor = (1, 1) if photo is None else (photo.size[0], photo.factor)
-        stated = frame.camera.height or height
-        scale.append(np.mean(frame.camera.focal) * height / stated / factor)
-    poses, scale = poses_of(capture), np.array(scale)
-    followed = tracks.follow(found, points, near)
-    share = 0.0
-    if len(followed.shown):
-        share = float((consistency.errors(followed, poses, scale) < consistency.NEAR).mean())
-    return Evidence(found, points, near, followed, poses, scale, share)
+    keypoints: list[Keypoints]
+    near: Int[np.ndarray, "V K"]
+    tracks: Tracks
+    poses: Float[np.ndarray, "V 3 4"]
+    scale: Float[np.ndarray, " V"]
+    fraction: float
 
 
-def judge_axes(capture, evidence):
-    """Returns Findings about the meaning of the poses, and the Evidence with poses as they are meant."""
-    if len(evidence.tracks.shown) < _ENOUGH:
-        found = f"only {len(evidence.tracks.shown)} places are recognised in several photographs"
-        change = "nothing, or take photographs with more texture and overlap"
-        return [Finding("note", "overlap", found, f"{_ENOUGH} to judge the cameras by", change)], evidence
-    stated, other = consistency.rank_axes(evidence.tracks, evidence.poses, evidence.scale)
-    if other.share > max(stated.share + _CLEARLY, 4 / 3 * stated.share):
-        mended = evidence._replace(poses=consistency.as_meant(evidence.poses, other), share=other.share)
-        found = (
-            f"{capture.source}: the poses are in {axes_name(other)}: {percent(other.share)} of what the "
-            f"photographs share fits then, {percent(stated.share)} as they are"
-        )
-        wanted = "camera-to-world with x right, y up, looking along -z (as the format has it)"
-        return [Finding("ruins", "axes", found, wanted, axes_change(capture.format, other))], mended
-    return [], evidence
+class Axes(NamedTuple):
+    """An alternative reading of the poses in a file.
+
+    Attributes:
+        turn: [3, 3] from the intended camera's axes to the stored one's, a signed permutation.
+        inverted: whether the file stores world to camera.
+        fraction: of the tracks that fit this reading.
+    """
+
+    turn: Float[np.ndarray, "3 3"]
+    inverted: bool
+    fraction: float
 
 
-def judge_places(capture):
-    """Returns Findings about cameras that all stand in one place."""
+def gather(capture: Capture, images: Sequence[ImageSummary | None], near: Int[np.ndarray, "V K"]) -> Evidence:
+    """Matches the images and returns the Evidence; an unreadable image (None) has no corners."""
+    keypoints = keypoints_of(capture, images)
+    scale = np.ones(len(images))
+    for view, (image, frame) in enumerate(zip(images, capture.frames, strict=True)):
+        if image is not None:
+            height = frame.camera.height or image.size[0]
+            scale[view] = np.mean(frame.camera.focal) * image.reduced[0] / height
+    tracks, poses = follow(keypoints, near), poses_of(capture)
+    return Evidence(keypoints, near, tracks, poses, scale, _fitting(tracks, poses, scale))
+
+
+def judge_positions(capture: Capture) -> list[Finding]:
+    """Returns a Finding if all cameras have the same position."""
     eyes = poses_of(capture)[:, :, 3]
     if len(eyes) < 2 or np.ptp(eyes, axis=0).max() > 1e-6 * (1 + np.abs(eyes).max()):
         return []
-    found = f"{capture.source}: all {len(eyes)} cameras stand in one place"
-    wanted = "places apart: only these tell how far off anything is"
-    return [Finding("ruins", "pose", found, wanted, "photograph while walking, or compute the poses anew")]
+    found = f"{capture.source}: all {len(eyes)} cameras are at the same position"
+    expected = "different positions, without which depth is undetermined"
+    return [Finding("error", "pose", found, expected, "move the camera between images, or compute the poses again")]
 
 
-def judge_focal(capture, evidence):
-    """Returns Findings about the focal length, and the Evidence with the one that fits."""
-    if len(evidence.tracks.shown) < _ENOUGH:
+def judge_axes(capture: Capture, evidence: Evidence) -> tuple[list[Finding], Evidence]:
+    """Returns Findings about the axes convention, and the Evidence with the poses as intended."""
+    count = len(evidence.tracks.shown)
+    if count < _MIN_TRACKS:
+        found = f"{capture.source}: only {count} corners are recognised in several images"
+        change = "nothing, or take images with more texture and overlap"
+        return [Finding("warning", "overlap", found, f"{_MIN_TRACKS} to judge the cameras", change)], evidence
+    stored, other = rank_axes(evidence.tracks, evidence.poses, evidence.scale)
+    if other.fraction <= max(stored.fraction + _CLEARLY, 4 / 3 * stored.fraction):
         return [], evidence
-    factor, gain, error = consistency.focal_factor(evidence.tracks, evidence.poses, evidence.scale)
-    told = len(np.unique(evidence.tracks.views)) >= _WITNESSES and gain > _LEAST_GAIN
-    if abs(np.log(factor)) < np.log1p(_OFF) or gain < _SURE * error or not told:
+    found = (
+        f"{capture.source}: the poses are in {axes_name(other)}; {percent(other.fraction)} of the matches fit "
+        f"these, {percent(stored.fraction)} fit the poses as stored"
+    )
+    expected = "camera-to-world with x right, y up, looking along -z (or as the format defines)"
+    finding = Finding("error", "axes", found, expected, axes_change(capture.format, other))
+    return [finding], evidence._replace(poses=as_intended(evidence.poses, other), fraction=other.fraction)
+
+
+def judge_focal(capture: Capture, evidence: Evidence) -> tuple[list[Finding], Evidence]:
+    """Returns Findings about the focal length, and the Evidence with the one that fits."""
+    if len(evidence.tracks.shown) < _MIN_TRACKS or len(np.unique(evidence.tracks.views)) < _MIN_VIEWS:
+        return [], evidence
+    factor, gain, error = focal_factor(evidence.tracks, evidence.poses, evidence.scale)
+    if abs(np.log(factor)) < np.log1p(_MIN_ERROR) or gain <= _MIN_GAIN or gain < _SURE * error:
         return [], evidence
     focal = np.mean(capture.frames[0].camera.focal)
     found = (
-        f"{capture.source}: the focal length is {focal:.5g} px and the photographs fit best at {factor:.2f} "
-        f"times that (by {gain:.2f} +- {error:.2f} px)"
+        f"{capture.source}: the focal length is {focal:.5g} px; the images fit {factor:.3g} times that better, by "
+        f"{gain:.2f} +- {error:.2f} px"
     )
-    wanted = f"about {focal * factor:.5g}"
-    finding = Finding("ruins", "focal", found, wanted, focal_change(capture, factor))
-    points = [(place / factor, good) for place, good in evidence.points]
-    followed = evidence.tracks._replace(points=evidence.tracks.points / factor)
+    finding = Finding("error", "focal", found, f"about {focal * factor:.5g}", focal_change(capture, factor))
+    keypoints = [part._replace(points=part.points / factor) for part in evidence.keypoints]
+    tracks = evidence.tracks._replace(points=evidence.tracks.points / factor)
     scale = evidence.scale * factor
-    share = float((consistency.errors(followed, evidence.poses, scale) < consistency.NEAR).mean())
-    return [finding], evidence._replace(points=points, tracks=followed, scale=scale, share=share)
+    fraction = _fitting(tracks, evidence.poses, scale)
+    return [finding], evidence._replace(keypoints=keypoints, tracks=tracks, scale=scale, fraction=fraction)
 
 
-def judge_views(capture, evidence):
-    """Returns Findings about photographs that are not from their cameras: swapped, or with a wrong pose."""
-
-    def fits(content, place):
-        return consistency.fits(*evidence[:3], *evidence[4:6], content=content, place=place)
-
+def judge_views(capture: Capture, evidence: Evidence) -> list[Finding]:
+    """Returns Findings about images that do not belong to their cameras: swapped, or with a wrong pose."""
     views = range(len(capture.frames))
-    fit, matches = np.array([fits(view, view) for view in views]).T
-    share = fit / np.maximum(matches, 1)
-    usual = np.median(share)
+    fit, matches = np.array([_fits(evidence, view, view) for view in views]).T
+    fraction = fit / np.maximum(matches, 1)
+    usual = np.median(fraction)
     if usual < _RARE:
         return _judge_all(capture, evidence)
-    strange = [view for view in views if share[view] < _STRANGE * usual and len(evidence.found[view].pixels)]
-    findings, left = [], list(strange)
-    for first in strange:
-        for second in strange:
-            if not (first < second and first in left and second in left):
-                continue
-            mended = fits(first, second), fits(second, first)
-            if all(good >= 8 and good > 0.6 * usual * every for good, every in mended):
-                findings.append(_swapped(capture, first, second))
-                left = [view for view in left if view not in (first, second)]
-    return findings + [finding for view in left for finding in _stranger(capture, evidence, view, usual)]
+    odd = [view for view in views if fraction[view] < _UNUSUAL * usual and len(evidence.keypoints[view].points)]
+    findings = []
+    for first, second in itertools.combinations(odd, 2):
+        if first not in odd or second not in odd:
+            continue
+        swapped = _fits(evidence, first, second), _fits(evidence, second, first)
+        if all(good >= 8 and good > 0.6 * usual * count for good, count in swapped):
+            one, two = capture.frames[first].image, capture.frames[second].image
+            found = f"{one} and {two} each show the view of the other's camera"
+            expected, change = "each image at its own camera", "rename the two files to each other"
+            findings.append(Finding("error", "swap", found, expected, change, (first, second)))
+            odd = [view for view in odd if view not in (first, second)]
+    return findings + [finding for view in odd for finding in _judge_view(capture, evidence, view, usual)]
 
 
-def places(evidence):
-    """Returns where in space the photographs agree that something is: [N, 3], and their tracks."""
-    followed = evidence.tracks
-    if not len(followed.shown):
-        return np.zeros((0, 3)), followed
-    found, _ = tracks.triangulate(followed, evidence.poses)
-    rays = found[:, None] - evidence.poses[followed.views][..., 3]
+def points_of(evidence: Evidence) -> tuple[Float[np.ndarray, "N 3"], Tracks]:
+    """Returns the points in space on which the images agree with sufficient parallax, and their tracks."""
+    tracks = evidence.tracks
+    points, _ = triangulate(tracks, evidence.poses)
+    rays = points[:, None] - evidence.poses[tracks.views][..., 3]
     rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
-    cosine = np.where(followed.shown, (rays * rays[:, :1]).sum(-1), 1).min(axis=1)
-    good = consistency.errors(followed, evidence.poses, evidence.scale) < 0.5 * consistency.NEAR
+    cosine = np.where(tracks.shown, (rays * rays[:, :1]).sum(-1), 1).min(axis=1)
+    good = errors(tracks, evidence.poses, evidence.scale) < 0.5 * INLIER
     good &= cosine < np.cos(_PARALLAX)
-    return found[good], tracks.Tracks(*(part[good] for part in followed))
+    return points[good], Tracks(*(part[good] for part in tracks))
 
 
-def _swapped(capture, first, second):
-    one, two = capture.frames[first], capture.frames[second]
-    found = f"{one.image} and {two.image} show what the other's camera sees"
-    wanted = "each photograph at its own camera"
-    return Finding("ruins", "swap", found, wanted, "rename the two files to each other", (first, second))
+def as_intended(poses: Float[np.ndarray, "V 3 4"], axes: Axes) -> Float[np.ndarray, "V 3 4"]:
+    """Returns the intended poses of a file that stores them in other axes; they may be mirrored."""
+    turn, eyes = poses[:, :, :3], poses[:, :, 3:]
+    if axes.inverted:
+        turn = np.swapaxes(turn, 1, 2)
+        eyes = -turn @ eyes
+    return np.concatenate([turn @ axes.turn, eyes], axis=-1)
 
 
-def _stranger(capture, evidence, view, usual):
-    """Returns the Findings about a photograph that does not fit those beside it."""
-    counts = [
-        0 if other == view else len(features.match(evidence.found[view], evidence.found[other]))
-        for other in range(len(capture.frames))
+def rank_axes(tracks: Tracks, poses: Float[np.ndarray, "V 3 4"], scale: Float[np.ndarray, " V"]) -> tuple[Axes, Axes]:
+    """Returns the Axes as stored, and the best of the 95 alternatives."""
+
+    def measured(part, axes):
+        return axes._replace(fraction=_fitting(part, as_intended(poses, axes), scale))
+
+    every = [
+        Axes(np.eye(3)[:, order] * signs, inverted, 0.0)
+        for inverted in (False, True)
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1, -1), repeat=3)
     ]
-    others = np.argsort(counts, kind="stable")[::-1][: evidence.near.shape[1]]  # by what they show alone
-    sure, share = _of_circles(evidence, [(view, others)])
-    if sure >= _CIRCLES and share > _CLOSED:
-        return []  # it fits elsewhere: what is beside it is too far off, or looks another way
+    screening, ranking = subset(tracks, _SCREENING), subset(tracks, _RANKING)
+    stored, *others = (measured(screening, axes) for axes in every)
+    best = sorted(others, key=lambda axes: -axes.fraction)[:3]
+    others = [measured(ranking, axes) for axes in best]
+    return measured(ranking, stored), max(others, key=lambda axes: axes.fraction)
+
+
+def focal_factor(
+    tracks: Tracks, poses: Float[np.ndarray, "V 3 4"], scale: Float[np.ndarray, " V"]
+) -> tuple[float, float, float]:
+    """Returns the factor of the focal length with the least mean error, and how certain it is.
+
+    Depth compensates much of a wrong focal length, but not all of it.
+
+    Returns:
+        The factor; the gain in px, the mean error at factor 1 minus that at the factor; and the gain's
+        standard error over views, inf if the least error is at an end of the range.
+    """
+    tracks = subset(tracks, _RANKING)
+
+    def cost(factor):
+        return errors(tracks._replace(points=tracks.points / factor), poses, scale * factor)
+
+    means = np.array([cost(factor).mean() for factor in _FACTORS])
+    best = int(means.argmin())
+    if best in (0, len(_FACTORS) - 1):
+        return float(_FACTORS[best]), 0.0, np.inf
+    before, here, after = means[best - 1 : best + 2]
+    shift = 0.5 * (before - after) / max(before + after - 2 * here, 1e-12)  # vertex of the parabola
+    factor = float(_FACTORS[best] * (_FACTORS[1] / _FACTORS[0]) ** np.clip(shift, -0.5, 0.5))
+    gain = cost(1.0) - cost(factor)
+    sums = np.bincount(tracks.views[:, 0], gain, len(poses))
+    count = np.bincount(tracks.views[:, 0], minlength=len(poses))
+    deviation = np.sqrt(((sums - count * gain.mean()) ** 2).sum()) / len(gain)
+    return factor, float(gain.mean()), float(deviation)
+
+
+def _fits(evidence, image, view):
+    return count_fits(evidence.keypoints, evidence.near, evidence.poses, evidence.scale, image=image, view=view)
+
+
+def _fitting(tracks, poses, scale):
+    """Returns the fraction of tracks that fit; 0 if there are none."""
+    return float((errors(tracks, poses, scale) < INLIER).mean()) if len(tracks.shown) else 0.0
+
+
+def _judge_view(capture, evidence, view, usual):
+    """Returns Findings about an image that does not fit its neighbours."""
+    own = evidence.keypoints[view]
+    counts = [(match(own, other) >= 0).sum() if k != view else 0 for k, other in enumerate(evidence.keypoints)]
+    others = np.argsort(counts, kind="stable")[::-1][: evidence.near.shape[1]]  # by content, whatever the poses
+    confirmed, fraction = _closed_circles(evidence, [(view, others)])
+    if confirmed >= _MIN_CIRCLES and fraction > _CLOSED:
+        return []  # it fits other views: its neighbours are too far away or look in another direction
     frame = capture.frames[view]
     change = f"{frame.name} in {capture.source}: correct its pose or its file, or remove it"
-    if sure >= _CIRCLES:
-        found = f"{frame.image} does not show what its camera sees ({percent(share)} of {sure} sure matches fit)"
-        severity = "ruins" if usual > _TRUSTED else "note"
+    if confirmed >= _MIN_CIRCLES:
+        found = (
+            f"{frame.image} does not show the view of its camera: {percent(fraction)} of {confirmed} matches "
+            "confirmed by a third image fit"
+        )
+        severity = "error" if usual > _TRUSTED else "warning"
         return [Finding(severity, "pose", found, "nearly all", change, (view,))]
-    found = f"{frame.image} shows nothing that is recognised in the views beside it"
-    return [Finding("note", "pose", found, "overlap", change, (view,))]
+    found = f"{frame.image} has no corner that its neighbours show"
+    return [Finding("warning", "pose", found, "overlap", change, (view,))]
 
 
 def _judge_all(capture, evidence):
-    """Returns Findings where hardly any match fits: because poses are wrong, or views too far apart?"""
-    sure, share = _of_circles(evidence, list(enumerate(evidence.near)))
-    if sure < _CIRCLES:
-        found = f"{capture.source}: the photographs have too little in common to judge the poses by"
-        change = "nothing, or take more photographs between these"
-        return [Finding("note", "overlap", found, "overlap", change)]
-    if share > _CLOSED:
+    """Returns Findings if hardly any match fits, because all poses are wrong or views are too far apart."""
+    confirmed, fraction = _closed_circles(evidence, list(enumerate(evidence.near)))
+    if confirmed < _MIN_CIRCLES:
+        found = f"{capture.source}: the images have too little in common to judge the poses"
+        change = "nothing, or take more images between these"
+        return [Finding("warning", "overlap", found, "overlap", change)]
+    if fraction > _CLOSED:
         return []
-    severity = "ruins" if share < _NONE else "note"
-    found = f"{capture.source}: {percent(share)} of {sure} sure matches between photographs fit the poses"
-    change = "the poses or the lens: wrong in a way that no turn of axes mends, so compute them anew"
+    severity = "error" if fraction < _NONE else "warning"
+    found = f"{capture.source}: {percent(fraction)} of {confirmed} matches confirmed by a third image fit the poses"
+    change = "the poses or the lens: no change of axes corrects them, so compute them again"
     return [Finding(severity, "pose", found, "nearly all", change)]
 
 
-def _of_circles(evidence, groups):
-    """Returns how many matches are sure among (view, others) of each group, and the share that fits."""
-    closed = [consistency.circles(evidence.found, evidence.points, *group) for group in groups]
-    off = [consistency.errors(part, evidence.poses, evidence.scale) for part in closed if part is not None]
+def _closed_circles(evidence, groups):
+    """Returns how many matches among the (view, others) of each group close a circle, and the fraction that fits."""
+    parts = [circles(evidence.keypoints, *group) for group in groups]
+    off = [errors(part, evidence.poses, evidence.scale) for part in parts if part is not None]
     off = np.concatenate([*off, np.zeros(0)])
-    return len(off), float((off < consistency.NEAR).mean()) if len(off) else 0.0
+    return len(off), float((off < INLIER).mean()) if len(off) else 0.0

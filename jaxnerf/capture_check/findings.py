@@ -1,75 +1,97 @@
-"""What is wrong with a capture, in a line each that ends in the line to change."""
+"""Findings of a check: one line each, which ends in the file, field or flag to change."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jaxnerf.data.readers.base import Capture
+
+if TYPE_CHECKING:
+    from jaxnerf.capture_check.cameras import Axes
+
 
 class Finding(NamedTuple):
-    """One thing that is not as it should be."""
+    """One problem of a dataset.
 
-    severity: str  # "ruins": training on it is time lost, or "note"
-    kind: str  # "axes", "focal", "swap", "pose", "size", "file", "mask", "bounds", "points", ...
+    Attributes:
+        severity: "error" where training would be useless, or "warning".
+        kind: "axes", "focal", "swap", "pose", "overlap", "points", "size", "file", "mask", "duplicate",
+            "blur", "bounds" or "skipped".
+        found: what the check found, with the name of the file.
+        expected: what it expects there.
+        change: the file, field or flag to change, and how.
+        frames: indices of the frames concerned; empty if the finding concerns all frames.
+    """
+
+    severity: str
+    kind: str
     found: str
-    wanted: str
-    change: str  # file, field or flag, and what to do there
-    frames: tuple[int, ...] = ()  # those it is about, where it is not about all
+    expected: str
+    change: str
+    frames: tuple[int, ...] = ()
 
-    def line(self):
-        """Returns the finding in one line."""
-        return f"{self.severity.upper():5} {self.found}; wanted {self.wanted}; change: {self.change}"
+    def line(self) -> str:
+        """Returns the finding as one line of text."""
+        return f"{self.severity.upper():7} {self.found}; expected {self.expected}; change: {self.change}"
 
 
-class _Place(NamedTuple):
-    """Where a format keeps its cameras."""
+class _PoseFile(NamedTuple):
+    """How a format stores camera poses.
+
+    Attributes:
+        poses: the matrices, in words.
+        axes: [3, 3], the camera axes of jaxnerf in those of the file.
+        lines: the part of a matrix that holds one axis: "columns" or "rows".
+        mirror: how to mirror the world in one coordinate.
+    """
 
     poses: str
-    axes: np.ndarray  # [3, 3]: our camera axes, each by those of the file
-    lines: str  # what there stands for an axis
-    mirror: str  # how to undo a mirrored world
+    axes: np.ndarray
+    lines: str
+    mirror: str
 
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
-_MATRIX = "negate row 1 of every transform_matrix, too (the world is mirrored)"
-_PLACES = {
-    "blender": _Place("every transform_matrix of transforms_*.json", np.eye(3), "columns", _MATRIX),
-    "transforms": _Place("every transform_matrix of transforms.json", np.eye(3), "columns", _MATRIX),
-    "llff": _Place(
+_MIRROR_ROW = "also negate row 1 of every transform_matrix (the world is mirrored)"
+_POSE_FILES = {
+    "blender": _PoseFile("every transform_matrix of transforms_*.json", np.eye(3), "columns", _MIRROR_ROW),
+    "transforms": _PoseFile("every transform_matrix of transforms.json", np.eye(3), "columns", _MIRROR_ROW),
+    "llff": _PoseFile(
         "the 3 x 5 matrix in every row of poses_bounds.npy",
         np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
         "columns",
-        "negate row 1 of every 3 x 5 matrix but for its column 5, too (the world is mirrored)",
+        "also negate row 1 of every 3 x 5 matrix except in column 5 (the world is mirrored)",
     ),
-    "colmap": _Place(
+    "colmap": _PoseFile(
         "every world-to-camera matrix [R | t] of the images file",
         _FLIP,
         "rows",
-        "negate column 1 of every R and x of every point, too (the world is mirrored)",
+        "also negate column 1 of every R and x of every point (the world is mirrored)",
     ),
 }
 
 
-def axes_change(format, axes):
-    """Returns what to write into a file whose cameras are stated in the given consistency.Axes."""
-    place = _PLACES[format]
-    turn = place.axes @ axes.turn @ place.axes.T  # in the file's axes
-    columns = [int(round(sign * (which + 1))) for which, sign in zip(*_entries(turn), strict=True)]
+def axes_change(format: str, axes: "Axes") -> str:
+    """Returns the edit that corrects a file whose cameras are stored in the given axes."""
+    file = _POSE_FILES.get(format, _PoseFile("every pose", np.eye(3), "columns", "also mirror the world"))
+    turn = file.axes @ axes.turn @ file.axes.T  # in the axes of the file
+    rows = np.abs(turn).argmax(axis=0)
+    columns = [int(round(sign * (row + 1))) for row, sign in zip(rows, turn[rows, np.arange(3)], strict=True)]
     steps = []
     if axes.inverted:
-        steps.append("invert it (it is the other way round: world to camera)")
-    if columns != [1, 2, 3]:
-        if [abs(column) for column in columns] == [1, 2, 3]:
-            negated = [str(-column) for column in columns if column < 0]
-            steps.append(f"negate {place.lines} {' and '.join(negated)}")
-        else:
-            steps.append(f"make its {place.lines} {', '.join(f'{column:+d}' for column in columns)} of these")
+        steps.append("invert it (it maps world to camera)")
+    if [abs(column) for column in columns] != [1, 2, 3]:
+        steps.append(f"replace its {file.lines} by {', '.join(f'{column:+d}' for column in columns)} of the old ones")
+    elif columns != [1, 2, 3]:
+        steps.append(f"negate {file.lines} {' and '.join(str(-column) for column in columns if column < 0)}")
     if np.linalg.det(axes.turn) < 0:
-        steps.append(place.mirror)
-    return f"{place.poses}: {', then '.join(steps)}"
+        steps.append(file.mirror)
+    return f"{file.poses}: {', then '.join(steps)}"
 
 
-def axes_name(axes):
-    """Returns in a few words what axes a file's cameras are stated in."""
+def axes_name(axes: "Axes") -> str:
+    """Returns the name of the convention that camera axes follow."""
     if axes.inverted:
         return "world-to-camera matrices"
     if np.array_equal(axes.turn, _FLIP):
@@ -79,8 +101,8 @@ def axes_name(axes):
     return "axes turned by right angles"
 
 
-def focal_change(capture, factor):
-    """Returns what to write into a file whose focal length is to be multiplied with a factor."""
+def focal_change(capture: Capture, factor: float) -> str:
+    """Returns the edit that multiplies the focal length of a dataset by a factor."""
     camera = capture.frames[0].camera
     focal = np.asarray(camera.focal) * factor
     if capture.format == "blender":
@@ -90,21 +112,15 @@ def focal_change(capture, factor):
         return f"poses_bounds.npy: row 3 of every column 5 to about {focal[0]:.5g}"
     if capture.format == "colmap":
         return f"the cameras file: every focal length times {factor:.3g}, or run COLMAP again"
-    return f"transforms.json: fl_x, fl_y (or camera_angle_x) to about {focal[0]:.5g}, {focal[1]:.5g}"
+    return f"{capture.source.name}: fl_x, fl_y (or camera_angle_x) to about {focal[0]:.5g}, {focal[1]:.5g}"
 
 
-def percent(share, digits=0):
-    """Returns a share as text."""
-    return f"{100 * share:.{digits}f} %"
+def percent(fraction: float, digits: int = 0) -> str:
+    """Returns a fraction as text in percent."""
+    return f"{100 * fraction:.{digits}f} %"
 
 
-def named(capture, indices):
-    """Returns the names of the frames with these indices, of many only some."""
+def named(capture: Capture, indices: Sequence[int]) -> str:
+    """Returns the names of frames, the first five if there are more."""
     names = ", ".join(capture.frames[index].name for index in indices[:5])
     return names + (f" and {len(indices) - 5} more" if len(indices) > 5 else "")
-
-
-def _entries(turn):
-    """Returns which axis each column of a signed permutation takes, and with which sign."""
-    which = np.abs(turn).argmax(axis=0)
-    return which, turn[which, np.arange(3)]

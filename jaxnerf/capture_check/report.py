@@ -1,159 +1,204 @@
-"""A capture looked over before hours are spent on it: what it is, and what is wrong with it."""
+"""Checks a dataset before training: describes it and lists its problems."""
 
+import os
 from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxnerf.capture_check import cameras as cameras_module
-from jaxnerf.capture_check import compare_images, depths, points, tracks
+from jaxnerf.capture_check import cameras, depths, tracks
 from jaxnerf.capture_check import images as images_module
-from jaxnerf.capture_check.findings import Finding
+from jaxnerf.capture_check.findings import Finding, percent
 from jaxnerf.data.geometry.poses import gaze_center
-from jaxnerf.data.geometry.world import poses_of
-from jaxnerf.data.images import load_images
+from jaxnerf.data.geometry.world import looks_forward, poses_of
+from jaxnerf.data.images.load_images import split_indices
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 
-_MOST = 160  # photographs that are opened: two cores read so many in half a minute
+_MAX_IMAGES = 160  # that are read, which takes half a minute on two cores
 
 
 class Report(NamedTuple):
-    """What `inspect` returns."""
+    """The result of `inspect`.
 
-    capture: Capture  # what was looked at
-    facts: tuple[tuple[str, str], ...]  # what, and how it is
-    findings: tuple[Finding, ...]  # what ruins training first
-    poses: np.ndarray  # [V, 3, 4] as they are meant
-    places: np.ndarray  # [N, 3] where the photographs agree that something is
+    Attributes:
+        capture: the frames that were inspected.
+        facts: pairs of a name and a description.
+        findings: errors first.
+        poses: [V, 3, 4], corrected where the axes are wrong.
+        points: [N, 3], on which the images agree.
+    """
+
+    capture: Capture
+    facts: tuple[tuple[str, str], ...]
+    findings: tuple[Finding, ...]
+    poses: Float[np.ndarray, "V 3 4"]
+    points: Float[np.ndarray, "N 3"]
 
     @property
-    def ruined(self):
-        """Whether training on the capture is time lost."""
-        return any(finding.severity == "ruins" for finding in self.findings)
+    def num_errors(self) -> int:
+        """The number of findings that make training useless."""
+        return sum(finding.severity == "error" for finding in self.findings)
 
-    def text(self):
-        """Returns the report, a line a fact, then a line a finding."""
+    def text(self) -> str:
+        """Returns the report as text: one line for each fact, one for each finding, and a summary."""
         width = max(len(name) for name, _ in self.facts)
         lines = [f"{name:{width}}  {value}" for name, value in self.facts]
         lines += [finding.line() for finding in self.findings]
-        count = sum(finding.severity == "ruins" for finding in self.findings)
-        verdict = f"{count} found that would ruin training" if count else "nothing found that would ruin training"
-        return "\n".join([*lines, verdict])
+        errors, warnings = self.num_errors, len(self.findings) - self.num_errors
+        summary = f"{errors or 'no'} error{'s' * (errors != 1)}, {warnings or 'no'} warning{'s' * (warnings != 1)}"
+        return "\n".join([*lines, summary])
 
 
-def inspect(folder, *, format="auto", near=None, far=None):
-    """Returns the Report on the capture in a folder.
+def inspect(
+    folder: str | os.PathLike, *, format: str = "auto", near: float | None = None, far: float | None = None
+) -> Report:
+    """Checks the dataset in a folder.
 
     Args:
-        folder, format: see base.read_capture.
-        near, far: as training is going to have them, in t; None: its defaults, or what the capture says.
+        folder, format: see `read_capture`.
+        near, far: as training will use them, in t; None: training's defaults, or what the dataset states.
 
     Raises:
-        ValueError: where the cameras cannot be read at all; names the file, what was found, what was wanted
-            and what to do.
+        ValueError: if the cameras cannot be read; names the file, what was found, what is expected and what
+            to do.
     """
-    there = base.formats_in(folder)
+    available = base.detect_formats(folder)
     whole = base.read_capture(folder, format)
-    capture = _part(whole)
-    pictures, findings = images_module.read(capture)
+    capture = _subset(whole)
+    images, findings = images_module.read(capture)
     near_views = tracks.neighbours(poses_of(capture))
-    findings += compare_images.compare(capture, pictures, near_views)
-    findings += points.judge_points(capture)
-    evidence = cameras_module.gather(capture, pictures, near_views)
-    wrong = cameras_module.judge_places(capture)
-    if not wrong:  # from one place the rays of all poses meet, in the eye
-        wrong, evidence = cameras_module.judge_axes(capture, evidence)
-        focal, evidence = cameras_module.judge_focal(capture, evidence)
-        findings += focal + cameras_module.judge_views(capture, evidence)
+    findings += images_module.compare(capture, images, near_views)
+    findings += depths.judge_model_points(capture)
+    evidence = cameras.gather(capture, images, near_views)
+    wrong = cameras.judge_positions(capture)
+    if not wrong:  # from one position, rays fit any axes and focal length
+        wrong, evidence = cameras.judge_axes(capture, evidence)
+        focal, evidence = cameras.judge_focal(capture, evidence)
+        findings += focal + cameras.judge_views(capture, evidence)
     findings += wrong
-    found, followed = cameras_module.places(evidence)
+    points, point_tracks = cameras.points_of(evidence)
     bounds, stated = depths.ranges(capture, near, far)
-    if stated or not wrong:  # computed from poses that are wrong, they mean nothing
-        findings += depths.judge_bounds(capture, evidence, found, followed, bounds, stated)
-    findings += depths.judge_box(capture, found)
-    findings += [_noted(note) for note in whole.notes]
-    facts = _facts(whole, there, pictures) + _camera_facts(capture, evidence)
-    facts += _depth_facts(evidence, found, followed, bounds, stated)
-    order = sorted(findings, key=lambda finding: finding.severity != "ruins")
-    return Report(capture, tuple(facts), tuple(order), evidence.poses, found)
+    depth = depths.view_depths(evidence.poses, points, point_tracks)
+    if stated or not wrong:  # bounds computed from wrong poses mean nothing
+        findings += depths.judge_bounds(depth, bounds[point_tracks.views[:, 0]], stated)
+    findings += depths.judge_box(capture, points)
+    findings += [
+        Finding("warning", "skipped", note, "nothing skipped", "the files named, if this is not intended")
+        for note in whole.notes
+    ]
+    facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence)
+    facts.append(("near, far", _range(bounds, stated, depth)))
+    order = sorted(findings, key=lambda finding: finding.severity != "error")
+    return Report(capture, tuple(facts), tuple(order), evidence.poses, points)
 
 
-def _part(capture):
-    """Returns the capture with every n-th frame only where there are very many."""
-    step = -(-len(capture.frames) // _MOST)
-    if step == 1:
-        return capture
-    kept = range(0, len(capture.frames), step)
-    return capture._replace(frames=tuple(capture.frames[index] for index in kept), splits=None)
+def _subset(capture):
+    """Returns the capture with every n-th frame if there are very many."""
+    step = -(-len(capture.frames) // _MAX_IMAGES)
+    return capture if step == 1 else capture._replace(frames=capture.frames[::step], splits=None)
 
 
-def _noted(note):
-    return Finding("note", "missing", note, "nothing left out", "the files named, if that is not meant")
-
-
-def _facts(capture, there, pictures):
-    others = [name for name in there if name != capture.format]
-    also = f"; also there: {', '.join(others)} (--format chooses)" if others else ""
-    if capture.splits:
-        splits = {name: len(chosen) for name, chosen in capture.splits.items()}
-    else:
-        splits = {name: len(load_images.split_indices(capture, name)) for name in ("train", "test")}
-    sizes = Counter("{1} x {0}".format(*picture.size) for picture in pictures if picture)
-    channels = Counter("alpha" if picture.channels == 4 else "no alpha" for picture in pictures if picture)
+def _image_facts(capture, available, images):
+    others = [name for name in available if name != capture.format]
+    also = f"; other formats in the folder: {', '.join(others)} (--format selects one)" if others else ""
+    splits = capture.splits or {name: split_indices(capture, name) for name in ("train", "test")}
+    sizes = Counter("{1} x {0}".format(*image.size) for image in images if image)
+    channels = Counter("alpha" if image.channels == 4 else "no alpha" for image in images if image)
     masks = sum(frame.mask is not None for frame in capture.frames)
-    opened = "" if len(pictures) == len(capture.frames) else f"; {len(pictures)} looked at"
+    checked = "" if len(images) == len(capture.frames) else f"; {len(images)} were checked"
+    counts = ", ".join(f"{len(chosen)} {name}" for name, chosen in splits.items())
     return [
         ("format", f"{capture.format} ({capture.source}){also}"),
-        ("views", f"{len(capture.frames)}: {', '.join(f'{n} {name}' for name, n in splits.items())}{opened}"),
+        ("views", f"{len(capture.frames)}: {counts}{checked}"),
         ("images", f"{_counted(sizes)} px; {_counted(channels)}; {masks or 'no'} masks"),
     ]
 
 
 def _camera_facts(capture, evidence):
-    cameras = [frame.camera for frame in capture.frames]
-    first, poses = cameras[0], evidence.poses
-    focal = np.array([camera.focal for camera in cameras]).mean(axis=0)
-    width, height = first.width or 2 * first.center[0], first.height or 2 * first.center[1]
-    view = 2 * np.degrees(np.arctan(0.5 * np.array([width, height]) / focal))
-    off = np.asarray(first.center) - np.array([width, height]) / 2
-    lenses = _counted(Counter(camera.lens for camera in cameras))
-    up, angle = depths.up_axis(poses)
+    stack = [frame.camera for frame in capture.frames]
+    first, poses = stack[0], evidence.poses
+    focal = np.array([camera.focal for camera in stack]).mean(axis=0)
+    size = np.array([first.width or 2 * first.center[0], first.height or 2 * first.center[1]])
+    angle = 2 * np.degrees(np.arctan(0.5 * size / focal))
+    off = np.asarray(first.center) - size / 2
+    lenses = _counted(Counter(camera.lens for camera in stack))
     middle = gaze_center(poses)
-    away = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
-    around, low, high = depths.arcs(poses)
-    looks = depths.view_direction(capture)
+    distance = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
+    up, tilt = _up_axis(poses)
+    around, low, high = _arcs(poses)
     shown = evidence.tracks.shown
-    seen = (shown.sum() / len(shown)) if len(shown) else 0.0
-    right = np.linalg.det(poses[:, :, :3]).min() > 0
+    seen = shown.sum() / max(len(shown), 1)
+    handed = "right-handed" if np.linalg.det(poses[:, :, :3]).min() > 0 else "mirrored"
     return [
         (
             "lens",
-            f"focal length {focal[0]:.5g}, {focal[1]:.5g} px, so {view[0]:.1f} x {view[1]:.1f} degrees; "
-            f"centre {off[0]:+.1f}, {off[1]:+.1f} px off the middle; {lenses}",
+            f"focal length {focal[0]:.5g}, {focal[1]:.5g} px; field of view {angle[0]:.1f} x {angle[1]:.1f} degrees; "
+            f"principal point {off[0]:+.1f}, {off[1]:+.1f} px from the image's centre; {lenses}",
         ),
-        ("poses", f"{'right-handed' if right else 'mirrored'}; up is {up} within {angle:.0f} degrees"),
-        ("looking", f"{looks}; {away.min():.4g} to {away.max():.4g} from {np.round(middle, 3).tolist()}"),
-        ("arcs", f"{around:.0f} of 360 degrees around up, {low:.0f} to {high:.0f} above the plane across it"),
+        ("poses", f"{handed}; up is {up} within {tilt:.0f} degrees"),
+        (
+            "direction",
+            f"{_view_direction(capture)}; {distance.min():.4g} to {distance.max():.4g} from "
+            f"{np.round(middle, 3).tolist()}",
+        ),
+        ("arcs", f"{around:.0f} of 360 degrees around up, at elevations of {low:.0f} to {high:.0f} degrees"),
         (
             "overlap",
-            f"{len(shown)} places are recognised, each in {seen:.1f} of {1 + evidence.near.shape[1]} views; "
-            f"{100 * evidence.share:.0f} % fit the cameras within {cameras_module.consistency.NEAR:.0f} px",
+            f"{len(shown)} corners are matched, each in {seen:.1f} of {1 + evidence.near.shape[1]} views; "
+            f"{percent(evidence.fraction)} fit the cameras within {tracks.INLIER:.0f} px",
         ),
     ]
 
 
-def _depth_facts(evidence, found, followed, bounds, stated):
-    (near, far), text = np.median(bounds, axis=0), "from the data" if stated is None else f"by {stated}"
-    line = f"{near:.4g} to {far:.4g} ({text})"
-    if len(found):
-        depth = depths.view_depths(evidence, found, followed)
+def _range(bounds, stated, depth):
+    near, far = np.median(bounds, axis=0)
+    line = f"{near:.4g} to {far:.4g} ({f'from {stated}' if stated else 'computed from the cameras and points'})"
+    if len(depth):
         low, high = np.percentile(depth, [2, 98])
-        line += f"; {len(found)} places that the photographs agree on lie {low:.4g} to {high:.4g} away"
-    return [("near, far", line)]
+        line += f"; {len(depth)} points on which the images agree are at depths of {low:.4g} to {high:.4g}"
+    return line
 
 
 def _counted(counter):
     if len(counter) == 1:
         return next(iter(counter))
     return ", ".join(f"{count} of {name}" for name, count in counter.most_common())
+
+
+def _view_direction(capture):
+    """Returns how the cameras look: "inwards", "outwards", "forward" or "along a path"."""
+    poses = poses_of(capture)
+    if looks_forward(capture):
+        return "forward"
+    inwards = (((poses[:, :, 3] - gaze_center(poses)) * poses[:, :, 2]).sum(axis=1) > 0).mean()
+    return "inwards" if inwards > 0.9 else "outwards" if inwards < 0.1 else "along a path"
+
+
+def _mean_up(poses):
+    up = poses[:, :, 1].sum(axis=0)
+    return up / max(np.linalg.norm(up), 1e-12)
+
+
+def _up_axis(poses):
+    """Returns (the world axis nearest to the cameras' mean up, degrees between the two)."""
+    up = _mean_up(poses)
+    axis = int(np.abs(up).argmax())
+    angle = np.degrees(np.arccos(np.clip(abs(up[axis]), 0, 1)))
+    return f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}", float(angle)
+
+
+def _arcs(poses):
+    """Returns degrees: the arc of the cameras around the mean up, their lowest and their highest elevation.
+
+    The arc is the circle without its widest gap. All are seen from `gaze_center`.
+    """
+    up = _mean_up(poses)
+    away = poses[:, :, 3] - gaze_center(poses)
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    elevation = np.degrees(np.arcsin(np.clip(away @ up, -1, 1)))
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    angle = np.sort(np.degrees(np.arctan2(away @ np.cross(up, first), away @ first)))
+    gap = np.diff(np.append(angle, angle[0] + 360)).max()
+    return 360 - float(gap), float(elevation.min()), float(elevation.max())

@@ -7,27 +7,33 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core.safe_math import divide, norm, normalize
-from jaxnerf.core.types import Rays, check_shapes
+from jaxnerf.core.types import Camera, Rays, check_shapes
 
 
-def pixel_grid(height, width, *, offset=0.5):
-    """Returns [H, W, 2], the (x, y) of every pixel in px from the top left corner of the image.
+def pixel_grid(height: int, width: int, *, offset: float = 0.5) -> Float[Array, "H W 2"]:
+    """Computes the (x, y) of every pixel, in px from the top left corner of the image.
 
     Args:
         height, width: px.
-        offset: where in its square a pixel is looked through. 0.5 is its centre; 0 is what the
-            2020 code did.
+        offset: the point in the pixel's square that its ray passes through. 0.5 is the centre; the 2020 code
+            uses 0.
+
+    Returns:
+        [H, W, 2].
     """
     x, y = jnp.meshgrid(jnp.arange(width) + offset, jnp.arange(height) + offset, indexing="xy")
     return jnp.stack([x, y], axis=-1).astype(jnp.float32)
 
 
-def undistort(camera, pixels):
-    """Returns where the straight rays behind distorted pixels cross the plane at distance 1.
+def undistort(
+    camera: Camera, pixels: Num[ArrayLike, "*batch 2"]
+) -> tuple[Float[Array, "*batch 2"], Bool[Array, "*batch"]]:
+    """Computes where the rays through distorted pixels cross the plane at distance 1.
 
-    Newton's method on the lens model (Brown 1966; Kannala and Brandt 2006). The gradient with respect
+    Inverts the lens model (Brown 1966; Kannala and Brandt 2006) by Newton's method. The gradient with respect
     to pixels, focal, center and distortion is that of the exact inverse: one differentiable Newton
     step from the solution. It has no second derivative.
 
@@ -38,7 +44,7 @@ def undistort(camera, pixels):
 
     Returns:
         points [..., 2], x right and y down, focal length 1; and converged [...]. A pixel outside
-        the lens's image has no preimage: its point is 0 and its flag False.
+        the image of the lens has no preimage: its point is 0 and converged is False.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -64,8 +70,14 @@ def undistort(camera, pixels):
     return points.reshape(target.shape), converged.reshape(target.shape[:-1])
 
 
-def rays_from_pixels(camera, pixels, *, near, far):
-    """Returns the rays that a camera sees through pixels.
+def rays_from_pixels(
+    camera: Camera,
+    pixels: Num[ArrayLike, "*batch 2"],
+    *,
+    near: Num[ArrayLike, "*#batch"],
+    far: Num[ArrayLike, "*#batch"],
+) -> Rays:
+    """Computes the rays from a camera through pixels.
 
     Args:
         camera: one Camera (use jax.vmap for a stack).
@@ -74,7 +86,7 @@ def rays_from_pixels(camera, pixels, *, near, far):
 
     Returns:
         Rays [...]; directions reach the plane at distance 1 (not unit length), as in the released
-        codes. A pixel without a preimage gets near = far and looks along the axis.
+        codes. The ray of a pixel without a preimage has near = far and runs along the axis.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -85,7 +97,7 @@ def rays_from_pixels(camera, pixels, *, near, far):
     to_world = jnp.asarray(camera.to_world)
     lead = (1,) * (pixels.ndim - 1)
     local = jnp.stack([points[..., 0], -points[..., 1], -jnp.ones_like(points[..., 0])], axis=-1)
-    # Sums of products, as a matrix unit may round the camera to ten bits.
+    # Sums of products instead of a matmul, which may round the camera to ten bits.
     directions = (to_world[:, :3].reshape(*lead, 3, 3) * local[..., None, :]).sum(axis=-1)
     shape = pixels.shape[:-1]
     near, far = (jnp.broadcast_to(jnp.asarray(value, directions.dtype), shape) for value in (near, far))
@@ -98,8 +110,8 @@ def rays_from_pixels(camera, pixels, *, near, far):
     )
 
 
-def project(camera, x):
-    """Returns where a camera sees points of the world: what rays_from_pixels undoes.
+def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
+    """Projects points of the world into the image, the inverse of `rays_from_pixels`.
 
     Args:
         camera: one Camera (use jax.vmap for a stack).
@@ -107,8 +119,8 @@ def project(camera, x):
 
     Returns:
         pixels [..., 2] px, (x, y); and depth [...] in world units along the camera's axis, > 0 in front,
-        the t of rays_from_pixels. A point that no pixel sees, as it is not in front or past a fold of the
-        lens, gets pixels inf, with gradient 0: outside every image.
+        the t of rays_from_pixels. A point behind the camera or beyond a fold of the lens has pixels inf, with
+        gradient 0.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -118,7 +130,7 @@ def project(camera, x):
     to_world, lead = jnp.asarray(camera.to_world), (1,) * (x.ndim - 1)
     focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
     offset = x - to_world[:, 3].reshape(*lead, 3)
-    # Sums of products, as a matrix unit may round the camera to ten bits.
+    # Sums of products instead of a matmul, which may round the camera to ten bits.
     local = (to_world[:, :3].reshape(*lead, 3, 3) * offset[..., None]).sum(axis=-2)
     depth = -local[..., 2]
     seen = depth > 0
@@ -141,33 +153,33 @@ def project(camera, x):
     return jnp.where(seen[..., None], points * focal + center, jnp.inf), depth
 
 
-def ndc_rays(rays, camera, *, near_plane=1.0):
-    """Returns forward-facing rays in normalised device coordinates (Appendix C, Eqs. 25 and 26).
+def ndc_rays(rays: Rays, camera: Camera, *, near_plane: Num[ArrayLike, ""] = 1.0) -> Rays:
+    """Transforms forward-facing rays to normalised device coordinates (Appendix C, Eqs. 25 and 26).
 
-    The whole half space beyond the near plane z = -near_plane becomes a box, and t in [0, 1] runs
+    The half space beyond the near plane z = -near_plane becomes a box, and t in [0, 1] runs
     from that plane to infinity, linear in disparity.
 
     Args:
-        rays: Rays [...] in a world whose cameras look roughly along -z.
+        rays: Rays [...] in a world in which the cameras look roughly along -z.
         camera: the Camera, for its focal length and size.
         near_plane: distance in world units.
 
     Returns:
-        Rays [...] with near 0 and far 1; viewdirs untouched. A ray that does not go towards -z, or so
-        nearly across it that its place or slope overflows, never meets the box and gets near = far = 0.
+        Rays [...] with near 0 and far 1 and the same viewdirs. A ray that does not run towards -z, or is so
+        nearly perpendicular to it that its position or gradient overflows, misses the box: near = far = 0.
 
     Raises:
         ValueError: if the camera's size is unknown.
     """
     if camera.height is None or camera.width is None:
-        raise ValueError("ndc_rays: the camera has no height and width; NDC wants them, set both in px")
+        raise ValueError("ndc_rays: the camera has no height and width, expected both in px; NDC depends on them")
     focal = jnp.asarray(camera.focal)
     scale = 2 * focal / jnp.array([camera.width, camera.height], focal.dtype) / near_plane
     scale = scale.reshape(*(1,) * rays.near.ndim, 2)
     height = rays.origins[..., 2:]
 
     def lateral_and_slope(depth):
-        # Both from the given origin: going to the near plane first would subtract large terms.
+        # Both from the given origin: moving it to the near plane first would subtract large terms.
         slant = divide(rays.directions[..., :2], jnp.broadcast_to(depth[..., None], (*depth.shape, 2)))
         lateral = scale * (rays.origins[..., :2] - (near_plane + height) * slant)
         return jnp.concatenate([lateral, scale * (height * slant - rays.origins[..., :2])], axis=-1)
@@ -187,13 +199,15 @@ def ndc_rays(rays, camera, *, near_plane=1.0):
     )
 
 
-def ndc_to_t(t, rays, camera=None, *, near_plane=1.0):
-    """Returns the t of world rays at the same points as NDC t: the depth back.
+def ndc_to_t(
+    t: Num[ArrayLike, "*batch"], rays: Rays, camera: Camera | None = None, *, near_plane: Num[ArrayLike, ""] = 1.0
+) -> Float[Array, "*batch"]:
+    """Converts t of NDC rays, such as a depth, to t of the world rays at the same points.
 
     Args:
         t: [...] in [0, 1], t of ndc_rays(rays, camera).
         rays: the world Rays [...] that went into ndc_rays.
-        camera: not needed, as depth does not depend on it; taken so that both calls look alike.
+        camera: unused, as the result does not depend on it; accepted for symmetry with ndc_rays.
         near_plane: as in ndc_rays.
 
     Returns:
@@ -213,14 +227,14 @@ def _lens(function, camera):
     distortion = jnp.asarray(camera.distortion)
     if (camera.lens, distortion.size) not in (("opencv", 4), ("opencv", 5), ("fisheye", 4)):
         raise ValueError(
-            f"{function}: lens {camera.lens!r} with {distortion.size} coefficients, wanted 'opencv' with 4 "
+            f"{function}: lens {camera.lens!r} with {distortion.size} coefficients, expected 'opencv' with 4 "
             "or 5 (k1, k2, p1, p2[, k3]) or 'fisheye' with 4 (k1, k2, k3, k4); pad with zeros"
         )
     return _brown if camera.lens == "opencv" else _equidistant, distortion
 
 
 def _brown(distortion, point):
-    """The "opencv" lens: radial and tangential terms on the plane at distance 1 (Brown 1966)."""
+    """Applies the "opencv" lens: radial and tangential terms on the plane at distance 1 (Brown 1966)."""
     k1, k2, p1, p2 = distortion[:4]
     k3 = distortion[4] if distortion.size == 5 else 0.0
     x, y = point
@@ -235,14 +249,14 @@ def _brown(distortion, point):
 
 
 def _equidistant(distortion, point):
-    """The "fisheye" lens on points whose length is the angle from the axis (Kannala and Brandt 2006)."""
+    """Applies the "fisheye" lens to points whose length is the angle from the axis (Kannala and Brandt 2006)."""
     square = (point**2).sum()
     k1, k2, k3, k4 = distortion
     return point * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
 
 
 def _growing(distort, distortion, point):
-    """Returns whether the image grows from the axis to a point [2]: past a fold a pixel is met again."""
+    """Returns whether the image grows monotonically from the axis to a point [2]; a lens folds where it does not."""
     fractions = jnp.linspace(0, 1, 32, dtype=point.dtype)
     _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),)))(
         fractions
@@ -251,7 +265,7 @@ def _growing(distort, distortion, point):
 
 
 def _invert(distort, distortion, goal):
-    """Returns the point [2] with distort(point) = goal [2], and whether it is one on the lens's own side."""
+    """Returns the point [2] with distort(point) = goal [2], and whether it was found before a fold of the lens."""
 
     def newton(point, coefficients, goal):
         jacobian = jax.lax.stop_gradient(jax.jacfwd(distort, argnums=1)(distortion, point))
@@ -264,7 +278,7 @@ def _invert(distort, distortion, goal):
     start = jax.lax.stop_gradient(distortion)
 
     def follow(i, point):
-        # From the axis outwards: a step from the goal itself may begin past a fold of the lens.
+        # The goal moves outwards from the axis: a start at the goal itself may lie beyond a fold of the lens.
         return newton(point, start, fixed * jnp.minimum((i + 1) / 24, 1))[0]
 
     point = jax.lax.fori_loop(0, 32, follow, jnp.zeros_like(fixed))

@@ -1,22 +1,26 @@
-"""All of space in a box: plain in its inner half, drawn together outside (after arXiv:2111.12077, Eq. 10).
+"""Contraction of unbounded space into a cube (after arXiv:2111.12077, Eq. 10).
 
-The largest component takes the place of the length there, so that what comes out fills a cube.
+The largest component replaces the Euclidean length of that equation, so that the image is a cube.
 """
 
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.types import check_shapes
 
 
-def contract(x):
-    """Returns points of all space in the cube from -2 to 2, the cube from -1 to 1 unchanged.
+def contract(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Maps all of space into the cube [-2, 2]^3 and leaves the cube [-1, 1]^3 unchanged.
 
     Args:
-        x: [..., 3], in halves of the plain cube's side.
+        x: [..., 3], in units of half the side of the unchanged cube.
 
     Returns:
-        [..., 3]; m = max |x_i| > 1 becomes 2 - 1 / m, the direction stays. A component beyond 1e30 counts as
-        1e30, so that infinity goes to 2.
+        [..., 3]; x with m = max |x_i| > 1 is scaled to 2 - 1 / m and keeps its direction. Components beyond 1e30
+        count as 1e30, so that infinity maps to 2.
+
+    Raises:
+        ValueError: on other shapes.
     """
     check_shapes("contract", x=(x, "... 3"))
     x = jnp.clip(x, -1e30, 1e30)
@@ -26,8 +30,12 @@ def contract(x):
     return jnp.where(outside, x / safe * (2 - 1 / safe), x)
 
 
-def expand(y):
-    """Returns the points x [..., 3] with contract(x) = y [..., 3], whose components are less than 2."""
+def expand(y: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Inverts `contract`: returns x with contract(x) = y, for components |y_i| < 2.
+
+    Raises:
+        ValueError: on other shapes.
+    """
     check_shapes("expand", y=(y, "... 3"))
     largest = _largest(y)
     outside = largest > 1

@@ -5,19 +5,22 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.safe_math import at_least_float32
 
-# 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half a float32's
-# digits is exact. Six pieces hold |x| 2^k up to 1e6 * 2^15 to 2^-27 of a turn.
+# 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half the digits of a float32
+# is exact. Six pieces hold |x| 2^k up to 1e6 * 2^15 to 2^-27 of a turn.
 _TURNS = 0x28BE60DB9391054A7F
 _PIECES = [((_TURNS >> (60 - 12 * j)) & 0xFFF) * 2.0 ** (-12 * (j + 1)) for j in range(6)]
 _SIN = [(-1) ** n / math.factorial(2 * n + 1) for n in range(5)]
 _COS = [(-1) ** n / math.factorial(2 * n) for n in range(6)]
 
 
-def positional_encoding(x, *, num_freqs, include_input=True):
-    """Returns x with the sine and cosine of its octaves, the network's input.
+def positional_encoding(
+    x: Float[ArrayLike, "*batch D"], *, num_freqs: int, include_input: bool = True
+) -> Float[Array, "*batch features"]:
+    """Encodes positions or directions by sines and cosines at octaves of their frequency.
 
         gamma(x) = (x, sin x, cos x, ..., sin 2^(F-1) x, cos 2^(F-1) x)      (Eq. 4)
 
@@ -33,10 +36,10 @@ def positional_encoding(x, *, num_freqs, include_input=True):
     Returns:
         [..., D (1 + 2F)], or [..., D 2F] without the input, ordered as in Eq. 4, each entry D
         wide and at least float32. Infinite x gives NaN in its sines and cosines. The gradient of sin 2^k x is
-        2^k cos 2^k x, as exact.
+        2^k cos 2^k x, to the same accuracy.
 
     Raises:
-        ValueError: if F is negative, or nothing is left to return.
+        ValueError: on a scalar or integer x, if F is negative, or if there are no features.
     """
     x = jnp.asarray(x)
     if num_freqs < 0 or (num_freqs == 0 and not include_input):
@@ -45,7 +48,7 @@ def positional_encoding(x, *, num_freqs, include_input=True):
             "features; use num_freqs >= 1, or 0 with include_input=True"
         )
     if x.ndim == 0 or not jnp.issubdtype(x.dtype, jnp.floating):
-        raise ValueError(f"positional_encoding: x is {x.dtype}{list(x.shape)}, wanted floating [..., D]")
+        raise ValueError(f"positional_encoding: x is {x.dtype}{list(x.shape)}, expected floating [..., D]")
     (x,) = at_least_float32(x)
     planes = encode_planes(
         jnp.moveaxis(x, -1, 0).reshape(x.shape[-1], -1), num_freqs=num_freqs, include_input=include_input
@@ -53,10 +56,11 @@ def positional_encoding(x, *, num_freqs, include_input=True):
     return jnp.moveaxis(planes.reshape(-1, *x.shape[:-1]), 0, -1)
 
 
-def encode_planes(x, *, num_freqs, include_input=True):
-    """Returns the same encoding for x [D, N], as [D (1 + 2F), N]: a plane a feature.
+def encode_planes(x: Float[Array, "D N"], *, num_freqs: int, include_input: bool = True) -> Float[Array, "features N"]:
+    """Computes the same encoding for x [D, N] as [D (1 + 2F), N], one row per feature.
 
-    The layout that is computed in: long inner loops, and a matrix product takes it as it is.
+    This is the layout of the computation: the inner loops are long, and a matrix product takes it without a
+    transposition.
     """
     parts = [x] if include_input else []
     if num_freqs:
@@ -66,7 +70,7 @@ def encode_planes(x, *, num_freqs, include_input=True):
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _octaves(x, num_freqs):
-    """Returns [F, 2, N]: sine and cosine of 2^k x [N] for k < F."""
+    """Computes sine and cosine of 2^k x [N] for k < F: [F, 2, N]."""
     if x.dtype != jnp.float32:
         angles = _scales(num_freqs, x.dtype) * x[None]
         return jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1)
@@ -85,10 +89,10 @@ def _scales(num_freqs, dtype):
 
 
 def _next_octave(turns, _):
-    """Returns the turns doubled, and the [2, N] sine and cosine of the given ones.
+    """Returns the angle (in turns) doubled, and the sine and cosine [2, N] of the given angle.
 
-    Arithmetic alone, which runs in vector registers where a library call a value would not; and a
-    loop, as the compiler would otherwise reduce x anew for each octave.
+    Plain arithmetic is vectorised, library calls for sine and cosine are not. The octaves are a loop because the
+    compiler would otherwise reduce x again for each one.
     """
     high, low = turns
     quarters = 4 * high
@@ -106,7 +110,7 @@ def _next_octave(turns, _):
 
 
 def _fraction_of_turn(x):
-    """Returns x / (2 pi) less a whole number, as two floats (Payne and Hanek 1983, shortened)."""
+    """Returns x / (2 pi) minus an integer, as two floats (Payne and Hanek 1983, shortened)."""
     bits = jax.lax.bitcast_convert_type(x, jnp.uint32) & jnp.uint32(0xFFFFF000)
     leading = jax.lax.bitcast_convert_type(bits, jnp.float32)
     high, low = jnp.zeros_like(x), jnp.zeros_like(x)

@@ -1,33 +1,47 @@
-"""How close two images are: PSNR, SSIM, and the 8-bit rounding that makes figures comparable."""
+"""Image metrics: MSE, PSNR, SSIM, and the rounding to 8 bits that makes scores comparable."""
 
 import math
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core.safe_math import at_least_float32
 from jaxnerf.core.types import check_shapes
 
 
-def mse(a, b, *, mask=None):
-    """Returns the mean squared error [...] of images [..., H, W, C], over the pixels in mask [..., H, W].
+def mse(
+    a: Num[ArrayLike, "*batch H W C"],
+    b: Num[ArrayLike, "*batch H W C"],
+    *,
+    mask: Bool[ArrayLike, "*batch H W"] | None = None,
+) -> Float[Array, "*batch"]:
+    """Computes the mean squared error of images over pixels and channels.
 
-    NaN where the mask is empty. Raises ValueError if the shapes differ.
+    Args:
+        a, b: [..., H, W, C].
+        mask: [..., H, W] bool, the pixels that count; all when None.
+
+    Returns:
+        [...]; NaN where the mask is empty.
+
+    Raises:
+        ValueError: if the shapes differ.
     """
     a, b = at_least_float32(a, b)
     check_shapes("mse", a=(a, "... H W C"), b=(b, "... H W C"))
     if mask is None:
         return ((a - b) ** 2).mean(axis=(-3, -2, -1))
     check_shapes("mse", a=(a, "... H W C"), mask=(mask, "... H W"))
-    kept = jnp.where(mask[..., None], a - b, 0)  # before the square: its gradient must not see the rest
+    kept = jnp.where(mask[..., None], a - b, 0)  # before the square, so that excluded pixels get gradient 0
     return (kept**2).sum(axis=(-3, -2, -1)) / (mask.sum(axis=(-2, -1)) * a.shape[-1])
 
 
 @jax.custom_jvp
-def decibels(error):
-    """Returns -10 log10(error) for mean squared errors [...] of colours in [0, 1].
+def decibels(error: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
+    """Computes -10 log10(error) of mean squared errors of colours in [0, 1].
 
-    No error is inf dB; the gradient there is 0, as nothing is left to improve. NaN stays NaN.
+    An error of 0 gives inf, with gradient 0. NaN stays NaN.
     """
     return -10 / math.log(10) * jnp.log(error)
 
@@ -39,15 +53,20 @@ def _decibels_jvp(primals, tangents):
     return decibels(error), slope * tangent
 
 
-def psnr(a, b, *, mask=None):
-    """Returns the peak signal-to-noise ratio in dB of images with colours in [0, 1].
+def psnr(
+    a: Num[ArrayLike, "*batch H W C"],
+    b: Num[ArrayLike, "*batch H W C"],
+    *,
+    mask: Bool[ArrayLike, "*batch H W"] | None = None,
+) -> Float[Array, "*batch"]:
+    """Computes the peak signal-to-noise ratio in dB of images with colours in [0, 1].
 
     Args:
         a, b: [..., H, W, C].
         mask: [..., H, W] bool, the pixels that count; all when None.
 
     Returns:
-        [...] dB: inf for identical images, with gradient 0; NaN if a colour that counts is.
+        [...] dB: inf for identical images, with gradient 0; NaN if a colour that counts is NaN.
 
     Raises:
         ValueError: if the shapes differ.
@@ -55,11 +74,11 @@ def psnr(a, b, *, mask=None):
     return decibels(mse(a, b, mask=mask))
 
 
-def ssim(a, b):
-    """Returns the structural similarity of images with colours in [0, 1] (Wang et al. 2004).
+def ssim(a: Num[ArrayLike, "*batch H W C"], b: Num[ArrayLike, "*batch H W C"]) -> Float[Array, "*batch"]:
+    """Computes the structural similarity of images with colours in [0, 1] (Wang et al. 2004).
 
-    A Gaussian window of 11 pixels and deviation 1.5 wherever it fits, k1 = 0.01, k2 = 0.03, population
-    variances, the mean over windows and channels: the figure of the paper's tables and of dm_pix.
+    Uses a Gaussian window of 11 pixels with standard deviation 1.5 at every position where it fits, k1 = 0.01,
+    k2 = 0.03, population variances, and the mean over windows and channels, as the paper's tables and dm_pix do.
 
     Args:
         a, b: [..., H, W, C].
@@ -68,18 +87,18 @@ def ssim(a, b):
         [...] in [-1, 1], 1 for identical images.
 
     Raises:
-        ValueError: if the shapes differ, or a side is under 11 pixels.
+        ValueError: if the shapes differ, or a side is shorter than 11 pixels.
     """
     a, b = at_least_float32(a, b)
     check_shapes("ssim", a=(a, "... H W C"), b=(b, "... H W C"))
     size, deviation = 11, 1.5
     if min(a.shape[-3:-1]) < size:
-        raise ValueError(f"ssim: images are {a.shape[-3]} x {a.shape[-2]} px, wanted at least {size} x {size}")
-    bells = [math.exp(-(((i - size // 2) / deviation) ** 2) / 2) for i in range(size)]
-    window = [bell / sum(bells) for bell in bells]
+        raise ValueError(f"ssim: images are {a.shape[-3]} x {a.shape[-2]} px, expected at least {size} x {size}")
+    gaussian = [math.exp(-(((i - size // 2) / deviation) ** 2) / 2) for i in range(size)]
+    window = [value / sum(gaussian) for value in gaussian]
 
-    # Down, then across: the variance of a window is the mean of its lines' variances plus the variance
-    # of their means. Differences of squares would lose the digits that a white image needs.
+    # Vertical, then horizontal: the variance of a window is the mean of its lines' variances plus the variance
+    # of their means. E[x^2] - E[x]^2 would cancel in a white image.
     mean_a, mean_b = a, b
     variance_a, variance_b, covariance = (jnp.zeros_like(a) for _ in range(3))
     for axis in (a.ndim - 3, a.ndim - 2):
@@ -98,11 +117,18 @@ def ssim(a, b):
 
 
 def _windows(arrays, size, axis):
-    """Returns for each place in a window of that size the arrays shifted to it, along an axis."""
+    """Returns the arrays shifted to each offset within a window, along an axis."""
     valid = arrays[0].shape[axis] - size + 1
     return [[jax.lax.slice_in_dim(x, i, i + valid, axis=axis) for x in arrays] for i in range(size)]
 
 
-def round_to_8_bits(image):
-    """Returns colours [...] clipped to [0, 1] and rounded to the nearest of the 256 levels of a PNG."""
+def round_to_8_bits(image: Num[ArrayLike, "*shape"]) -> Float[Array, "*shape"]:
+    """Clips colours to [0, 1] and rounds them to the nearest of the 256 levels of a PNG.
+
+    Args:
+        image: [...] colours.
+
+    Returns:
+        [...] float.
+    """
     return jnp.round(jnp.clip(jnp.asarray(image), 0, 1) * 255) / 255

@@ -1,12 +1,13 @@
-"""Arithmetic that must hold in value and in slope, for all of the core."""
+"""Arithmetic whose values and gradients stay correct at 0, at infinity and at the limits of the float type."""
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Num
 
 
 @jax.custom_jvp
-def divide(a, b):
-    """Returns a / b for arrays of one shape; its slope holds no 1 / b^2, which overflows before a / b^2."""
+def divide(a: Float[ArrayLike, "*shape"], b: Float[ArrayLike, "*shape"]) -> Float[Array, "*shape"]:
+    """Computes a / b; the derivative avoids 1 / b^2, which overflows before a / b^2 does."""
     return a / b
 
 
@@ -16,20 +17,22 @@ def _divide_jvp(primals, tangents):
     return quotient, tangents[0] * inverse - (quotient * inverse) * tangents[1]
 
 
-def clamp(x, lower, upper):
-    """Returns x within lower and upper, else the nearer of them: a clip whose slope is whole at both."""
+def clamp(
+    x: Float[ArrayLike, "*#shape"], lower: Float[ArrayLike, "*#shape"], upper: Float[ArrayLike, "*#shape"]
+) -> Float[Array, "*#shape"]:
+    """Clips x to [lower, upper]; unlike jnp.clip, the gradient is not halved where x equals a bound."""
     return jnp.where(x < lower, lower, jnp.where(x > upper, upper, x))
 
 
-def at_least_float32(*arrays):
-    """Returns the arrays in the widest of their types and float32."""
+def at_least_float32(*arrays: Num[ArrayLike, "..."]) -> list[Float[Array, "..."]]:
+    """Converts arrays to their common type, which is at least float32."""
     arrays = [jnp.asarray(array) for array in arrays]
     dtype = jnp.result_type(jnp.float32, *(array.dtype for array in arrays))
     return [array.astype(dtype) for array in arrays]
 
 
-def norm(vectors):
-    """Returns the length [...] of vectors [..., D] without over- or underflow; 0, with gradient 0, for 0."""
+def norm(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch"]:
+    """Computes the length of vectors without over- or underflow; 0, with gradient 0, for a zero vector."""
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
     nonzero = largest != 0  # NaN stays NaN
     largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
@@ -37,8 +40,8 @@ def norm(vectors):
     return jnp.where(nonzero, largest * jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)[..., 0]
 
 
-def normalize(vectors):
-    """Returns vectors [..., D] at unit length; 0, with gradient 0, for a zero vector."""
+def normalize(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch D"]:
+    """Scales vectors to unit length; 0, with gradient 0, for a zero vector."""
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
     nonzero = largest != 0  # NaN stays NaN
     scaled = vectors / jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))

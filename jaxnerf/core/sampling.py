@@ -1,19 +1,23 @@
-"""Where to ask along a ray: edges of segments, points in them, and points where the weight is."""
+"""Samples along rays: edges of segments, points in the segments, and importance sampling."""
 
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Key, Num
 
 from jaxnerf.core.safe_math import at_least_float32, clamp, divide
-from jaxnerf.core.types import Samples, check_shapes
+from jaxnerf.core.types import Keys, Samples, check_shapes
 
 
-def uniform_edges(near, far, *, num_segments, in_disparity=False):
-    """Returns the edges of segments of equal length, in t or in 1 / t.
+def uniform_edges(
+    near: Num[ArrayLike, "*batch"], far: Num[ArrayLike, "*batch"], *, num_segments: int, in_disparity: bool = False
+) -> Float[Array, "*batch edges"]:
+    """Computes the edges of segments of equal length, in t or in 1 / t.
 
     Args:
-        near, far: [...] in t, near <= far. Where they are equal all edges are.
+        near, far: [...] in t, near <= far. If they are equal, all edges are.
         num_segments: S >= 1.
         in_disparity: equal steps in 1 / t instead: 1 / t = (1 - s) / near + s / far, which may
             reach far = inf and needs near > 0.
@@ -27,13 +31,13 @@ def uniform_edges(near, far, *, num_segments, in_disparity=False):
     near, far = jnp.asarray(near), jnp.asarray(far)
     check_shapes("uniform_edges", near=(near, "..."), far=(far, "..."))
     if num_segments < 1:
-        raise ValueError(f"uniform_edges: num_segments is {num_segments}, wanted at least 1")
+        raise ValueError(f"uniform_edges: num_segments is {num_segments}, expected at least 1")
     dtype = jnp.result_type(jnp.float32, near.dtype, far.dtype)
     near, far = near[..., None].astype(dtype), far[..., None].astype(dtype)
     s = (jnp.arange(1, num_segments, dtype=dtype) / num_segments).reshape((1,) * (near.ndim - 1) + (-1,))
     if in_disparity:
         if _is_known(~(near > 0).all()):
-            raise ValueError(f"uniform_edges: near has {near.min()}, disparity 1 / t wants near > 0; raise near")
+            raise ValueError(f"uniform_edges: near has {near.min()}, expected near > 0 for disparity 1 / t; raise near")
         inner = near / ((1 - s) + s * (near / far))
     else:
         inner = near + (far - near) * s
@@ -41,17 +45,25 @@ def uniform_edges(near, far, *, num_segments, in_disparity=False):
     return jnp.concatenate([near, inner, far], axis=-1)
 
 
-def stepped_edges(key, near, far, *, step_size, num_segments):
-    """Returns the edges of segments of one length, so that a ray has as many as it is long.
+def stepped_edges(
+    key: Keys | None,
+    near: Num[ArrayLike, "*batch"],
+    far: Num[ArrayLike, "*batch"],
+    *,
+    step_size: Num[ArrayLike, "*#batch"],
+    num_segments: int,
+) -> Float[Array, "*batch edges"]:
+    """Computes the edges of segments of fixed length, so that longer rays have more segments.
 
-    What the marching of arXiv:2201.05989 does with one draw a ray, in place of Eq. 2's one a segment.
+    This is the ray marching of arXiv:2201.05989 with one random offset per ray instead of one draw per segment
+    (Eq. 2).
 
     Args:
-        key: None, one key, or one key a ray [...]: moves all edges of a ray by one draw of up to a step,
-            which costs one number a ray. None moves none.
+        key: None, one key, or one key per ray [...]. A key shifts all edges of a ray towards near by the same
+            random fraction of a step.
         near, far: [...] in t, near <= far, both finite.
         step_size: [...] or a number, in t, > 0.
-        num_segments: S >= 1. Those past far are empty; where S steps do not reach far, the last is longer.
+        num_segments: S >= 1. Segments beyond far are empty; if S steps do not reach far, the last is longer.
 
     Returns:
         [..., S + 1] ascending edges; the first is near and the last is far, exactly.
@@ -62,31 +74,31 @@ def stepped_edges(key, near, far, *, step_size, num_segments):
     near, far = at_least_float32(jnp.asarray(near), jnp.asarray(far))
     check_shapes("stepped_edges", near=(near, "..."), far=(far, "..."))
     if num_segments < 1:
-        raise ValueError(f"stepped_edges: num_segments is {num_segments}, wanted at least 1")
-    moved = 0.0 if key is None else uniform(key, (*near.shape, 1))
+        raise ValueError(f"stepped_edges: num_segments is {num_segments}, expected at least 1")
+    shift = 0.0 if key is None else uniform(key, (*near.shape, 1))
     count = jnp.arange(1, num_segments, dtype=near.dtype).reshape((1,) * near.ndim + (-1,))
     step = jnp.broadcast_to(jnp.asarray(step_size, near.dtype), near.shape)
-    inner = near[..., None] + (count - moved) * step[..., None]
+    inner = near[..., None] + (count - shift) * step[..., None]
     inner = jnp.minimum(inner, far[..., None])
     return jnp.concatenate([near[..., None], inner, far[..., None]], axis=-1)
 
 
-def samples_from_edges(key, edges, *, rule="segments"):
-    """Returns the samples of each segment: one anywhere in it or in its middle, or two Gauss points.
+def samples_from_edges(key: Keys | None, edges: Num[ArrayLike, "*batch edges"], *, rule: str = "segments") -> Samples:
+    """Places samples in segments: one per segment, at its midpoint or at random, or two Gauss points.
 
     Args:
-        key: None for fixed samples, one key, or one key a ray [...].
-        edges: [..., S + 1] ascending, in t. The last may be inf: 1 / t then takes t's place in
-            that segment, whose middle is at twice its lower edge (which must be > 0).
-        rule: "segments": density and colour count as constant over the segment. A key draws t
-            evenly in it (Eq. 2); the midpoint makes the quadrature second order.
+        key: None for fixed samples, one key, or one key per ray [...].
+        edges: [..., S + 1] ascending, in t. The last may be inf: the segment is then sampled in 1 / t, and its
+            midpoint is at twice its lower edge (which must be > 0).
+        rule: "segments": density and colour are taken as constant over the segment. A key draws t
+            uniformly in it (Eq. 2); the midpoint makes the quadrature second order.
             "gauss": two samples in each segment, at (1 -+ 1 / sqrt(3)) / 2 of it, each for half of its
             length: fourth order where the scene is smooth. A key draws the edges instead, each
-            between the middles beside it; first and last stay.
+            between the adjacent midpoints; the first and last edge stay fixed.
 
     Returns:
         Samples [..., S], or [..., 2 S] for "gauss". A drawn t lies in [edge, next edge), exactly; a
-        zero-width segment has t on its edge and delta 0.
+        segment of width 0 has t on its edge and delta 0.
 
     Raises:
         ValueError: on fewer than two edges, other shapes of the key, or another rule.
@@ -94,23 +106,23 @@ def samples_from_edges(key, edges, *, rule="segments"):
     (edges,) = at_least_float32(edges)
     _check_edges("samples_from_edges", edges)
     if rule == "gauss":
-        return _gauss_samples(edges if key is None else _moved_edges(key, edges))
+        return _gauss_samples(edges if key is None else _jittered_edges(key, edges))
     if rule != "segments":
-        raise ValueError(f"samples_from_edges: rule is {rule!r}, wanted 'segments' or 'gauss'")
+        raise ValueError(f"samples_from_edges: rule is {rule!r}, expected 'segments' or 'gauss'")
     lower, upper = edges[..., :-1], edges[..., 1:]
-    return Samples(t=_between(key, lower, upper), delta=_width(lower, upper), rule=rule)
+    return Samples(t=_draw_between(key, lower, upper), delta=_width(lower, upper), rule=rule)
 
 
-def samples_from_points(t, *, last_delta=1e10):
-    """Returns samples that stand for the gap to the next one: the released codes' quadrature.
+def samples_from_points(t: Num[ArrayLike, "*batch samples"], *, last_delta: Num[ArrayLike, ""] = 1e10) -> Samples:
+    """Makes samples that stand for the gap to the next one: the released codes' quadrature.
 
-    delta_i = t_{i+1} - t_i, as below Eq. 3. The last sample stands for last_delta, which closes
-    every ray that ends in matter. Segments are the better rule: this one is of first order, and
+    delta_i = t_{i+1} - t_i, as below Eq. 3. The last sample stands for last_delta, which makes every ray opaque
+    that ends in matter. The rule "segments" is more accurate: this one is of first order, and
     with the default it does not converge where the far end lies inside matter.
 
     Args:
         t: [..., S] ascending, S >= 1.
-        last_delta: in t; the 2020 code has 1e10.
+        last_delta: in t; the 2020 code uses 1e10.
 
     Returns:
         Samples [..., S].
@@ -124,16 +136,20 @@ def samples_from_points(t, *, last_delta=1e10):
     return Samples(t=t, delta=jnp.concatenate([jnp.diff(t), last], axis=-1), rule="points")
 
 
-def inverse_cdf(edges, weights, u):
-    """Returns where the distribution that is constant between edges reaches the shares u.
+def inverse_cdf(
+    edges: Num[ArrayLike, "*batch edges"],
+    weights: Num[ArrayLike, "*batch segments"],
+    u: Num[ArrayLike, "*batch points"],
+) -> Float[Array, "*batch points"]:
+    """Inverts the cumulative distribution of a piecewise-constant density (Section 5.2).
 
-    The weights, over their sum, are the probabilities of the segments (the piecewise-constant
-    PDF of Section 5.2). Each u is looked up in their running sum and interpolated linearly.
+    The weights, divided by their sum, are the probabilities of the segments. The inverse interpolates linearly
+    between the values of their cumulative sum.
 
     Args:
         edges: [..., S + 1] ascending, in t.
-        weights: [..., S] >= 0, of any scale. Where all are 0 (or below 1.2e-38, the smallest
-            normal float) every segment counts the same.
+        weights: [..., S] >= 0, of any scale. If all are 0 (or below 1.2e-38, the smallest
+            normal float), all segments have the same probability.
         u: [..., N] in [0, 1].
 
     Returns:
@@ -148,14 +164,14 @@ def inverse_cdf(edges, weights, u):
     check_shapes("inverse_cdf", edges=(edges, "... E"), weights=(weights, "... S"), u=(u, "... N"))
     if edges.shape[-1] != weights.shape[-1] + 1:
         raise ValueError(
-            f"inverse_cdf: weights has shape {weights.shape}, wanted [..., {edges.shape[-1] - 1}] for edges "
-            f"{edges.shape}: one weight a segment"
+            f"inverse_cdf: weights has shape {weights.shape}, expected [..., {edges.shape[-1] - 1}] for edges "
+            f"{edges.shape}: one weight per segment"
         )
-    # Scaling by the largest first keeps the running sum clear of under- and overflow.
+    # Divided by the largest first, so that the cumulative sum neither under- nor overflows.
     largest = weights.max(axis=-1, keepdims=True)
     empty = largest < jnp.finfo(weights.dtype).tiny
-    shares = jnp.where(empty, 1.0, weights / jnp.where(empty, 1.0, largest))
-    sums = jax.lax.cummax(jnp.cumsum(shares, axis=-1), axis=shares.ndim - 1)  # a parallel sum can fall
+    scaled = jnp.where(empty, 1.0, weights / jnp.where(empty, 1.0, largest))
+    sums = jax.lax.cummax(jnp.cumsum(scaled, axis=-1), axis=scaled.ndim - 1)  # a parallel sum can decrease
     cdf = jnp.concatenate([jnp.zeros_like(sums[..., :1]), sums], axis=-1)
     target = u * cdf[..., -1:]
     # The segment is the last one that begins at or before the target and has weight.
@@ -163,23 +179,30 @@ def inverse_cdf(edges, weights, u):
     lower_sum, upper_sum = _take(cdf, index), _take(cdf, index + 1)
     lower, upper = _take(edges, index), _take(edges, index + 1)
     width = upper_sum - lower_sum
-    share = jnp.where(width > 0, divide(target - lower_sum, jnp.where(width > 0, width, 1)), 0)
-    return clamp(_part_way(lower, upper, share), lower, upper)
+    fraction = jnp.where(width > 0, divide(target - lower_sum, jnp.where(width > 0, width, 1)), 0)
+    return clamp(_interpolate(lower, upper, fraction), lower, upper)
 
 
-def importance_points(key, edges, weights, *, num_points, padding=0.0):
-    """Returns points that lie dense where the weight is (Section 5.2).
+def importance_points(
+    key: Keys | None,
+    edges: Num[ArrayLike, "*batch edges"],
+    weights: Num[ArrayLike, "*batch segments"],
+    *,
+    num_points: int,
+    padding: float = 0.0,
+) -> Float[Array, "*batch points"]:
+    """Draws points with a density proportional to the weights (Section 5.2).
 
-    Stratified: one uniform draw in each of N equal shares of the weight, which keeps the
-    points in order without a sort.
+    The draws are stratified: one uniform draw in each of N equal parts of the total weight. The points are
+    therefore in order without a sort.
 
     Args:
-        key: None for the middle of each share, one key, or one key a ray [...].
+        key: None for the middle of each part, one key, or one key per ray [...].
         edges: [..., S + 1] ascending, in t.
-        weights: [..., S] >= 0. Where all are 0 the points spread evenly over the segments.
+        weights: [..., S] >= 0. If all are 0, the points are spread evenly over the segments.
         num_points: N >= 1.
         padding: added to every weight. The released codes use 1e-5 against division by zero, which
-            pulls samples into empty space wherever a ray is nearly empty; here it is for parity.
+            moves samples into empty space on nearly empty rays; it is offered here for parity.
 
     Returns:
         [..., N] ascending points in t, within the edges. No gradient flows through them.
@@ -189,24 +212,26 @@ def importance_points(key, edges, weights, *, num_points, padding=0.0):
     """
     edges, weights = jax.lax.stop_gradient(at_least_float32(edges, weights))
     if num_points < 1:
-        raise ValueError(f"importance_points: num_points is {num_points}, wanted at least 1")
+        raise ValueError(f"importance_points: num_points is {num_points}, expected at least 1")
     shape = (*weights.shape[:-1], num_points)
-    shares = jnp.broadcast_to(
+    strata = jnp.broadcast_to(
         jnp.arange(num_points + 1, dtype=weights.dtype) / num_points, (*shape[:-1], num_points + 1)
     )
-    u = _between(key, shares[..., :-1], shares[..., 1:])
+    u = _draw_between(key, strata[..., :-1], strata[..., 1:])
     return inverse_cdf(edges, weights + padding if padding else weights, u)
 
 
-def merge_edges(edges, points):
-    """Returns the edges of the segments that the points cut the old segments into.
+def merge_edges(
+    edges: Num[ArrayLike, "*batch edges"], points: Num[ArrayLike, "*batch points"]
+) -> Float[Array, "*batch merged"]:
+    """Splits segments at points and returns the new edges.
 
     Args:
         edges: [..., S + 1] in t.
         points: [..., N] in t, anywhere.
 
     Returns:
-        [..., S + N + 1] ascending; a repeated edge makes a segment of width 0, which counts for nothing.
+        [..., S + N + 1] ascending; a repeated edge makes a segment of width 0, which has no weight.
 
     Raises:
         ValueError: if the leading axes differ.
@@ -216,11 +241,18 @@ def merge_edges(edges, points):
     return jnp.sort(jnp.concatenate([edges, points], axis=-1), axis=-1)
 
 
-def stratified_points(key, near, far, *, num_points, in_disparity=False):
-    """Returns the 2020 code's coarse points: near to far inclusive, each moved within its half gaps.
+def stratified_points(
+    key: Keys | None,
+    near: Num[ArrayLike, "*batch"],
+    far: Num[ArrayLike, "*batch"],
+    *,
+    num_points: int,
+    in_disparity: bool = False,
+) -> Float[Array, "*batch points"]:
+    """Draws the 2020 code's coarse points: near to far inclusive, each between its adjacent midpoints.
 
     Args:
-        key: None for the points themselves, one key, or one key a ray [...].
+        key: None for evenly spaced points, one key, or one key per ray [...].
         near, far: [...] in t.
         num_points: S >= 2.
         in_disparity: equal steps in 1 / t.
@@ -232,25 +264,25 @@ def stratified_points(key, near, far, *, num_points, in_disparity=False):
         ValueError: as uniform_edges.
     """
     if num_points < 2:
-        raise ValueError(f"stratified_points: num_points is {num_points}, wanted at least 2")
+        raise ValueError(f"stratified_points: num_points is {num_points}, expected at least 2")
     if _is_known(jnp.isinf(jnp.asarray(far)).any()):
-        raise ValueError("stratified_points: far is inf, where the last point would lie; give a finite far")
+        raise ValueError("stratified_points: far is inf, expected a finite far, where the last point lies")
     points = uniform_edges(near, far, num_segments=num_points - 1, in_disparity=in_disparity)
     if key is None:
         return points
     middles = midpoints(points)
     lower = jnp.concatenate([points[..., :1], middles], axis=-1)
     upper = jnp.concatenate([middles, points[..., -1:]], axis=-1)
-    return _between(key, lower, upper)
+    return _draw_between(key, lower, upper)
 
 
-def midpoints(edges):
-    """Returns [..., S], the middle of each of the segments between edges [..., S + 1]."""
-    return _part_way(edges[..., :-1], edges[..., 1:], 0.5)
+def midpoints(edges: Float[ArrayLike, "*batch edges"]) -> Float[Array, "*batch segments"]:
+    """Computes the midpoints [..., S] of the segments between edges [..., S + 1]."""
+    return _interpolate(edges[..., :-1], edges[..., 1:], 0.5)
 
 
-def split_key(key, num):
-    """Returns num independent keys (or Nones) for a key that is None, one key, or one a ray."""
+def split_key(key: Keys | None, num: int) -> tuple[Key[Array, "..."] | None, ...]:
+    """Splits a key, or one key per ray, into num independent ones; None gives as many None."""
     if key is None:
         return (None,) * num
     key = _typed(key)
@@ -258,13 +290,13 @@ def split_key(key, num):
     return tuple(keys[..., i] for i in range(num))
 
 
-def uniform(key, shape):
-    """Returns [*shape] draws in [0, 1) from one key, or from one key a ray (key [*shape[:-1]])."""
+def uniform(key: Keys, shape: Sequence[int]) -> Float[Array, "..."]:
+    """Draws [*shape] uniform numbers in [0, 1) from one key, or from one key per ray (key [*shape[:-1]])."""
     return _draw(jax.random.uniform, key, shape)
 
 
-def normal(key, shape):
-    """Returns [*shape] standard normal draws from one key, or from one key a ray (key [*shape[:-1]])."""
+def normal(key: Keys, shape: Sequence[int]) -> Float[Array, "..."]:
+    """Draws [*shape] standard normal numbers from one key, or from one key per ray (key [*shape[:-1]])."""
     return _draw(jax.random.normal, key, shape)
 
 
@@ -273,7 +305,7 @@ def _draw(distribution, key, shape):
     if key.ndim == 0:
         return distribution(key, shape)
     if key.shape != tuple(shape[:-1]):
-        raise ValueError(f"key has shape {key.shape}, wanted one key, or one a ray: {tuple(shape[:-1])}")
+        raise ValueError(f"key has shape {key.shape}, expected one key, or one per ray: {tuple(shape[:-1])}")
     return _per_ray(lambda k: distribution(k, shape[-1:]), key)
 
 
@@ -288,26 +320,26 @@ def _per_ray(function, keys):
 
 def _gauss_samples(edges):
     lower, upper = edges[..., :-1], edges[..., 1:]
-    shares = [0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12)]
-    t = jnp.stack([clamp(_part_way(lower, upper, share), lower, upper) for share in shares], axis=-1)
+    nodes = [0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12)]
+    t = jnp.stack([clamp(_interpolate(lower, upper, node), lower, upper) for node in nodes], axis=-1)
     half = 0.5 * _width(lower, upper)
     delta = jnp.stack([half, half], axis=-1)
     flat = (*lower.shape[:-1], 2 * lower.shape[-1])
     return Samples(t=t.reshape(flat), delta=delta.reshape(flat), rule="gauss")
 
 
-def _moved_edges(key, edges):
+def _jittered_edges(key, edges):
     middles = midpoints(edges)
-    inner = _between(key, middles[..., :-1], middles[..., 1:])
+    inner = _draw_between(key, middles[..., :-1], middles[..., 1:])
     return jnp.concatenate([edges[..., :1], inner, edges[..., -1:]], axis=-1)
 
 
-def _between(key, lower, upper):
-    """A draw in [lower, upper) or the middle, never past either end by rounding."""
+def _draw_between(key, lower, upper):
+    """Draws in [lower, upper), or returns the middle; rounding never leaves the interval."""
     if key is None:
-        return clamp(_part_way(lower, upper, 0.5), lower, upper)
-    draw = _part_way(lower, upper, uniform(key, lower.shape).astype(lower.dtype))
-    # Edges are rounded themselves: a draw this close to one may lie in the next of the exact bins.
+        return clamp(_interpolate(lower, upper, 0.5), lower, upper)
+    draw = _interpolate(lower, upper, uniform(key, lower.shape).astype(lower.dtype))
+    # The edges are rounded: a draw this close to one may lie in the neighbouring exact bin.
     finite_upper = jnp.where(jnp.isinf(upper), lower, upper)
     rounding = 2 * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(finite_upper))
     margin = jnp.minimum(rounding, 0.25 * (finite_upper - lower))
@@ -315,11 +347,11 @@ def _between(key, lower, upper):
     return clamp(draw, lower + margin, jnp.minimum(upper - margin, below))
 
 
-def _part_way(lower, upper, share):
-    """Returns the place at a share of the way, in t, or in 1 / t where the way has no end."""
-    endless = jnp.isinf(upper)
-    beyond = lower / (1 - jnp.where(endless, share, 0))
-    return jnp.where(endless, beyond, lower + share * (jnp.where(endless, lower, upper) - lower))
+def _interpolate(lower, upper, fraction):
+    """Interpolates linearly in t, or in 1 / t where upper is inf."""
+    infinite = jnp.isinf(upper)
+    reciprocal = lower / (1 - jnp.where(infinite, fraction, 0))
+    return jnp.where(infinite, reciprocal, lower + fraction * (jnp.where(infinite, lower, upper) - lower))
 
 
 def _width(lower, upper):
@@ -327,7 +359,7 @@ def _width(lower, upper):
 
 
 def _count_below(sums, target):
-    """Returns how many running sums [..., S] are at most target [..., N], but never past the last weight."""
+    """Counts the cumulative sums [..., S] that are at most target [..., N], up to the last positive weight."""
 
     def row(sums, target):
         found = jnp.searchsorted(sums, target, side="right", method="compare_all")
@@ -342,11 +374,11 @@ def _take(values, index):
 
 
 def _is_known(condition):
-    """Returns whether a condition holds already while the program is traced."""
+    """Returns whether a condition is known to hold at trace time."""
     return not isinstance(condition, jax.core.Tracer) and bool(condition)
 
 
 def _check_edges(function, edges):
     check_shapes(function, edges=(edges, "... E"))
     if edges.shape[-1] < 2:
-        raise ValueError(f"{function}: edges has shape {edges.shape}, wanted [..., S + 1] with S >= 1")
+        raise ValueError(f"{function}: edges has shape {edges.shape}, expected [..., S + 1] with S >= 1")

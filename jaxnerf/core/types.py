@@ -1,128 +1,218 @@
-"""The data types every floor shares, and the shape checks of every public function."""
+"""Data types of the whole package, and the shape check of the public functions."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, Num, UInt, UInt32
+
+_T = TypeVar("_T")
 
 
-def pytree(*, static=()):
-    """Returns a decorator: a frozen, keyword-only dataclass that JAX can trace through."""
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def pytree(*, static: Iterable[str] = ()) -> Callable[[type[_T]], type[_T]]:
+    """Makes a decorator that turns a class into a frozen, keyword-only dataclass and a JAX pytree.
+
+    JAX rebuilds pytrees with None, PartitionSpecs or ShapeDtypeStructs in their fields, so the constructor checks
+    nothing: the annotations of the fields describe what functions take and return.
+
+    Args:
+        static: names of fields that are part of the tree's structure, not arrays.
+    """
+    static = list(static)
 
     def decorate(cls):
         cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
         names = [field.name for field in dataclasses.fields(cls)]
         data = [name for name in names if name not in static]
-        return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=list(static))
+        return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static)
 
     return decorate
 
 
 # (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S] in 1 / world unit, rgb [..., S, 3]).
-SceneFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+SceneFn: TypeAlias = Callable[
+    [Float[Array, "*batch samples 3"], Float[Array, "*batch #samples 3"]],
+    tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]],
+]
+
+# One key or an array of keys, typed or raw; functions say whether they take one key per ray.
+Keys: TypeAlias = Key[Array, "..."] | UInt32[ArrayLike, "... 2"]
+
+Vector: TypeAlias = Num[ArrayLike, "3"] | Sequence[float]
+
+# One colour, or one per ray.
+Background: TypeAlias = Num[ArrayLike, "*#batch 3"] | Sequence[float]
 
 
 @pytree()
 class Rays:
-    """Half lines x(t) = origins + t * directions, looked along from t = near to t = far."""
+    """Rays x(t) = origins + t * directions between t = near and t = far.
 
-    origins: jax.Array  # [..., 3] world units
-    directions: jax.Array  # [..., 3] world units per t, any length > 0
-    viewdirs: jax.Array  # [..., 3] unit length, what a field sees as the direction
-    near: jax.Array  # [...] in t
-    far: jax.Array  # [...] in t; equal to near: the ray sees only the background
+    Attributes:
+        origins: [..., 3] world units.
+        directions: [..., 3] world units per t, of any length > 0.
+        viewdirs: [..., 3] unit length, the direction that a field receives.
+        near: [...] in t.
+        far: [...] in t. A ray whose far equals its near shows only the background.
+    """
+
+    origins: Float[Array, "*batch 3"]
+    directions: Float[Array, "*batch 3"]
+    viewdirs: Float[Array, "*batch 3"]
+    near: Float[Array, "*batch"]
+    far: Float[Array, "*batch"]
 
 
 @pytree(static=("rule",))
 class Samples:
-    """Where a scene is asked along each ray, and how the answers are summed."""
+    """Positions along each ray at which a scene is evaluated, and the quadrature that sums the values.
 
-    t: jax.Array  # [..., S] where the scene is asked, near to far
-    delta: jax.Array  # [..., S] the length in t that each answer stands for, 0 = ignore
-    rule: str = "segments"  # the quadrature: "segments", "gauss" (two a cell) or "points"
+    Attributes:
+        t: [..., S] in t, near to far.
+        delta: [..., S] length in t that each sample stands for; samples of length 0 are ignored.
+        rule: the quadrature: "segments", "gauss" (two samples per segment) or "points".
+    """
+
+    t: Float[Array, "*batch samples"]
+    delta: Float[Array, "*batch samples"]
+    rule: str = "segments"
 
 
-@pytree()
+@pytree(static=("rule",))
 class PackedSamples:
-    """The evaluated samples of many rays in one buffer of fixed size, ray after ray, near to far."""
+    """The evaluated samples of many rays in one buffer of fixed size, ray after ray, near to far.
 
-    weights: jax.Array  # [K] compositing weights, 0 in unused slots
-    t: jax.Array  # [K] in t of the sample's ray
-    delta: jax.Array  # [K] length in t
-    ray_index: jax.Array  # [K] int32, ascending
-    used: jax.Array  # [K] bool, False for unused slots, which come last
+    Attributes:
+        weights: [K] compositing weights, 0 in unused slots.
+        t: [K] in t of the sample's ray.
+        delta: [K] length in t.
+        ray_index: [K] index of the sample's ray, ascending.
+        used: [K] False for unused slots, which come last.
+        rule: the quadrature, see Samples.
+    """
+
+    weights: Float[Array, " K"]
+    t: Float[Array, " K"]
+    delta: Float[Array, " K"]
+    ray_index: Int[Array, " K"]
+    used: Bool[Array, " K"]
+    rule: str = "segments"
 
 
 @pytree()
 class Rendering:
-    """The result of rendering rays."""
+    """The result of rendering rays.
 
-    rgb: jax.Array  # [..., 3] in [0, 1] where the scene's colours and the background are
-    opacity: jax.Array  # [...] in [0, 1], the share of light from behind that is stopped
-    depth: jax.Array  # [...] in t, the expected stopping place; what passes through counts at far
-    disparity: jax.Array  # [...] in 1 / t, 0 for an empty ray
-    weights: jax.Array | None  # [..., S] compositing weight of each sample
-    num_dropped: jax.Array  # [...] int32, samples that did not fit into the buffer: 0 unless packed
-    samples: Samples | PackedSamples | None = None  # what was evaluated, for losses; None where it was dropped
+    Attributes:
+        rgb: [..., 3] in [0, 1] if the scene's colours and the background are.
+        opacity: [...] in [0, 1], 1 - transmittance of the whole ray.
+        depth: [...] in t, the expected depth; the transmitted fraction counts at far.
+        disparity: [...] in 1 / t, the expected inverse depth; 0 for an empty ray.
+        weights: [..., S] compositing weight of each sample; None where dropped.
+        num_dropped: [...] number of samples that did not fit into the packed buffer; 0 unless packed.
+        samples: the evaluated samples, for losses; None where dropped.
+    """
+
+    rgb: Float[Array, "*batch 3"]
+    opacity: Float[Array, "*batch"]
+    depth: Float[Array, "*batch"]
+    disparity: Float[Array, "*batch"]
+    weights: Float[Array, "*batch samples"] | None
+    num_dropped: Int[Array, "*batch"]
+    samples: Samples | PackedSamples | None = None
 
 
-def without_samples(rendering):
-    """Returns the Rendering without weights and samples, which are most of its bytes and no image needs."""
+def without_samples(rendering: Rendering) -> Rendering:
+    """Drops the weights and samples of a Rendering: most of its bytes, which no image needs."""
     return dataclasses.replace(rendering, weights=None, samples=None)
 
 
 @pytree(static=("lens", "height", "width"))
 class Camera:
-    """A pinhole, or a lens in front of one. Camera axes: x right, y up, looking along -z.
+    """A pinhole camera, or one with a lens. Camera axes: x right, y up, looking along -z.
 
     A stack of cameras has leading axes on every array; its height and width are None where the
     sizes differ.
+
+    Attributes:
+        to_world: [3, 4] rotation and position, camera to world, position in world units.
+        focal: [2] px, (x, y).
+        center: [2] px, (x, y) from the image's top left corner.
+        distortion: [K] coefficients of the lens, see `undistort`; None for a pinhole.
+        lens: "pinhole", "opencv" or "fisheye".
+        height: px.
+        width: px.
     """
 
-    to_world: jax.Array  # [3, 4] rotation and position, camera -> world
-    focal: jax.Array  # [2] px, (x, y)
-    center: jax.Array  # [2] px, (x, y) from the image's top left corner
-    distortion: jax.Array | None = None  # [K] coefficients of the lens, see cameras.undistort
-    lens: str = "pinhole"  # "pinhole", "opencv" or "fisheye"
-    height: int | None = None  # px
-    width: int | None = None  # px
+    to_world: Float[Array, "*views 3 4"]
+    focal: Float[Array, "*views 2"]
+    center: Float[Array, "*views 2"]
+    distortion: Float[Array, "*views K"] | None = None
+    lens: str = "pinhole"
+    height: int | None = None
+    width: int | None = None
 
 
 @pytree(static=("names", "background"))
 class Views:
-    """Posed photographs, all their pixels in one array."""
+    """Images with their cameras; the pixels of all images are in one array.
 
-    pixels: jax.Array  # [P, C] uint8 or uint16; C = 4: straight alpha last, 3: opaque
-    offset: jax.Array  # [V] int32, where each view's pixels begin
-    size: jax.Array  # [V, 2] int32 (height, width) px
-    cameras: Camera  # stacked, [V, ...]
-    near: jax.Array  # [V] in t
-    far: jax.Array  # [V] in t
-    mask: jax.Array | None = None  # [P] bool, False = belongs to no batch and no score
-    names: tuple[str, ...] = ()  # V file names without folder and extension
-    background: tuple[float, float, float] | None = None  # what alpha is composited over
-    box: jax.Array | None = None  # [2, 3] world units, lower and upper, outside which the file has nothing
-    to_file: jax.Array | None = None  # [4, 4] this world -> the capture file's; None: the same
+    Attributes:
+        pixels: [P, C] uint8 or uint16, row by row; the fourth channel, if any, is straight alpha.
+        offset: [V] index of each view's first pixel.
+        size: [V, 2] px, (height, width).
+        cameras: stacked, [V, ...].
+        near: [V] in t.
+        far: [V] in t.
+        mask: [P] False for pixels that are excluded from batches and scores; None where all count.
+        names: V file names without folder and extension.
+        background: the colour that alpha is composited over; None for images without alpha.
+        box: [2, 3] lower and upper corner in world units; the dataset declares the outside empty.
+        to_file: [4, 4] maps this world to that of the dataset's files; None where they are the same.
+    """
+
+    pixels: UInt[Array, "P C"]
+    offset: Int[Array, " V"]
+    size: Int[Array, "V 2"]
+    cameras: Camera
+    near: Float[Array, " V"]
+    far: Float[Array, " V"]
+    mask: Bool[Array, " P"] | None = None
+    names: tuple[str, ...] = ()
+    background: tuple[float, float, float] | None = None
+    box: Float[Array, "2 3"] | None = None
+    to_file: Float[Array, "4 4"] | None = None
 
 
 @pytree()
 class Batch:
-    """The rays of one training step and what they should show.
+    """The rays of one training step and the colours they should have.
 
     The optional fields are None unless a loss needs them.
+
+    Attributes:
+        rays: Rays [B].
+        rgb: [B, 3] in [0, 1].
+        image_index: [B] index of the view.
+        pixel: [B, 2] px, (x, y) from the image's top left corner.
+        alpha: [B] in [0, 1]; 1 where the image has no alpha.
+        depth: [B] in t.
+        depth_weight: [B] confidence of the depth, 0 where it is unknown.
     """
 
-    rays: Rays  # [B]
-    rgb: jax.Array  # [B, 3] in [0, 1]
-    image_index: jax.Array | None = None  # [B] int32
-    pixel: jax.Array | None = None  # [B, 2] px, (x, y) from the image's top left corner
-    alpha: jax.Array | None = None  # [B] in [0, 1]; 1 where the image has no alpha
-    depth: jax.Array | None = None  # [B] in t
-    depth_weight: jax.Array | None = None  # [B] confidence of the depth, 0 where it is not known
+    rays: Rays
+    rgb: Float[Array, "B 3"]
+    image_index: Int[Array, " B"] | None = None
+    pixel: Float[Array, "B 2"] | None = None
+    alpha: Float[Array, " B"] | None = None
+    depth: Float[Array, " B"] | None = None
+    depth_weight: Float[Array, " B"] | None = None
 
 
-def check_shapes(function, **arrays):
+def check_shapes(function: str, **arrays: tuple[object, str]) -> None:
     """Raises a ValueError unless the shapes fit their patterns.
 
     Args:
@@ -132,9 +222,9 @@ def check_shapes(function, **arrays):
             leading axes throughout a call.
 
     Raises:
-        ValueError: at trace time; names the array, its shape and the shape it had to have.
+        ValueError: at trace time; names the array, its shape and the expected shape.
     """
-    known = {}
+    known: dict[str, object] = {}
     for name, (array, pattern) in arrays.items():
         shape, axes = jnp.shape(array), pattern.split()
         tail = [axis for axis in axes if axis != "..."]
@@ -143,14 +233,14 @@ def check_shapes(function, **arrays):
         fits = len(shape) >= len(tail) if "..." in axes else len(shape) == len(tail)
         fits = fits and ("..." not in axes or known.setdefault("...", leading) == leading)
         for axis, length in found:
-            wanted = int(axis) if axis.isdigit() else known.setdefault(axis, length)
-            fits = fits and length == wanted
+            expected = int(axis) if axis.isdigit() else known.setdefault(axis, length)
+            fits = fits and length == expected
         if not fits:
-            wanted = ", ".join(
+            others = ", ".join(
                 f"{other} {tuple(jnp.shape(value))}" for other, (value, _) in arrays.items() if other != name
             )
             raise ValueError(
-                f"{function}: {name} has shape {tuple(shape)}, wanted [{', '.join(axes)}]"
-                + (f" beside {wanted}" if wanted else "")
-                + "; nothing is broadcast here, so expand it first"
+                f"{function}: {name} has shape {tuple(shape)}, expected [{', '.join(axes)}]"
+                + (f" beside {others}" if others else "")
+                + "; these arrays are not broadcast, so expand it first"
             )

@@ -1,42 +1,44 @@
-"""From densities to what a ray sees: weights, colour, depth (Eq. 3 and its sums)."""
+"""Volume rendering integrals of a ray: weights, transmittance, colour and depth (Eq. 3)."""
 
 import functools
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core.safe_math import at_least_float32, divide
 from jaxnerf.core.types import check_shapes
 
-# Beyond this optical depth exp(-x) is 0 in every float type, so that nothing changes where a depth
-# that is larger, or infinite, is replaced by it: sums and products then stay finite.
+# Beyond this optical depth exp(-x) is 0 in every float type. Larger or infinite depths are replaced by it, so that
+# sums and products stay finite.
 _OPAQUE = 1e4
 
 
-def weights_from_density(density, length, *, rule="segments"):
-    """Returns the share of the pixel's colour that each sample contributes.
-
-    Density is constant inside a segment, which makes the quadrature exact:
+def weights_from_density(
+    density: Num[ArrayLike, "*batch samples"], length: Num[ArrayLike, "*batch samples"], *, rule: str = "segments"
+) -> Float[Array, "*batch samples"]:
+    """Computes the weight of each segment in the colour of its ray.
 
         w_i = T_i (1 - exp(-sigma_i l_i)),   T_i = exp(-sum_{j<i} sigma_j l_j)      (Eq. 3)
 
-    What the weights leave over passes through to the background: see transmittance.
+    This is exact if the density is constant inside each segment. The weights and the `transmittance` of the ray
+    sum to 1.
 
     Args:
         density: [..., S] sigma >= 0, in 1 / world unit, ordered near to far.
-        length: [..., S] l >= 0, in world units. Zero removes the sample: neither the value nor
-            the gradient sees its density, even where that is NaN or infinite.
-        rule: the rule of the samples, see samples_from_edges. "gauss" moves a part of each cell's
-            second weight to its first, which makes the colour, too, of fourth order.
+        length: [..., S] l >= 0, in world units. Length 0 removes the sample: neither the value nor
+            the gradient depends on its density, even if that is NaN or infinite.
+        rule: the rule of the samples, see samples_from_edges. "gauss" moves a part of the second weight of each
+            segment to the first, which makes the colour of fourth order, too.
 
     Returns:
         [..., S] weights in [0, 1], at least float32. An infinite density over a positive length is
-        opaque. The gradient is that of Eq. 3 to rounding, also in fog so thick that it cancels.
+        opaque. The gradient is that of Eq. 3 to rounding, also in dense media, where its terms cancel.
 
     Raises:
-        ValueError: if the shapes differ (nothing is broadcast here), the rule is unknown, or "gauss" has
-            an odd S.
+        ValueError: if the shapes differ (they are not broadcast), the rule is unknown, or S is odd for "gauss".
     """
     depth = _optical_depth("weights_from_density", density, length)
     weights = _weights(depth)
@@ -44,21 +46,23 @@ def weights_from_density(density, length, *, rule="segments"):
         return weights
     if rule != "gauss" or depth.shape[-1] % 2:
         raise ValueError(
-            f"weights_from_density: rule {rule!r} with {depth.shape[-1]} samples, wanted 'segments', "
-            "'points', or 'gauss' with two samples a cell"
+            f"weights_from_density: rule {rule!r} with {depth.shape[-1]} samples, expected 'segments', "
+            "'points', or 'gauss' with two samples per segment"
         )
     return _follow_transmittance(weights, depth)
 
 
-def transmittance(density, length):
-    """Returns what passes through all segments, T = exp(-sum_i sigma_i l_i).
+def transmittance(
+    density: Num[ArrayLike, "*batch samples"], length: Num[ArrayLike, "*batch samples"]
+) -> Float[Array, "*batch"]:
+    """Computes the transmittance of all segments, T = exp(-sum_i sigma_i l_i).
 
     Args:
         density: [..., S] in 1 / world unit.
-        length: [..., S] in world units; zero removes the segment.
+        length: [..., S] in world units; length 0 removes the segment.
 
     Returns:
-        [...] in [0, 1]; keeps its digits where 1 - sum of weights has lost them.
+        [...] in [0, 1]; accurate also where 1 - sum of weights would cancel.
 
     Raises:
         ValueError: if the shapes differ.
@@ -66,32 +70,40 @@ def transmittance(density, length):
     return jnp.exp(-_optical_depth("transmittance", density, length).sum(axis=-1))
 
 
-def opacity(density, length):
-    """Returns the share of light from behind that is stopped, 1 - T, with all its digits also in thin fog.
+def opacity(
+    density: Num[ArrayLike, "*batch samples"], length: Num[ArrayLike, "*batch samples"]
+) -> Float[Array, "*batch"]:
+    """Computes the opacity 1 - T in [0, 1], the sum of the weights, accurate also in thin media.
 
-    Arguments and errors as transmittance; [...] in [0, 1], the sum of the weights.
+    Takes the arguments of `transmittance` and raises its errors.
     """
     return _absorbed(_optical_depth("opacity", density, length).sum(axis=-1))
 
 
-def exclusive_sum(values):
-    """Returns [..., S], the sum of all values [..., S] before each, which must be finite.
+def exclusive_sum(values: Float[ArrayLike, "*batch samples"]) -> Float[Array, "*batch samples"]:
+    """Computes the sum of all values before each one, as in the exponent of T_i (Eq. 3).
 
-    Of optical depths it is the one in the exponent of T_i (Eq. 3).
+    The values must be finite, see `running_sum`.
     """
     return _previous(running_sum(values))
 
 
-def composite(weights, values, *, background=None, transmittance=None):
-    """Returns the weighted sum of values along each ray, over a background.
+def composite(
+    weights: Num[ArrayLike, "*batch samples"],
+    values: Num[ArrayLike, "*batch samples channels"],
+    *,
+    background: Num[ArrayLike, "*#batch channels"] | Sequence[float] | None = None,
+    transmittance: Num[ArrayLike, "*batch"] | None = None,
+) -> Float[Array, "*batch channels"]:
+    """Computes the weighted sum of values along each ray, over a background.
 
         C = sum_i w_i c_i + T c_background      (Eq. 3, and the background behind it)
 
     Args:
         weights: [..., S].
-        values: [..., S, C], colours or anything else a sample has, finite also where the weight is 0.
-        background: None for black (nothing is added), [C], or [..., C] one a ray.
-        transmittance: [...] what passes through; 1 - sum of weights when not given.
+        values: [..., S, C], colours or other values, finite also where the weight is 0.
+        background: None for black (nothing is added), [C], or [..., C], one per ray.
+        transmittance: [...] weight of the background; None for 1 - sum of weights.
 
     Returns:
         [..., C], at least float32.
@@ -107,25 +119,31 @@ def composite(weights, values, *, background=None, transmittance=None):
     background = jnp.asarray(background, colour.dtype)
     if background.shape not in (colour.shape, colour.shape[-1:]):
         raise ValueError(
-            f"composite: background has shape {background.shape}, wanted {colour.shape[-1:]} or {colour.shape}"
+            f"composite: background has shape {background.shape}, expected {colour.shape[-1:]} or {colour.shape}"
         )
-    passing = 1 - weights.sum(axis=-1) if transmittance is None else jnp.asarray(transmittance)
-    check_shapes("composite", transmittance=(passing, "..."), colour=(colour, "... C"))
-    return colour + passing[..., None] * jnp.broadcast_to(background, colour.shape)
+    behind = 1 - weights.sum(axis=-1) if transmittance is None else jnp.asarray(transmittance)
+    check_shapes("composite", transmittance=(behind, "..."), colour=(colour, "... C"))
+    return colour + behind[..., None] * jnp.broadcast_to(background, colour.shape)
 
 
-def expected_depth(weights, t, transmittance, *, far):
-    """Returns the expected place where light stops, sum_i w_i t_i + T far.
+def expected_depth(
+    weights: Num[ArrayLike, "*batch samples"],
+    t: Num[ArrayLike, "*batch samples"],
+    transmittance: Num[ArrayLike, "*batch"],
+    *,
+    far: Num[ArrayLike, "*batch"],
+) -> Float[Array, "*batch"]:
+    """Computes the expected depth of each ray, sum_i w_i t_i + T far.
 
     Args:
         weights: [..., S].
-        t: [..., S] in t, where the samples are.
-        transmittance: [...] what passes through, counted as stopping at far.
-        far: [...] in t, may be inf: a ray that lets anything through is then infinitely deep.
+        t: [..., S] in t, positions of the samples.
+        transmittance: [...] T of the whole ray.
+        far: [...] in t; may be inf: the depth is then inf unless T is 0.
 
     Returns:
-        [...] in t. An empty ray has depth far; never NaN, as nothing is added where nothing passes.
-        What multiplies an infinite t or far gets no gradient from it.
+        [...] in t. An empty ray has depth far. 0 times an infinite t or far is 0, not NaN, and an infinite t or
+        far gives its factor gradient 0.
 
     Raises:
         ValueError: on other shapes.
@@ -141,12 +159,14 @@ def expected_depth(weights, t, transmittance, *, far):
     return multiply_or_zero(weights, t).sum(axis=-1) + multiply_or_zero(transmittance, far)
 
 
-def expected_disparity(weights, t):
-    """Returns the expected inverse depth, sum_i w_i / t_i.
+def expected_disparity(
+    weights: Num[ArrayLike, "*batch samples"], t: Num[ArrayLike, "*batch samples"]
+) -> Float[Array, "*batch"]:
+    """Computes the expected inverse depth, sum_i w_i / t_i.
 
     Args:
         weights: [..., S].
-        t: [..., S] in t, > 0 where a weight is.
+        t: [..., S] in t, > 0 where the weight is.
 
     Returns:
         [...] in 1 / t; 0 for an empty ray, also with samples at t = 0. A weight at t = 0 makes it
@@ -160,16 +180,18 @@ def expected_disparity(weights, t):
     return divide_or_zero(weights, t).sum(axis=-1)
 
 
-def packed_weights(density, length, starts, *, longest):
-    """Returns the weights of samples of many rays in one row, ray after ray.
+def packed_weights(
+    density: Num[ArrayLike, " K"], length: Num[ArrayLike, " K"], starts: Bool[ArrayLike, " K"], *, longest: int
+) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
+    """Computes the weights of the samples of many rays in one buffer, ray after ray.
 
     Args:
         density, length: [K], as in weights_from_density.
         starts: [K] bool, the first sample of each ray.
-        longest: no ray has more samples.
+        longest: upper bound of the number of samples of a ray.
 
     Returns:
-        [K] weights, and [K] optical depths sigma l, of which none exceeds what lets nothing through.
+        [K] weights, and [K] optical depths sigma l, capped where exp(-sigma l) is 0.
 
     Raises:
         ValueError: if the shapes differ.
@@ -179,31 +201,30 @@ def packed_weights(density, length, starts, *, longest):
     return _packed_weights(depth, starts, longest), depth
 
 
-def divide_or_zero(weight, t):
-    """Returns weight over t, where 0 / 0 is 0 and an infinite quotient by 0 has no gradient."""
-    touching = t == 0
-    quotient = divide(jnp.where(touching, 0, weight), jnp.where(touching, 1, t))
-    return jnp.where(touching & (weight != 0), jnp.inf * jax.lax.stop_gradient(weight), quotient)
+def divide_or_zero(weight: Float[ArrayLike, "*#shape"], t: Float[ArrayLike, "*#shape"]) -> Float[Array, "*#shape"]:
+    """Computes weight / t with 0 / 0 = 0; an infinite quotient has gradient 0."""
+    zero = t == 0
+    quotient = divide(jnp.where(zero, 0, weight), jnp.where(zero, 1, t))
+    return jnp.where(zero & (weight != 0), jnp.inf * jax.lax.stop_gradient(weight), quotient)
 
 
-def multiply_or_zero(weight, place):
-    """Returns weight times place, where 0 times inf is 0 and an infinite product has no gradient."""
-    endless = jnp.isinf(place)
-    return jnp.where(endless & (weight > 0), place, weight * jnp.where(endless, 0, place))
+def multiply_or_zero(weight: Float[ArrayLike, "*#shape"], t: Float[ArrayLike, "*#shape"]) -> Float[Array, "*#shape"]:
+    """Computes weight * t with 0 * inf = 0; an infinite product has gradient 0."""
+    infinite = jnp.isinf(t)
+    return jnp.where(infinite & (weight > 0), t, weight * jnp.where(infinite, 0, t))
 
 
 def _sum_over_samples(weights, values):
-    """Returns the weighted sums; few channels one by one, as an inner axis of 3 fills no vector register."""
+    """Computes the weighted sums; a few channels one by one, as an inner axis of 3 would not be vectorised."""
     if values.shape[-1] > 4:
         return (weights[..., None] * values).sum(axis=-2)
     return jnp.stack([(weights * values[..., i]).sum(axis=-1) for i in range(values.shape[-1])], axis=-1)
 
 
 def _optical_depth(function, density, length):
-    """Returns sigma l, with what has no length or lets nothing through selected out of the product.
+    """Computes sigma l, at most _OPAQUE; 0 for segments of length 0 and for empty segments of infinite length.
 
-    Both operands are replaced there, as the derivative of a product multiplies by them. Empty space
-    without an end (0 times inf) counts for nothing.
+    In these cases both factors are replaced, because the derivative of a product multiplies by them.
     """
     density, length = at_least_float32(density, length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))
@@ -221,12 +242,12 @@ def _weights(depth):
 
 @_weights.defjvp
 def _weights_jvp(primals, tangents, *, long_ray=4096):
-    """Differentiates w_i = T_i - T_{i+1} as it stands.
+    """Differentiates w_i = T_i - T_{i+1} term by term.
 
-    In reverse the colours of neighbours are then subtracted before they are summed. The derivative of the
-    product subtracts the sum behind a sample from its own colour: in thick fog of one colour nothing is
-    left of that. Roundings of the differences add up, so that rays of more than long_ray samples go another
-    way to the same end.
+    In reverse mode, this subtracts the colours of neighbours before it sums them. The derivative of the product
+    T_i (1 - exp(-sigma_i l_i)) would subtract the sum behind a sample from the sample's own colour, which cancels
+    in a dense medium of one colour. The rounding errors of the differences add up, so that rays of more than
+    long_ray samples use _change_of_long_ray.
     """
     (depth,), (tangent,) = primals, tangents
     weights, behind = _weights(depth), jnp.exp(-running_sum(depth))
@@ -244,7 +265,7 @@ def _packed_weights(depth, starts, longest):
 
 @_packed_weights.defjvp
 def _packed_weights_jvp(longest, primals, tangents):
-    """As _weights_jvp."""
+    """Differentiates like _weights_jvp."""
     depth, starts = primals
     behind = jnp.exp(-running_sum_since(starts, depth, longest))
     change = behind * running_sum_since(starts, tangents[0], longest)
@@ -253,70 +274,71 @@ def _packed_weights_jvp(longest, primals, tangents):
 
 
 def _change_of_long_ray(weights, behind, tangent):
-    """Differentiates Eq. 3, and takes the heaviest weight's share from the sum of all, which is known.
+    """Differentiates Eq. 3, except that the change of the largest weight is the total minus all others.
 
-    In reverse, the heaviest sample's colour comes off all others before they are summed.
+    In reverse mode, this subtracts the colour of the heaviest sample from all others before they are summed.
     """
     plain = behind * tangent - weights * _previous(running_sum(tangent))
     total = behind[..., -1:] * tangent.sum(axis=-1, keepdims=True)
-    heaviest = _places(weights) == weights.argmax(axis=-1, keepdims=True)
+    heaviest = _sample_index(weights) == weights.argmax(axis=-1, keepdims=True)
     others = jnp.where(heaviest, 0, plain)
     return jnp.where(heaviest, total - others.sum(axis=-1, keepdims=True), others)
 
 
 def _follow_transmittance(weights, depth):
-    """Returns the weights of half cells, turned into those of the Gauss points in them.
+    """Converts the weights of half segments to those of the two Gauss points.
 
-    At the points the integrand is sigma exp(-tau), and of a cell's optical depth tau 1 / sqrt(3) lies
-    between them, where half cells have 1 / 2. So the ratio of the first weight to the second grows by
-    exp((1 / sqrt(3) - 1 / 2) tau); their sum stays, and with it the fourth order of the opacity. The growth
-    ends at tau = 4: in a cell that a wall begins in, the little there is before it must not take its place.
+    The integrand at the points is sigma exp(-tau). A fraction 1 / sqrt(3) of the segment's optical depth tau lies
+    between the points, compared with 1 / 2 between the centres of the halves. The ratio of the first weight to the
+    second therefore grows by exp((1 / sqrt(3) - 1 / 2) tau); their sum, and with it the fourth order of the opacity,
+    is unchanged. The growth is capped at tau = 4: in a segment in which a wall begins, thin matter in front of the
+    wall must not take over its weight.
     """
     following = jnp.concatenate([depth[..., 1:], jnp.zeros_like(depth[..., :1])], axis=-1)
     rate = 1 / math.sqrt(3) - 1 / 2
     both = depth + following
-    thin = both < 1e-12  # the derivative squares it, and the square must not underflow
-    held = jnp.where(thin, 1, both)
-    ratio = jnp.where(thin, rate, jnp.expm1(rate * jnp.minimum(held, 4)) / _absorbed(held))
-    grown = _absorbed(depth) * ratio
-    share = grown / (1 + grown)
+    thin = both < 1e-12  # the derivative squares it, which would underflow
+    safe = jnp.where(thin, 1, both)
+    ratio = jnp.where(thin, rate, jnp.expm1(rate * jnp.minimum(safe, 4)) / _absorbed(safe))
+    growth = _absorbed(depth) * ratio
+    fraction = growth / (1 + growth)
     second = jnp.concatenate([weights[..., 1:], jnp.zeros_like(weights[..., :1])], axis=-1)
-    moved = jnp.where(_places(depth) % 2 == 0, share * second, 0)
+    moved = jnp.where(_sample_index(depth) % 2 == 0, fraction * second, 0)
     return weights + moved - _previous(moved)
 
 
-def running_sum(x, block=16):
-    """Returns the sum of all entries up to each.
+def running_sum(x: Float[ArrayLike, "*batch samples"], part_size: int = 16) -> Float[Array, "*batch samples"]:
+    """Computes the cumulative sum along the last axis by matrix products with triangles of ones.
 
-    By products with a triangle of ones, block by block: faster on a CPU than jnp.cumsum, and as close.
-    Entries must be finite, or a whole block is NaN.
+    On a CPU this is faster than jnp.cumsum and as accurate. The values must be finite: one that is not makes its
+    whole part NaN.
     """
     size = x.shape[-1]
-    if size <= block:
+    if size <= part_size:
         ones = jnp.triu(jnp.ones((size, size), x.dtype))
         return jnp.matmul(x, ones, precision="highest")
-    count = -(-size // block)
-    padding = [(0, 0)] * (x.ndim - 1) + [(0, count * block - size)]
-    blocks = jnp.pad(x, padding).reshape(*x.shape[:-1], count, block)
-    inside = running_sum(blocks, block)
-    total = inside + _previous(running_sum(inside[..., -1], block))[..., None]
+    count = -(-size // part_size)
+    padding = [(0, 0)] * (x.ndim - 1) + [(0, count * part_size - size)]
+    parts = jnp.pad(x, padding).reshape(*x.shape[:-1], count, part_size)
+    inside = running_sum(parts, part_size)
+    total = inside + _previous(running_sum(inside[..., -1], part_size))[..., None]
     return total.reshape(*x.shape[:-1], -1)[..., :size]
 
 
-def running_sum_since(starts, x, longest):
-    """Returns the sum of all entries [K] from the last start up to each (Hillis and Steele 1986)."""
+def running_sum_since(starts: Bool[ArrayLike, " K"], x: Float[Array, " K"], longest: int) -> Float[Array, " K"]:
+    """Computes the cumulative sum since the last start, for runs of at most longest (Hillis and Steele 1986)."""
     step = 1
     while step < min(longest, x.size):
-        nothing, closed = jnp.zeros(step, x.dtype), jnp.ones(step, bool)
+        zeros, ones = jnp.zeros(step, x.dtype), jnp.ones(step, bool)
         x, starts = (
-            jnp.where(starts, x, x + jnp.concatenate([nothing, x[:-step]])),
-            starts | jnp.concatenate([closed, starts[:-step]]),
+            jnp.where(starts, x, x + jnp.concatenate([zeros, x[:-step]])),
+            starts | jnp.concatenate([ones, starts[:-step]]),
         )
         step *= 2
     return x
 
 
-def _places(x):
+def _sample_index(x):
     return jnp.arange(x.shape[-1]).reshape((1,) * (x.ndim - 1) + (-1,))
 
 
@@ -326,7 +348,7 @@ def _previous(x, first=0):
 
 @jax.custom_jvp
 def _absorbed(depth):
-    """1 - exp(-x) without cancellation, in the value (thin) and in the derivative (opaque)."""
+    """Computes 1 - exp(-x) without cancellation, in the value for small x and in the derivative for large x."""
     return -jnp.expm1(-depth)
 
 

@@ -1,12 +1,15 @@
-"""Datasets: the Views of a split, read as a config's data section or a folder says."""
+"""Datasets: the Views of a split, for a folder or for the data section of a config."""
 
 import copy
 import dataclasses
 import os
 import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 from ml_collections import ConfigDict
 
 from jaxnerf.core.types import Views
@@ -15,54 +18,41 @@ from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
 from jaxnerf.data.readers import base, blender
 from jaxnerf.data.readers.base import fingerprint
-from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.runtime.config_fields import AUTO, is_auto
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 WORLDS = {
     "file": "cameras stay as in the file",
-    "forward": "all cameras look one way, which becomes -z",
+    "forward": "all cameras look in one direction, which becomes -z",
     "around": "the point that the cameras look at becomes the origin, their distance 1",
 }
+_SYNTHETIC = {"fingerprint": "", "factor": 1, "background": "white", "world": "file", "ndc": False}
 _BLENDER_NEAR, _BLENDER_FAR = 2.0, 6.0  # of the NeRF paper's synthetic scenes, world units
-_HELD_OUT_OFFSET = 3  # datasets often begin with views that differ from the rest, so not the first
+_HELD_OUT_OFFSET = 3  # not 0, as the first views of a dataset often differ from the others
 
 
-def load_dataset(folder: str | os.PathLike, *, split: str = "train", **options) -> Views:
+def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any) -> Views:
     """Reads the Views of a split of the dataset in a folder.
 
-    Args:
-        folder: of a dataset in any registered format: Blender, transforms.json, COLMAP or LLFF.
-        split: "train", "test" or another that the dataset has.
-        **options: fields of the config's data section, see configs/default.py. What is not given is inferred
-            from the dataset; images are not shrunk.
+    Images keep their size unless `factor` is given. Everything else that `options` does not set is inferred from
+    the dataset.
 
-    Returns:
-        Views.
+    Args:
+        dir: of a dataset in any registered format: Blender, transforms.json, COLMAP or LLFF, for example.
+        split: "train", "test", or another split of the dataset.
+        **options: fields of the config's data section, see configs/default.py.
 
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    data = ConfigDict(_DEFAULTS | {"dir": str(folder)} | options)
-    return load_split(resolve(data)[0], split)
+    from jaxnerf.configs import default
 
-
-_DEFAULTS = {
-    "format": "auto",
-    "dir": "",
-    "fingerprint": "auto",
-    "factor": 1,
-    "width": 800,
-    "size": 100,
-    "finish": "usual",
-    "near": 0.0,
-    "far": 0.0,
-    "background": "auto",
-    "hold_out": 0,
-    "num_views": 0,
-    "pixel_offset": 0.5,
-    "world": "auto",
-    "ndc": False,
-}
+    data = default.get_config().data
+    inferred = {name: AUTO for name in ("format", "background", "world", "ndc")}
+    if unknown := sorted(set(options) - set(data)):
+        raise ValueError(f"load_dataset: {unknown[0]} is no option, expected one of {', '.join(data)}; correct it")
+    data.update(inferred | {"dir": str(dir)} | options)
+    return load_split(data, split)
 
 
 def resolve(data: ConfigDict, *, missing_ok: bool = False) -> tuple[ConfigDict, list[str]]:
@@ -70,13 +60,13 @@ def resolve(data: ConfigDict, *, missing_ok: bool = False) -> tuple[ConfigDict, 
 
     Args:
         data: see configs/default.py; it is not changed.
-        missing_ok: whether all stays "auto" where there is no such folder.
+        missing_ok: whether everything stays "auto" if the folder does not exist.
 
     Returns:
         A copy of the section, and one line per inferred value with its reason.
 
     Raises:
-        ValueError: if there is no such folder, or it holds no dataset.
+        ValueError: if the folder does not exist or holds no dataset.
     """
     data, lines = copy.deepcopy(data), []
 
@@ -91,161 +81,113 @@ def resolve(data: ConfigDict, *, missing_ok: bool = False) -> tuple[ConfigDict, 
             infer(name, value)
         return data, lines
     try:
-        folder = scene_folder(data.dir)
+        folder = dataset_folder(data.dir)
     except ValueError:
         if missing_ok:
             return data, lines
         raise
+    if pathlib.Path(data.dir).is_dir():  # a name below $JAXNERF_SCENES stays a name
+        data.dir = str(folder.absolute())
     if is_auto(data.format):
-        found = base.formats_in(folder)
+        found = base.detect_formats(folder)
         others = f", of {', '.join(found)}: --format selects another" if len(found) > 1 else ""
         infer("format", found[0], f"format        {found[0]}{others}")
     if data.format == "blender":
-        # Each split has a file of its own, and the cameras are where they should be.
+        # Each split has a file of its own, and the world of the cameras is already normalised.
         infer("fingerprint", "")
         infer("world", "file")
-    # Reading the cameras takes a while, so only where something is left to infer from them.
-    left = [name for name in ("factor", "background", "fingerprint") if is_auto(data[name])]
-    capture = base.read_capture(folder, data.format) if left or is_auto(data.world) else None
-    if capture is not None:
+    # Reading the cameras takes a while, so they are only read to infer something from them.
+    if any(is_auto(data[name]) for name in ("factor", "world", "background", "fingerprint")):
+        capture = base.read_capture(folder, data.format)
         lines += [f"skipped       {note}" for note in capture.notes]
-    if is_auto(data.factor):
-        factor, width = downscaled_copies.factor_for(capture, data.width)
-        infer("factor", factor, f"factor        {factor}, of images {width} px wide")
-    if is_auto(data.world):
-        kind = _default_world(data, capture)
-        infer("world", kind, f"world         {kind}: {WORLDS[kind]}")
-    if is_auto(data.background):
-        color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
-        infer("background", color, f"background    {color}")
-    if capture is not None:
+        if is_auto(data.factor):
+            factor, width = downscaled_copies.factor_for(capture, data.width)
+            infer("factor", factor, f"factor        {factor}, of images {width} px wide")
+        if is_auto(data.world):
+            forward = data.ndc is True or world.looks_forward(capture)
+            kind = "forward" if forward else "around"
+            infer("world", kind, f"world         {kind}: {WORLDS[kind]}")
+        if is_auto(data.background):
+            color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
+            infer("background", color, f"background    {color}")
         infer("fingerprint", fingerprint(capture))
     infer("ndc", data.world == "forward", f"NDC           {'on' if data.world == 'forward' else 'off'}")
     return data, lines
 
 
-_SYNTHETIC = {
-    "format": "synthetic",
-    "fingerprint": "",
-    "factor": 1,
-    "background": "white",
-    "world": "file",
-    "ndc": False,
-}
-
-
-def _default_world(data, capture):
-    if data.format == "blender":
-        return "file"
-    return "forward" if data.ndc or world.looks_forward(capture) else "around"
-
-
 def load_split(data: ConfigDict, split: str) -> Views:
-    """Returns the Views of a split, as the data section of a configuration describes them.
+    """Reads the Views of a split of the dataset that a config's data section describes.
 
-    With data.hold_out a part of the training views is the split "held_out", and not in "train". With
-    data.num_views only so many of those in "train" are.
+    With `hold_out`, some views of "train" form the split "held_out" instead. With `num_views`, "train" has only
+    that many of its views. Fields that are still "auto" are resolved first.
+
+    Raises:
+        ValueError: names the field or file, what was found, what is expected and what to do.
     """
-    if split == "train" and data.num_views:
-        views = _without_held_out(data, split)
-        return select_views(views, evenly("data.num_views", len(views.offset), data.num_views))
-    return _without_held_out(data, split)
-
-
-def _without_held_out(data, split):
-    every = data.hold_out
-    if not every or split not in ("train", "held_out"):
-        return _read_views(data, split)
-
-    def only(count):
-        if not 2 <= every <= count:
-            raise ValueError(f"data.hold_out is {every} of {count} views, wanted 2 to {count}, or 0 for none")
-        indices = held_out(count, every)
-        return indices if split == "held_out" else np.setdiff1d(range(count), indices)
-
-    return _read_views(data, "train", only)
-
-
-def _read_views(data, split, only=None):
+    select = _selection(data, split)
+    source = "train" if split == "held_out" and data.hold_out else split
     if data.format == "synthetic":
-        views = synthetic.load_views(split=split, size=data.size, finish=data.finish)
-        return views if only is None else select_views(views, only(len(views.offset)))
+        views = synthetic.load_synthetic(split=source, size=data.size, finish=data.finish)
+        return views if select is None else select_views(views, select(len(views.offset)))
     data, _ = resolve(data)
-    folder = scene_folder(data.dir)
-    if data.world not in WORLDS or (data.format == "blender" and data.world != "file"):
-        names = "'file'" if data.format == "blender" else ", ".join(WORLDS)
-        raise ValueError(f"data.world is {data.world!r}, wanted {names} or 'auto'")
-    if data.ndc and data.world != "forward":
-        raise ValueError(
-            f"data.ndc is on in the world {data.world!r}, wanted 'forward', with cameras that look one way; "
-            "set data.ndc to False"
-        )
+    _check_world(data)
+    folder = dataset_folder(data.dir)
+    reading = {"split": source, "factor": data.factor, "background": background_of(data), "select": select}
     if data.format == "blender":
-        return blender.load_views(
-            folder,
-            split=split,
-            factor=data.factor,
-            near=data.near or _BLENDER_NEAR,
-            far=data.far or _BLENDER_FAR,
-            background=background_of(data),
-            only=only,
-        )
+        near, far = data.near or _BLENDER_NEAR, data.far or _BLENDER_FAR
+        return blender.load_blender(folder, near=near, far=far, **reading)
     capture = base.read_capture(folder, data.format)
     if data.fingerprint not in ("", found := fingerprint(capture)):
         raise ValueError(
-            f"{folder}: holds {found}, where training saw {data.fingerprint}: other photographs would be in each "
-            "split, and the world another; restore what was there, or train anew in another --workdir"
+            f"{folder}: holds {found}, expected {data.fingerprint} as in training: other images would be in each "
+            "split, and the world would differ; restore the dataset, or train again in another --workdir"
         )
     capture = bounds.with_bounds(capture)
     to_file = np.eye(4)
     if data.world == "forward":
         if data.ndc and not world.looks_forward(capture, cosine=0.5):
-            raise ValueError(f"{folder}: data.ndc is on and the cameras look all ways; set it to False")
+            raise ValueError(
+                f"{folder}: data.ndc is True and the cameras look in all directions, expected one direction; set "
+                "data.ndc to False"
+            )
         capture, to_file = world.recenter(capture)
     elif data.world == "around":
         capture, to_file = world.center(capture)
-    capture = bounds.given(capture, data.near, data.far, to_file)
-    views = load_images.load_views(capture, split=split, factor=data.factor, background=background_of(data), only=only)
+    capture = bounds.override_bounds(capture, data.near, data.far, to_file)
     box = None if capture.box is None else np.float32(capture.box)
+    views = load_images.load_capture(capture, **reading)
     return dataclasses.replace(views, to_file=np.float32(to_file), box=box)
 
 
-def scene_folder(name):
-    """Returns the folder of that name here, or else under $JAXNERF_SCENES."""
+def dataset_folder(name: str) -> pathlib.Path:
+    """Returns the folder of that path, or else of that name below $JAXNERF_SCENES.
+
+    Raises:
+        ValueError: if neither exists.
+    """
     scenes = os.environ.get("JAXNERF_SCENES")
     places = [pathlib.Path(name)] + ([pathlib.Path(scenes, name)] if scenes else [])
     found = [place for place in places if name and place.is_dir()]
     if not found:
-        looked = " or ".join(str(place.absolute()) for place in places) if name else "no name"
-        raise ValueError(f"data.dir is {name!r}, looked at {looked}: no such folder; give one with --data_dir")
+        searched = " or ".join(str(place.absolute()) for place in places) if name else "nothing"
+        raise ValueError(f"data.dir is {name!r}: no such folder, searched {searched}; set it with --data_dir")
     return found[0]
 
 
-def background_of(data):
+def background_of(data: ConfigDict) -> tuple[float, float, float] | None:
     """Returns the colour behind alpha and behind the scene, or None."""
     if data.background not in BACKGROUNDS:
-        raise ValueError(f"data.background is {data.background!r}, wanted one of {sorted(BACKGROUNDS)}")
+        raise ValueError(f"data.background is {data.background!r}, expected one of {sorted(BACKGROUNDS)}; correct it")
     return BACKGROUNDS[data.background]
 
 
-def held_out(count, every):
-    """Returns the indices of the held-out views among count, one in each `every`; ascending, int."""
+def held_out(count: int, every: int) -> Int[np.ndarray, " N"]:
+    """Returns the indices of the held-out views among count, one in each `every`, in ascending order."""
     return np.arange(min(_HELD_OUT_OFFSET, every - 1), count, every)
 
 
-def evenly(name, count, number):
-    """Returns the indices of so many views of count, evenly spread from the first; ascending, int.
-
-    Raises:
-        ValueError: if there are not so many; names the field.
-    """
-    if not 1 <= number <= count:
-        raise ValueError(f"{name} is {number} of {count} views, wanted 1 to {count}, or 0 for all")
-    return np.arange(number) * count // number
-
-
-def select_views(views, indices):
-    """Returns the Views of the given indices [N], in that order; pixels are copied."""
+def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -> Views:
+    """Returns the Views of the given indices, in their order; pixels are copied."""
     indices = np.asarray(indices)
     size, first = np.asarray(views.size)[indices], np.asarray(views.offset)[indices]
     counts = size.prod(axis=1)
@@ -267,3 +209,45 @@ def select_views(views, indices):
         mask=None if views.mask is None else pick(views.mask),
         names=tuple(views.names[index] for index in indices) if views.names else (),
     )
+
+
+def _selection(data: ConfigDict, split: str) -> Callable[[int], np.ndarray] | None:
+    """Returns a function from the number of views to the indices of those that a split has; None: all."""
+    every = data.hold_out if split in ("train", "held_out") else 0
+    number = data.num_views if split == "train" else 0
+    if not every and not number:
+        return None
+
+    def select(count):
+        indices = np.arange(count)
+        if every:
+            if not 2 <= every <= count:
+                raise ValueError(
+                    f"data.hold_out is {every} of {count} views, expected 2 to {count}, or 0 for none; correct it"
+                )
+            held = held_out(count, every)
+            indices = held if split == "held_out" else np.setdiff1d(indices, held)
+            count = len(indices)
+        if number:
+            if not 1 <= number <= count:
+                raise ValueError(
+                    f"data.num_views is {number} of {count} views, expected 1 to {count}, or 0 for all; correct it"
+                )
+            indices = indices[np.arange(number) * count // number]
+        return indices
+
+    return select
+
+
+def _check_world(data):
+    worlds = ("file",) if data.format == "blender" else tuple(WORLDS)
+    if data.world not in worlds:
+        raise ValueError(
+            f"data.world is {data.world!r}, expected one of {', '.join(worlds)} or auto for the format "
+            f"{data.format!r}; correct it"
+        )
+    if data.ndc and data.world != "forward":
+        raise ValueError(
+            f"data.ndc is True in the world {data.world!r}, expected the world 'forward' and cameras that look in "
+            "one direction; set data.ndc to False"
+        )

@@ -1,30 +1,70 @@
-"""Training rays, drawn on the device from the pixels of all views."""
+"""Random training rays, drawn on the device from the pixels of all views."""
 
 import dataclasses
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, Num, UInt
 
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
 from jaxnerf.core.safe_math import norm
-from jaxnerf.core.types import Batch, pytree
+from jaxnerf.core.types import Batch, Rays, Vector, Views, pytree
 
 BATCHINGS = ("all_images", "single_image")
 
 
 @pytree(static=("shape",))
 class Gathered:
-    """In place of all pixels of Views, those of one step's batch, where a device has no room for more."""
+    """The pixels of one step's batch, in place of the pixels of Views that do not fit into the device's memory.
 
-    rows: jax.Array  # [batch, C], by position in the batch
-    shape: tuple[int, int]  # of all pixels [P, C]
+    Attributes:
+        rows: [B, C], in the order of the batch.
+        shape: (P, C) of all pixels.
+    """
+
+    rows: UInt[Array, "B C"]
+    shape: tuple[int, int]
 
 
-def pixel_colors(pixels, background):
-    """Returns colours [..., 3] in [0, 1] of pixels [..., C] of uint8 or uint16.
+@pytree()
+class PixelRuns:
+    """Pixel ids in ascending order, stored as runs of consecutive ids: single ids take as much memory as pixels.
 
-    With C = 4 the colour is composited over background [3] (None: black); with C = 3 it is opaque.
+    Attributes:
+        first: [R] int32, the first id of each run.
+        before: [R] int32, the number of ids in all previous runs.
+        size: int32, the number of all ids.
+    """
+
+    first: Int[Array, " R"]
+    before: Int[Array, " R"]
+    size: Int[Array, ""]
+
+    def ids(self, positions: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
+        """Returns the ids at positions in [0, size)."""
+        run = jnp.searchsorted(self.before, positions, side="right") - 1
+        return jnp.asarray(self.first)[run] + positions - jnp.asarray(self.before)[run]
+
+    def count_below(self, bounds: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
+        """Returns the number of ids below each bound."""
+        run = jnp.maximum(jnp.searchsorted(self.first, bounds) - 1, 0)
+        ends = jnp.append(self.before[1:], self.size)
+        within = bounds - jnp.asarray(self.first)[run]
+        return jnp.clip(jnp.asarray(self.before)[run] + within, 0, ends[run])
+
+    def all_ids(self) -> Int[np.ndarray, " N"]:
+        """Returns all ids as int32, on the host."""
+        lengths = np.diff(np.append(self.before, self.size))
+        return (np.arange(self.size) + np.repeat(self.first - self.before, lengths)).astype(np.int32)
+
+
+def pixel_colors(pixels: UInt[ArrayLike, "*batch C"], background: Vector | None) -> Float[ArrayLike, "*batch 3"]:
+    """Returns the colours of uint8 or uint16 pixels in [0, 1].
+
+    Pixels of C = 4 channels have straight alpha and are composited over background (None: black). Pixels of
+    C = 3 channels are opaque.
     """
     largest = jnp.iinfo(pixels.dtype).max
     values = pixels.astype(jnp.float32) / largest
@@ -37,60 +77,69 @@ def pixel_colors(pixels, background):
     return rgb * alpha + behind * (1 - alpha)
 
 
-def view_rays(views, index, pixels, *, ndc=False):
-    """Returns Rays [...] of one view through pixels [..., 2]; index is a number, traced or not."""
+def view_rays(
+    views: Views, index: Int[ArrayLike, ""], pixels: Num[ArrayLike, "*batch 2"], *, ndc: bool = False
+) -> Rays:
+    """Returns the Rays [*batch] of one view through pixel positions (x, y); ndc: in normalised device coordinates."""
     camera = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], views.cameras)
     near, far = jnp.asarray(views.near)[index], jnp.asarray(views.far)[index]
     rays = rays_from_pixels(camera, pixels, near=near, far=far)
     return ndc_rays(rays, camera) if ndc else rays
 
 
-def world_depth(views, index, pixels, depth, *, ndc=False):
-    """Returns the distance [...] along the rays of view_rays of depth [...] in their t.
+def world_depth(
+    views: Views,
+    index: Int[ArrayLike, ""],
+    pixels: Num[ArrayLike, "*batch 2"],
+    depth: Float[ArrayLike, "*batch"],
+    *,
+    ndc: bool = False,
+) -> Float[Array, "*batch"]:
+    """Converts depths in t of the rays of `view_rays` to distances along them.
 
-    It is in world units of the capture's file, whatever the reader made of them: views.to_file says.
+    Distances are in the world units of the dataset's files, see `Views.to_file`.
     """
     rays = view_rays(views, index, pixels)
     t = depth
-    if ndc:  # a ray that turns away from the box meets nothing in it
+    if ndc:  # NDC hold nothing of rays that point backwards
         t = jnp.where(rays.directions[..., 2] < 0, ndc_to_t(depth, rays), jnp.inf)
     distance = t * norm(rays.directions)
     if views.to_file is None:
         return distance
-    return distance * norm(jnp.asarray(views.to_file)[:3, 0])  # each axis of a similarity has its scale
+    return distance * norm(jnp.asarray(views.to_file)[:3, 0])  # all axes of a similarity have one scale
 
 
 def draw_batch(
-    seed,
-    step,
-    positions,
-    views,
-    active_pixels=None,
+    seed: Integer[ArrayLike, ""],
+    step: Int[ArrayLike, ""],
+    positions: Int[ArrayLike, " B"],
+    views: Views,
+    active_pixels: PixelRuns | None = None,
     *,
-    batching="all_images",
-    pixel_offset=0.5,
-    ndc=False,
-    extras=(),
-):
-    """Returns one key a ray and the rays and colours of a part of one step's batch.
+    batching: str = "all_images",
+    pixel_offset: float = 0.5,
+    ndc: bool = False,
+    extras: Iterable[str] = (),
+) -> tuple[Key[Array, " B"], Batch]:
+    """Draws random rays with their colours: a part of one step's batch.
 
-    Everything depends on the seed, the step and the ray's position in the whole batch alone, so
-    it is the same however the batch is split over devices.
+    Each ray depends only on the seed, the step and its position in the whole batch, and therefore not on how the
+    batch is split over devices.
 
     Args:
-        seed: int.
-        step: int32 scalar.
-        positions: [B] int32, of the rays in the step's whole batch.
-        views: Views, on the device. Their pixels may be Gathered.
-        active_pixels: PixelRuns, the pixels to draw from; None: all.
-        batching: "all_images": each ray from any pixel of any view; "single_image": all rays of a
-            step from one view, as in the paper's synthetic runs.
-        pixel_offset: where in its square a pixel is looked through, see pixel_grid.
-        ndc: rays in normalised device coordinates.
-        extras: names of the optional fields of Batch to fill: "image_index", "pixel" and "alpha".
+        seed: of the run.
+        step: training step.
+        positions: of the rays in the step's whole batch.
+        views: on the device; their pixels may be Gathered.
+        active_pixels: the pixels to draw from; None: all.
+        batching: "all_images": each ray from any pixel of any view; "single_image": all rays of a step from one
+            view, as in the paper's synthetic runs.
+        pixel_offset: px, position of a ray in its pixel, see `pixel_grid`.
+        ndc: whether the rays are in normalised device coordinates.
+        extras: the optional fields of Batch to fill, of "image_index", "pixel" and "alpha".
 
     Returns:
-        keys [B], for sampling along the rays; and Batch [B].
+        One key per ray, for sampling along the rays; and the Batch [B].
 
     Raises:
         ValueError: on an unknown batching.
@@ -101,32 +150,40 @@ def draw_batch(
     width = views.size[view, 1]
     pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
     rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
-    seen = views.pixels
-    colors = seen.rows[positions] if isinstance(seen, Gathered) else seen[index]
-    batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background))
+    stored = views.pixels
+    chosen = stored.rows[positions] if isinstance(stored, Gathered) else stored[index]
+    batch = Batch(rays=rays, rgb=pixel_colors(chosen, views.background))
     if not extras:
         return keys, batch
-    known = {"image_index": view.astype(jnp.int32), "pixel": pixels, "alpha": _alpha(colors)}
+    known = {"image_index": view.astype(jnp.int32), "pixel": pixels, "alpha": _alpha(chosen)}
     return keys, dataclasses.replace(batch, **{name: known[name] for name in extras})
 
 
 def _alpha(pixels):
-    """Returns the alpha [...] of pixels [..., C]; 1 where they have none."""
+    """Returns the alpha [...] of pixels [..., C]; 1 if C = 3."""
     if pixels.shape[-1] == 3:
         return jnp.ones(pixels.shape[:-1], jnp.float32)
     return pixels[..., 3].astype(jnp.float32) / jnp.iinfo(pixels.dtype).max
 
 
-def draw_pixels(seed, step, positions, views, active_pixels=None, *, batching="all_images"):
-    """Returns the keys [B] of draw_batch and the ids [B] int32 of the pixels that its rays go through."""
+def draw_pixels(
+    seed: Integer[ArrayLike, ""],
+    step: Int[ArrayLike, ""],
+    positions: Int[ArrayLike, " B"],
+    views: Views,
+    active_pixels: PixelRuns | None = None,
+    *,
+    batching: str = "all_images",
+) -> tuple[Key[Array, " B"], Int[Array, " B"]]:
+    """Returns the keys of `draw_batch` and the ids of the pixels that its rays pass through."""
     if batching not in BATCHINGS:
-        raise ValueError(f"draw_batch: batching is {batching!r}, wanted one of {BATCHINGS}")
+        raise ValueError(f"draw_batch: batching is {batching!r}, expected one of {BATCHINGS}")
     key = step_key(seed, step)
     ray_keys = jax.vmap(lambda position: jax.random.fold_in(key, position))(positions)
     pixel_keys, keys = jax.vmap(lambda key: tuple(jax.random.split(key)))(ray_keys)
     first, count = 0, views.pixels.shape[0] if active_pixels is None else active_pixels.size
     if batching == "single_image":
-        # No ray has this position, so the key is the step's own.
+        # No ray has this position, so no ray has this key.
         view = jax.random.randint(jax.random.fold_in(key, 2**32 - 1), (), 0, views.offset.shape[0])
         first, count = views.offset[view], views.size[view].prod()
         if active_pixels is not None:
@@ -136,20 +193,22 @@ def draw_pixels(seed, step, positions, views, active_pixels=None, *, batching="a
     return keys, index if active_pixels is None else active_pixels.ids(index)
 
 
-def step_key(seed, step):
-    """Returns the key of a step; of it come those of its rays, by their positions in the batch."""
+def step_key(seed: Integer[ArrayLike, ""], step: Int[ArrayLike, ""]) -> Key[Array, ""]:
+    """Returns the key of a step. The keys of its rays are folded from it with their positions in the batch."""
     return jax.random.fold_in(jax.random.key(seed), step)
 
 
-def random_rays(views, count, view_rays, *, pixel_offset=0.5, seed=0):
-    """Returns Rays [N] through random pixels of Views, nearly as many of each view; only cameras count.
+def random_rays(
+    views: Views, count: int, view_rays: Callable[..., Rays], *, pixel_offset: float = 0.5, seed: int = 0
+) -> Rays:
+    """Returns Rays [count] through random pixels, almost equally many of each view. Colours are not read.
 
     Args:
-        views: Views.
-        count: N.
+        views: any.
+        count: number of rays.
         view_rays: (views, index, pixels [M, 2]) -> Rays [M].
-        pixel_offset: see pixel_grid.
-        seed: int.
+        pixel_offset: see `pixel_grid`.
+        seed: of the choice.
     """
     rng, parts = np.random.default_rng(seed), []
     ends = np.linspace(0, count, len(views.size) + 1).astype(int)

@@ -1,64 +1,68 @@
-"""The default scene: views of fields.showcase, rendered here on first use, so that nothing is downloaded."""
+"""The embedded dataset: views of `fields.still_life`, rendered on first use, so that nothing is downloaded."""
 
 import functools
-import hashlib
 import inspect
 import math
+import os
 import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import UInt16
 
 from jaxnerf.core import cameras, poses, rendering, sampling, types, volume_rendering
 from jaxnerf.core.poses import look_at
-from jaxnerf.core.types import Camera, Rays, Views
+from jaxnerf.core.types import Camera, Rays, SceneFn, Views
 from jaxnerf.data.images import image_files
 from jaxnerf.fields import still_life
+from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
 _COUNT = {"train": 60, "val": 8, "test": 8}
 _DISTANCE = 4.0  # of every camera from the origin, world units
-_DEPTH = 1.4  # of the scene before and behind the origin along any axis: the plinth's edge is 1.27 from it
-_CYLINDER = {"radius": 1.14, "ends": (-0.97, 1.1)}  # around the z axis, holds all density; world units
+_DEPTH = 1.4  # of the scene in front of and behind the origin, along any axis: the plinth's edge is at 1.27
+_CYLINDER = {"radius": 1.14, "ends": (-0.97, 1.1)}  # around the z axis; contains all density; world units
 _WHITE = (1.0, 1.0, 1.0)
-FINISHES = {"usual": still_life.still_life, "matt": still_life.matt_scene, "shiny": still_life.shiny_scene}
+FINISHES = {"usual": still_life.still_life, "matt": still_life.matt_still_life, "shiny": still_life.shiny_still_life}
 
 
-def load_views(*, split="train", size=100, finish="usual", cache=None):
-    """Returns views of the built-in still life, with alpha, to be composited over white.
+def load_synthetic(
+    *, split: str = "train", size: int = 100, finish: str = "usual", cache: str | os.PathLike | None = None
+) -> Views:
+    """Returns views of the embedded still life, with alpha and a white background.
 
-    This package's renderer makes them from a field in closed form. Each pixel is one ray through its centre:
-    as a model's pixels are, so what separates the two is the model's error and no filter's.
+    This package's renderer computes them from a closed-form field. Each pixel is a single ray through its
+    center, as the pixels of a trained model are, so a model's error contains no difference between filters.
 
     Args:
-        split: "train" (60 views), "val" (8) or "test" (8). No two of the 76 have the same pose.
-        size: H = W in px, >= 1. All 60 views take about ten seconds at 100, once.
-        finish: "usual", with a highlight on the ball; "matt", without, so that no view direction matters;
-            "shiny", with highlights on half of what is there.
-        cache: folder for the rendered pixels; None for jaxnerf in $XDG_CACHE_HOME or ~/.cache. Where it
-            cannot be used they are rendered again, with a warning in the log.
+        split: "train" (60 views), "val" (8) or "test" (8). All 76 poses are different.
+        size: height and width in px, at least 1. All 60 views of size 100 take about ten seconds, once.
+        finish: "usual": a highlight on the ball; "matt": none, so that colour does not depend on the view
+            direction; "shiny": highlights on half of the objects.
+        cache: folder for the rendered pixels; None: jaxnerf in $XDG_CACHE_HOME or ~/.cache. If it cannot be
+            used, a warning is logged and the views are rendered again.
 
     Returns:
-        Views: pixels [V * size * size, 4] uint16, rays through t in [2.6, 5.4].
+        Views: pixels [V * size * size, 4] uint16, rays with t in [2.6, 5.4].
 
     Raises:
         ValueError: on another split, size or finish.
     """
     if split not in _COUNT:
-        raise ValueError(f"split is {split!r}, the built-in scene has {', '.join(_COUNT)}; take one of these")
+        raise ValueError(f"split is {split!r}, expected one of {', '.join(_COUNT)}; choose one of these")
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= 4096:
-        raise ValueError(f"size is {size!r}, wanted a whole number of pixels from 1 to 4096; 100 is usual")
+        raise ValueError(f"size is {size!r}, expected a whole number of pixels from 1 to 4096; 100 is the default")
     if finish not in FINISHES:
-        raise ValueError(f"finish is {finish!r}, wanted one of {sorted(FINISHES)}; correct data.finish")
+        raise ValueError(f"finish is {finish!r}, expected one of {sorted(FINISHES)}; correct data.finish")
     count, size = _COUNT[split], int(size)
     stack = _cameras(split, size)
     form = (count * size * size, 4), np.uint16
     kept = load_or_make(
         cache,
-        f"showcase_{finish}_{split}_{size}_{_fingerprint()}",
+        f"still_life_{finish}_{split}_{size}_{_fingerprint()}",
         lambda: {"pixels": render_views(stack, FINISHES[finish])},
-        fits=lambda arrays: [(each.shape, each.dtype) for each in arrays.values()] == [form],
+        is_valid=lambda arrays: [(each.shape, each.dtype) for each in arrays.values()] == [form],
     )
     return Views(
         pixels=kept["pixels"],
@@ -72,52 +76,54 @@ def load_views(*, split="train", size=100, finish="usual", cache=None):
     )
 
 
-def render_views(stack, scene=still_life.still_life, *, num_segments=384, chunk=1024):
-    """Returns the pixels of a stack of V cameras, [V * H * W, 4] uint16 with straight alpha.
+def render_views(
+    stack: Camera, scene: SceneFn = still_life.still_life, *, num_segments: int = 384, chunk: int = 1024
+) -> UInt16[np.ndarray, "P 4"]:
+    """Renders the pixels of a stack of V cameras: P = V * H * W, with straight alpha.
 
     Args:
-        stack: Camera [V], of one height and width.
-        scene: what they see, a SceneFn.
-        num_segments: of the midpoint rule on the longest way through the scene, even. Ways of up to half
-            that length take half as many, which saves a quarter of the work and keeps the segments short.
-        chunk: rays at once. No pixel depends on it.
+        stack: [V], with one height and width.
+        scene: to render.
+        num_segments: even, of the midpoint rule on the longest ray segment inside the scene's cylinder. Rays
+            with at most half that length have half as many, which saves a quarter of the work.
+        chunk: number of rays at once; it has no effect on the pixels.
     """
     rays = scene_rays(stack)
-    way = rays.far - rays.near  # negative: the ray misses
-    seen = np.zeros((way.size, 4))
-    longest = max(way.max(), 0.0)
-    for share, chosen in ((2, (way > 0) & (way <= longest / 2)), (1, way > longest / 2)):
+    length = rays.far - rays.near  # negative: the ray misses the cylinder
+    rgba = np.zeros((length.size, 4))
+    longest = max(length.max(), 0.0)
+    for divisor, chosen in ((2, (length > 0) & (length <= longest / 2)), (1, length > longest / 2)):
         indices, parts = np.flatnonzero(chosen), []
         for start in range(0, indices.size, chunk):
-            index = indices[np.minimum(np.arange(start, start + chunk), indices.size - 1)]  # one shape
+            index = indices[np.minimum(np.arange(start, start + chunk), indices.size - 1)]  # a single compiled shape
             part = jax.tree.map(lambda leaf, index=index: leaf[index], rays)
-            parts.append(_render(part, scene, num_segments // share))  # returns at once: the device stays busy
+            parts.append(_render(part, scene, num_segments // divisor))  # asynchronous: the device stays busy
         if parts:
-            seen[indices] = np.concatenate(parts)[: indices.size]
-    return image_files.to_straight(seen[:, :3], seen[:, 3], background=_WHITE)
+            rgba[indices] = np.concatenate(parts)[: indices.size]
+    return image_files.to_straight(rgba[:, :3], rgba[:, 3], background=_WHITE)
 
 
-def scene_rays(stack):
-    """Returns the rays through all pixels of a stack of cameras, cut to the part that can hold matter.
+def scene_rays(stack: Camera) -> Rays:
+    """Returns the rays through all pixels of a stack of cameras, clipped to a cylinder around the scene.
 
     Args:
-        stack: Camera [V], of one height and width.
+        stack: [V], with one height and width.
 
     Returns:
-        Rays [V * H * W], arrays of numpy, from entering to leaving a cylinder around the scene; near >= far
-        where they miss it, and where a lens has no ray for the pixel.
+        Rays [V * H * W] of numpy arrays. near >= far if a ray misses the cylinder, or if the lens has no ray
+        for the pixel.
     """
     rays = _all_rays(stack)
     origins, directions, viewdirs = (
         np.asarray(leaf).reshape(-1, 3) for leaf in (rays.origins, rays.directions, rays.viewdirs)
     )
-    # The round side is a quadratic in t.
+    # The intersections with the lateral surface are the roots of a quadratic in t.
     start, slope = origins[:, :2], directions[:, :2]
-    square = np.maximum((slope**2).sum(axis=-1), 1e-12)  # a ray along the axis never meets the side
+    square = np.maximum((slope**2).sum(axis=-1), 1e-12)  # a ray parallel to the axis has none
     middle = -(start * slope).sum(axis=-1) / square
     closest = ((start + middle[:, None] * slope) ** 2).sum(axis=-1)
     half = np.sqrt(np.maximum(_CYLINDER["radius"] ** 2 - closest, 0) / square)
-    with np.errstate(divide="ignore"):  # a level ray meets the ends at infinity
+    with np.errstate(divide="ignore"):  # a horizontal ray meets the ends at infinity
         ends = np.sort((np.float32([_CYLINDER["ends"]]) - origins[:, 2:]) / directions[:, 2:], axis=-1)
     near = np.maximum(middle - half, ends[:, 0])
     through = np.asarray(rays.far).reshape(-1) > 0
@@ -130,7 +136,7 @@ def scene_rays(stack):
     )
 
 
-@jax.jit  # step by step, each of a lens's operations would be compiled by itself
+@jax.jit  # otherwise each operation of a lens is compiled separately
 def _all_rays(stack):
     grid = cameras.pixel_grid(stack.height, stack.width).reshape(-1, 2)
     return jax.vmap(lambda camera: cameras.rays_from_pixels(camera, grid, near=0.0, far=1.0))(stack)
@@ -143,18 +149,18 @@ def _render(rays, scene, num_segments):
 
 
 def _cameras(split, size):
-    """Returns V cameras on a golden spiral, looking at the origin from above and from a little below."""
+    """Returns V cameras on a golden spiral that look at the origin, most of them from above."""
     count = _COUNT[split]
     steps = np.arange(count)
-    height = -0.25 + 1.2 * (steps + 0.5) / count  # sine of the elevation; short of 1, where up means nothing
+    height = -0.25 + 1.2 * (steps + 0.5) / count  # sine of the elevation; below 1, where up is undefined
     golden = math.pi * (3 - math.sqrt(5))
-    azimuth = golden * steps + list(_COUNT).index(split)  # a radian between splits: no pose comes twice
+    azimuth = golden * steps + list(_COUNT).index(split)  # one radian between splits, so that all poses differ
     around = np.sqrt(1 - height**2)
     eyes = _DISTANCE * np.stack([around * np.cos(azimuth), around * np.sin(azimuth), height], axis=-1)
     to_world = jax.vmap(lambda eye: look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))(eyes)
     return Camera(
         to_world=np.asarray(to_world),
-        focal=np.full((count, 2), 1.36 * size, np.float32),  # the whole plinth fits
+        focal=np.full((count, 2), 1.36 * size, np.float32),  # the whole plinth is visible
         center=np.full((count, 2), size / 2, np.float32),
         height=size,
         width=size,
@@ -162,8 +168,7 @@ def _cameras(split, size):
 
 
 def _fingerprint():
-    """Returns a hash of the source code that the pixels depend on: a changed scene is rendered anew."""
+    """Returns a hash of the source code that the pixels depend on."""
     own = sys.modules[__name__]
     modules = (still_life, cameras, volume_rendering, poses, rendering, sampling, types, image_files, own)
-    source = "".join(inspect.getsource(module) for module in modules)
-    return hashlib.sha256(source.encode()).hexdigest()[:16]
+    return fingerprint(*(inspect.getsource(module) for module in modules))

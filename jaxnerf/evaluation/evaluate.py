@@ -1,8 +1,8 @@
-"""Scores of a trained run on held-out views, and the pictures they were taken from.
+"""Scores a trained run on held-out views, and writes the images that the metrics are computed from.
 
-A view is finished when its pictures and its row of scores are in eval/<step>.tmp/. What is finished is kept
-and skipped, whoever made it: a call that was stopped, or another shard. The call after which none is missing
-makes results.json of them and moves the folder to eval/<step>/.
+A view is finished when its images and its row of metrics are in eval/<step>.tmp/. Finished views are kept and
+skipped, whichever process made them: one that was stopped, or another shard. The process that finds all views
+finished writes results.json and moves the folder to eval/<step>/.
 """
 
 import functools
@@ -10,6 +10,7 @@ import os
 import pathlib
 import shutil
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +19,16 @@ from ml_collections import ConfigDict
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Views
 from jaxnerf.data.ray_batches import pixel_colors
-from jaxnerf.evaluation import aggregate, pictures
-from jaxnerf.evaluation.metrics import scores
-from jaxnerf.evaluation.restore import newest_step, restore_run
-from jaxnerf.runtime import processes, shards
-from jaxnerf.training import metric_log, workdir
+from jaxnerf.evaluation import aggregate, output_images
+from jaxnerf.evaluation.metrics import image_metrics
+from jaxnerf.evaluation.restore import TrainedRun, newest_step, render_settings, restore_run
+from jaxnerf.runtime import atomic_files, processes, shards
+from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.loop import train
 
-_OTHER = "give --overwrite without --shard, or remove it"
+_REMEDY = "give --overwrite without --shard, or remove it"
 
 
 def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views: Views | None = None) -> bool:
@@ -38,8 +40,8 @@ def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views:
         views: of the split "train" where they have been read.
 
     Returns:
-        Whether training, and with `eval.at_end` scoring, came to its end. False: stopped by Ctrl-C or SIGTERM
-        and saved; the same call goes on.
+        Whether training, and with `eval.at_end` the evaluation, are complete. False: stopped by Ctrl-C or
+        SIGTERM and saved; the same call continues.
 
     Raises:
         ValueError: on bad input, when another process trains in the workdir, or when too many steps in a row
@@ -48,117 +50,130 @@ def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views:
     return train(config, workdir, views=views, at_end=_score_newest)
 
 
-def _score_newest(folder):
-    """Scores the last checkpoint unless it is scored already; returns whether it is."""
-    if (pathlib.Path(folder) / "eval" / str(Checkpoints(folder).steps()[-1])).exists():
+def _score_newest(workdir):
+    """Scores the last checkpoint unless it has been scored; returns False where that is interrupted."""
+    if (pathlib.Path(workdir) / "eval" / str(Checkpoints(workdir).steps()[-1])).exists():
         return True
     try:
-        evaluate(folder, shard=(jax.process_index(), jax.process_count()))
+        evaluate(workdir, shard=(jax.process_index(), jax.process_count()))
     except KeyboardInterrupt:
-        processes.say("stopped while scoring; the checkpoints are saved, and the same command goes on scoring")
+        processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
         return False
     return True
 
 
 def evaluate(
-    folder,
+    workdir: str | os.PathLike,
     *,
-    config=None,
-    split=None,
-    step=None,
-    chunk=None,
-    settings=None,
-    overwrite=False,
-    shard=shards.WHOLE,
-):
+    config: ConfigDict | None = None,
+    data_dir: str | None = None,
+    split: str | None = None,
+    step: int | None = None,
+    settings: dict[str, Any] | None = None,
+    overwrite: bool = False,
+    shard: tuple[int, int] = shards.WHOLE,
+) -> dict[str, Any] | None:
     """Scores one checkpoint and writes <workdir>/eval/<step>/.
 
     Args:
-        folder: the workdir.
-        config: ConfigDict in place of the workdir's own.
-        split: of the data; the configuration's eval.split when None. Another split than that one
-            is written to eval/<step>-<split>.
+        workdir: the folder that training wrote.
+        config, data_dir, settings: see `restore_run`.
+        split: of the dataset; the config's eval.split when None. The results of any other split are written
+            to eval/<step>-<split>/.
         step: of the checkpoint; the newest when None.
-        chunk: rays rendered at once; the configuration's eval.chunk when None; 0: see image_renderer.
-        settings: see open_run.
         overwrite: whether an earlier result of the same step and split is replaced.
-        shard: (index, count): only every count-th view from that index on.
+        shard: (index, count): only every count-th view, from view `index` on.
 
     Returns:
-        What results.json holds; None where views of other shards are missing still.
+        What results.json holds; None while views of other shards are missing.
 
     Raises:
-        ValueError: if there is no such run, checkpoint or split, the result is already there, or what is
-            finished of it was scored with other settings.
+        ValueError: if there is no such run, checkpoint or split, the result exists, or its finished views were
+            scored with other settings.
     """
-    run = restore_run(folder, config, settings=settings)
-    return score_run(run, folder, split=split, step=step, chunk=chunk, overwrite=overwrite, shard=shard)
+    run = restore_run(workdir, config, data_dir=data_dir, settings=settings)
+    return score_run(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
 
 
-def score_run(run, folder, *, split=None, step=None, chunk=None, overwrite=False, views=None, shard=shards.WHOLE):
-    """As evaluate, for a run that is open already and views that may be read already."""
-    step, chunk = newest_step(run, folder, step), run.experiment.eval.chunk if chunk is None else chunk
-    target = claim_target(run, folder, split=split, step=step, overwrite=overwrite, shard=shard)
+def score_run(
+    run: TrainedRun,
+    workdir: str | os.PathLike,
+    *,
+    split: str | None = None,
+    step: int | None = None,
+    overwrite: bool = False,
+    views: Views | None = None,
+    shard: tuple[int, int] = shards.WHOLE,
+) -> dict[str, Any] | None:
+    """Scores a checkpoint as `evaluate` does, for a restored run and views that may have been read already."""
+    step = newest_step(run, workdir, step)
+    target = claim_target(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
     split = split or run.experiment.eval.split
     views = run.experiment.load_split(split) if views is None else views
     variables = run.variables(step)
     partial, origin = target.with_name(target.name + ".tmp"), _origin(run, variables, views, split, step)
-    rest = {"run": run, "folder": folder, "views": views, "variables": variables, "origin": origin}
     if target.exists() and not overwrite:
-        return aggregate.read(target, origin, _OTHER)
-    shards.claim_folder(partial, origin, overwrite=overwrite, file=aggregate.ORIGIN, other=_OTHER)
+        return aggregate.read(target, origin, _REMEDY)
+    shards.claim_folder(partial, origin, overwrite=overwrite, file=aggregate.ORIGIN, remedy=_REMEDY)
     try:
-        with workdir.naming(partial):
+        with atomic_files.naming(partial):
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
-            _score_views(run, functools.partial(run.render_image, variables), views, chunk, partial, shard)
-            return aggregate.merge(partial, target, chunk=chunk, **rest)
-    except FileNotFoundError:  # another call has finished and moved it all, perhaps while this one began
+            _score_views(run, functools.partial(run.render_image, variables), views, partial, shard)
+            return aggregate.merge(
+                partial, target, run=run, workdir=workdir, views=views, variables=variables, origin=origin
+            )
+    except FileNotFoundError:  # another process has finished and moved the folder, perhaps just now
         if partial.exists() and any((partial / "rows").glob("*")) or not target.exists():
             raise
         shutil.rmtree(partial, ignore_errors=True)
-        return aggregate.read(target, origin, _OTHER)
+        return aggregate.read(target, origin, _REMEDY)
 
 
-def claim_target(run, folder, *, split=None, step=None, overwrite=False, shard=shards.WHOLE):
-    """Returns the folder that a score goes to; ValueError if it is there already and not to be replaced.
+def claim_target(
+    run: TrainedRun,
+    workdir: str | os.PathLike,
+    *,
+    split: str | None = None,
+    step: int | None = None,
+    overwrite: bool = False,
+    shard: tuple[int, int] = shards.WHOLE,
+) -> pathlib.Path:
+    """Returns the folder of a result; raises ValueError if it exists and is not to be replaced.
 
-    To a shard it may be there: then all shards are finished, and this one has nothing to do.
+    For a shard it may exist: then all shards are finished, and this one has nothing to do.
     """
-    step, own = newest_step(run, folder, step), run.experiment.eval.split
+    step, own = newest_step(run, workdir, step), run.experiment.eval.split
     name = str(step) if split in (None, own) else f"{step}-{split}"
-    target = pathlib.Path(folder) / "eval" / name
+    target = pathlib.Path(workdir) / "eval" / name
     shards.refuse_overwrite(overwrite, shard, target)
     if target.exists() and not overwrite and shard == shards.WHOLE:
-        raise ValueError(f"{target}: is there already; give --overwrite to score again, or another --step")
+        raise ValueError(f"{target}: exists already; give --overwrite to score again, or another --step")
     return target
 
 
 def _origin(run, variables, views, split, step):
-    """Returns all that the scores depend on, but for the chunk, which they do not show."""
-    settings = {
-        name: vars(run.experiment.eval).get(name) for name in ("sample_multiplier", "early_stop_eps", "bake_occupancy")
-    }
+    """Returns everything that the metrics depend on; the chunk is absent, as it changes no pixel."""
     return {
         "split": split,
         "step": step,
-        **settings,
-        "configuration": shards.digest(run.identity),
-        "parameters": shards.digest(variables[0]),
-        "cameras": shards.digest(views.cameras, views.near, views.far, "/".join(views.names)),
-        "photographs": shards.digest(views.pixels, sample=4096),
+        **render_settings(run),
+        "config": fingerprint(run.identity),
+        "parameters": fingerprint(variables[0]),
+        "cameras": fingerprint(views.cameras, views.near, views.far, *views.names),
+        "images": fingerprint(views.pixels, sample=4096),
     }
 
 
-def summary(results):
+def summary(results: dict[str, Any]) -> str:
     """Returns one line that sums up results.json."""
     step = f"step {results['step']}: " if "step" in results else ""
-    speed = f", {results['seconds_per_frame']:.2f} s a frame" if "seconds_per_frame" in results else ""
-    scores = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
-    return f"{step}{scores} over {results['views']} views{speed}"
+    speed = f", {results['seconds_per_frame']:.2f} s per frame" if "seconds_per_frame" in results else ""
+    metrics = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
+    return f"{step}{metrics} over {results['views']} views{speed}"
 
 
-def reference(views, index):
+def reference(views: Views, index: int) -> jax.Array:
     """Returns the colours [H, W, 3] of one of Views, over its background."""
     height, width = (int(value) for value in views.size[index])
     first = int(views.offset[index])
@@ -166,8 +181,16 @@ def reference(views, index):
     return pixel_colors(pixels, views.background).reshape(height, width, 3)
 
 
-def _score_views(run, render, views, chunk, folder, shard):
-    """Renders and scores those views that are a shard's and not finished yet."""
+def pixel_mask(views: Views, index: int) -> jax.Array | None:
+    """Returns [H, W] bool of one of Views: which pixels the metrics use; None where all."""
+    if views.mask is None:
+        return None
+    (height, width), first = views.size[index], int(views.offset[index])
+    return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
+
+
+def _score_views(run, render, views, folder, shard):
+    """Renders and scores those views of a shard that are not finished."""
     frames = shards.own(range(len(views.names)), shard)
     todo = [index for index in frames if not aggregate.is_finished(folder, index)]
     progress, first = metric_log.Progress(len(frames), show=processes.is_first()), True
@@ -176,21 +199,13 @@ def _score_views(run, render, views, chunk, folder, shard):
         pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
         started = time.perf_counter()
         rays = run.experiment.view_rays(views, index, pixels)
-        image = jax.block_until_ready(render(rays, chunk=chunk))
+        image = jax.block_until_ready(render(rays))
         seconds = time.perf_counter() - started
         truth = reference(views, index)
-        row = {"name": name, **scores(image.rgb, truth, live_mask(views, index)), "seconds": seconds}
+        row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
-        pictures.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
-        aggregate.finish(folder, index, row, first, len(views.names), truth, image)
+        output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
+        aggregate.finish(folder, index, row, truth, image, count=len(views.names), first=first)
         progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
         first = False
     progress.close()
-
-
-def live_mask(views, index):
-    """Returns [H, W] bool of one of Views, which pixels count; None where all do."""
-    if views.mask is None:
-        return None
-    (height, width), first = views.size[index], int(views.offset[index])
-    return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)

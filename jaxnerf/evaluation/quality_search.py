@@ -1,120 +1,152 @@
-"""The cheapest way to render a trained model that stays within an error."""
+"""Searches the cheapest settings that render a trained model within an error."""
 
+import os
 import sys
 import time
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from ml_collections import ConfigDict
 
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.evaluate import claim_target
 from jaxnerf.evaluation.restore import newest_step, restore_run
 
-_EXACT = {
-    "sample_multiplier": 4.0,
-    "early_stop_eps": 0.0,
-    "bake_occupancy": False,
-}  # what the error is measured against
-_SAMPLES = (1.0, 0.7, 0.5, 0.35, 0.25)
-_STOPS = (1e-3, 1e-2, 3e-2, 1e-1)
+# What the error is measured against.
+_EXACT = {"sample_multiplier": 4.0, "early_stop_eps": 0.0, "bake_occupancy": False}
+_SAMPLE_MULTIPLIERS = (1.0, 0.7, 0.5, 0.35, 0.25)
+_EARLY_STOP_EPS = (1e-3, 1e-2, 3e-2, 1e-1)
 
 
-class Choice(NamedTuple):
-    """One way to render, and what it costs."""
+class Candidate(NamedTuple):
+    """One way to render, and what it costs.
 
-    settings: dict  # of the configuration's eval section
-    error: float  # root of the mean square, over colours, of the difference from the exact rendering
-    seconds: float  # for the rays that were tried
+    Attributes:
+        settings: of the config's section `eval`.
+        error: root mean square, over colours, of the difference from the exact rendering.
+        seconds: for the rays that were rendered.
+    """
 
-
-def choose(folder, error_budget, *, config=None, split=None, step=None, chunk=None, overwrite=False):
-    """Returns the settings of cheapest_settings for evaluate, and prints what was tried and picked."""
-    # The search takes a while, so what would end the scoring after it comes first.
-    claim_target(restore_run(folder, config), folder, split=split, step=step, overwrite=overwrite)
-    options = {"config": config, "split": split, "step": step, "chunk": chunk}
-    choice, tried = cheapest_settings(folder, error_budget, **options)
-    for other in tried:
-        print(f"{_text(other)}{'  <- picked' if other is choice else ''}", file=sys.stderr)
-    return choice.settings
+    settings: dict[str, Any]
+    error: float
+    seconds: float
 
 
-def _text(choice):
-    settings = ", ".join(f"{name} {value}" for name, value in choice.settings.items())
-    return f"RMS error {choice.error:.5f} in {choice.seconds:.3f} s: {settings}"
+def choose(
+    workdir: str | os.PathLike,
+    error_budget: float,
+    *,
+    config: ConfigDict | None = None,
+    data_dir: str | None = None,
+    split: str | None = None,
+    step: int | None = None,
+    settings: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Returns the settings of `cheapest_settings` for `evaluate`, and prints all candidates."""
+    # The search takes a while, so errors that would end the evaluation after it come first.
+    claim_target(restore_run(workdir, config, data_dir=data_dir), workdir, split=split, step=step, overwrite=overwrite)
+    options = {"config": config, "data_dir": data_dir, "split": split, "step": step, "settings": settings}
+    best, candidates = cheapest_settings(workdir, error_budget, **options)
+    for candidate in candidates:
+        tried = ", ".join(f"{name} {value}" for name, value in candidate.settings.items())
+        line = f"RMS error {candidate.error:.5f} in {candidate.seconds:.3f} s: {tried}"
+        print(f"{line}{'  <- chosen' if candidate is best else ''}", file=sys.stderr)
+    return best.settings
 
 
-def cheapest_settings(folder, error_budget, *, config=None, split=None, step=None, chunk=None, num_rays=4096):
-    """Returns the cheapest Choice within a budget, and all that were tried.
+def cheapest_settings(
+    workdir: str | os.PathLike,
+    error_budget: float,
+    *,
+    config: ConfigDict | None = None,
+    data_dir: str | None = None,
+    split: str | None = None,
+    step: int | None = None,
+    settings: dict[str, Any] | None = None,
+    num_rays: int = 4096,
+    sample_multipliers: Sequence[float] = _SAMPLE_MULTIPLIERS,
+    early_stop_eps: Sequence[float] = _EARLY_STOP_EPS,
+) -> tuple[Candidate, list[Candidate]]:
+    """Returns the cheapest candidate within a budget, and all candidates.
 
-    Tried on rays through random pixels of a split's views, of which only the cameras count: the error is that
-    against the same model's own rendering with four times the samples, no stop, and nothing skipped but what
-    it was trained to skip.
+    Candidates render rays through random pixels of a split's views, of which only the cameras are used. The
+    error is the difference from the same model's own rendering with four times the samples, no early
+    termination, and no grid but the one that the model was trained with.
 
     Args:
-        folder: the workdir.
-        error_budget: in units of colour, of [0, 1].
-        config: see open_run.
-        split: views held out of training; the configuration's eval.split when None.
+        workdir: the folder that training wrote.
+        error_budget: in units of colour, in [0, 1].
+        config, data_dir: see `restore_run`.
+        split: of views; the config's eval.split when None.
         step: of the checkpoint; the newest when None.
-        chunk: rays at once, see evaluate; of the exact rendering as many fewer as it has more samples.
-        num_rays: to try on.
+        settings: other fields of the config's section `eval` to replace, by name. The exact rendering takes
+            smaller chunks than `chunk` says, as it has more samples.
+        num_rays: to render.
+        sample_multipliers, early_stop_eps: values of the settings to try, in this order; the first are the most
+            exact.
 
     Returns:
-        Choice, and a list of Choices in the order in which they were tried.
+        The Candidate, and all in the order in which they were rendered.
 
     Raises:
-        ValueError: if none is within the budget; says how near the best comes.
+        ValueError: if none is within the budget; says how close the best comes.
     """
-    exact = restore_run(folder, config, settings=_EXACT)
-    split = split or exact.experiment.eval.split
+    exact = restore_run(workdir, config, data_dir=data_dir, settings={**(settings or {}), **_EXACT})
     experiment = exact.experiment
-    rays = random_rays(
-        experiment.load_split(split), num_rays, experiment.view_rays, pixel_offset=experiment.pixel_offset
-    )
-    step = newest_step(exact, folder, step)
-    chunk = experiment.eval.chunk if chunk is None else chunk
-    fewer = -(-chunk // int(_EXACT["sample_multiplier"]))
-    truth = np.asarray(exact.render_image(exact.variables(step), rays, chunk=min(fewer, num_rays)).rgb)
-    tried, variables = [], {}
+    views = experiment.load_split(split or experiment.eval.split)
+    rays = random_rays(views, num_rays, experiment.view_rays, pixel_offset=experiment.pixel_offset)
+    step = newest_step(exact, workdir, step)
+    smaller_chunk = -(-experiment.eval.chunk // int(_EXACT["sample_multiplier"]))
+    exact_variables = exact.variables(step)
+    truth = np.asarray(exact.render_image(exact_variables, rays, chunk=smaller_chunk).rgb)
+    candidates, variables = [], {False: exact_variables}
 
-    def attempt(settings):
-        run = restore_run(folder, config, settings=settings)
-        if settings["bake_occupancy"] not in variables:  # neither samples nor stop change them
-            variables[settings["bake_occupancy"]] = run.variables(step)
-        rgb, seconds = _render(run, variables[settings["bake_occupancy"]], rays, min(chunk, num_rays))
-        tried.append(Choice(settings, float(np.sqrt(np.mean((rgb - truth) ** 2))), seconds))
-        return tried[-1].error <= error_budget
+    def is_within(multiplier, eps, bake):
+        tried = {"sample_multiplier": multiplier, "early_stop_eps": eps, "bake_occupancy": bake}
+        run = restore_run(workdir, config, data_dir=data_dir, settings={**(settings or {}), **tried})
+        if bake not in variables:  # the other settings do not change them
+            variables[bake] = run.variables(step)
+        rgb, seconds = _render(run, variables[bake], rays)
+        candidates.append(Candidate(tried, float(np.sqrt(np.mean((rgb - truth) ** 2))), seconds))
+        return candidates[-1].error <= error_budget
 
-    skips = exact.experiment.model.grid_schedule is not None
-    for bake_occupancy in (False,) if skips else (False, True):
-        _descend(attempt, tried, bake_occupancy, stops=_STOPS if skips or bake_occupancy else _STOPS[:1])
-    within = [choice for choice in tried if choice.error <= error_budget]
+    has_grid = experiment.model.grid_schedule is not None
+    for bake in (False,) if has_grid else (False, True):
+        # Without a grid no ray ends early.
+        _search(is_within, sample_multipliers, early_stop_eps if has_grid or bake else early_stop_eps[:1], bake)
+    return _fastest(candidates, error_budget, workdir), candidates
+
+
+def _search(is_within, sample_multipliers, early_stop_eps, bake):
+    """Lowers the number of samples while the error allows it, then raises early_stop_eps."""
+    lowest = sample_multipliers[0]
+    for multiplier in sample_multipliers:
+        if not is_within(multiplier, early_stop_eps[0], bake):
+            break
+        lowest = multiplier
+    for eps in early_stop_eps[1:]:
+        if not is_within(lowest, eps, bake):
+            break
+
+
+def _fastest(candidates, error_budget, workdir):
+    within = [candidate for candidate in candidates if candidate.error <= error_budget]
     if not within:
-        best = min(tried, key=lambda choice: choice.error)
+        best = min(candidates, key=lambda candidate: candidate.error)
         raise ValueError(
-            f"{folder}: no settings stay within {error_budget:g}; the nearest, {best.settings}, differ by "
+            f"{workdir}: no settings stay within {error_budget:g}; the closest, {best.settings}, differ by "
             f"{best.error:.2g}: allow that, or train with more samples"
         )
-    return min(within, key=lambda choice: choice.seconds), tried
+    return min(within, key=lambda candidate: candidate.seconds)
 
 
-def _descend(attempt, tried, bake_occupancy, stops):
-    """Tries fewer and fewer samples, and with the fewest that do, earlier and earlier stops."""
-    fewest = _SAMPLES[0]
-    for samples in _SAMPLES:
-        if not attempt({"sample_multiplier": samples, "early_stop_eps": stops[0], "bake_occupancy": bake_occupancy}):
-            break
-        fewest = samples
-    for stop in stops[1:]:
-        if not attempt({"sample_multiplier": fewest, "early_stop_eps": stop, "bake_occupancy": bake_occupancy}):
-            break
-
-
-def _render(run, variables, rays, chunk):
-    """Returns colours [N, 3] and the seconds that they took, compilation not counted."""
-    rgb, seconds = run.render_image(variables, rays, chunk=chunk).rgb, []
+def _render(run, variables, rays):
+    """Returns colours [N, 3] and the seconds that they took, without compilation."""
+    rgb, seconds = run.render_image(variables, rays).rgb, []
     for _ in range(3):
         started = time.perf_counter()
-        run.render_image(variables, rays, chunk=chunk)
+        run.render_image(variables, rays)
         seconds.append(time.perf_counter() - started)
     return np.asarray(rgb), min(seconds)

@@ -1,6 +1,8 @@
-"""A trained run as functions for other code."""
+"""Restores a trained run as functions for other code."""
 
+import copy
 import functools
+import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,59 +10,74 @@ import jax
 import numpy as np
 from ml_collections import ConfigDict
 
-from jaxnerf.core.types import SceneFn
+from jaxnerf.core.types import Rays, Rendering, SceneFn
+from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
-from jaxnerf.runtime.chunking import image_renderer
-from jaxnerf.training import auto_config, build, workdir
-from jaxnerf.training.averaging import averaged_params
+from jaxnerf.runtime.memory import image_renderer
+from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.optimizer import averaged_params
 from jaxnerf.training.state import create_state
+from jaxnerf.training.workdir import read_config
+
+_RENDER_SETTINGS = ("sample_multiplier", "early_stop_eps", "bake_occupancy")
 
 
 class TrainedRun(NamedTuple):
     """A run's experiment and the functions that read and render its checkpoints.
 
-    The variables of a checkpoint are (params, grid); the grid is None where the model has none.
+    Attributes:
+        experiment: what its config describes, see `build.Experiment`.
+        steps: () -> the steps of the finished checkpoints, ascending.
+        variables: step -> (params, grid) of that checkpoint; the grid is None where the model has none.
+        render: (variables, Rays [...]) -> Rendering [...] without weights, jitted.
+        identity: text that is equal for configs that render alike, see `build.identity`.
+        render_image: (variables, Rays [...], chunk=None) -> Rendering [...] as `render`, in chunks that fit
+            into memory.
     """
 
     experiment: build.Experiment
-    steps: Callable[[], list[int]]  # the steps of the finished checkpoints, ascending
-    variables: Callable[[int], tuple]  # step -> (params, grid)
-    render: Callable[..., Any]  # (variables, Rays [...]) -> Rendering [...] without weights, jitted
-    identity: str  # of its config, see build.identity
-    render_image: Callable[..., Any]  # (variables, Rays [...], chunk=None) -> the same in chunks
+    steps: Callable[[], list[int]]
+    variables: Callable[[int], tuple]
+    render: Callable[[tuple, Rays], Rendering]
+    identity: str
+    render_image: Callable[..., Rendering]
 
 
 def restore_run(
-    workdir_path,
+    workdir: str | os.PathLike,
     config: ConfigDict | None = None,
     *,
     data_dir: str | None = None,
-    settings: dict | None = None,
+    settings: dict[str, Any] | None = None,
 ) -> TrainedRun:
-    """Restores the run in a workdir.
+    """Restores the run in a workdir. Checkpoints are read when `variables` is called.
 
     Args:
-        workdir_path: the folder that training wrote.
+        workdir: the folder that training wrote.
         config: in place of the workdir's own; its "auto" fields have the values of the workdir's.
         data_dir: the dataset's folder in place of the config's.
         settings: fields of the config's section `eval` to replace, by name.
 
     Raises:
-        ValueError: if there is no run; names the folder.
+        ValueError: if there is no run, or no dataset in data_dir; names the folder.
     """
     if config is None:
-        config = workdir.read_config(workdir_path)
+        config = read_config(workdir)
     elif auto_config.auto_fields(config):
-        config = auto_config.fill_from(config, workdir.read_config(workdir_path))
+        config = auto_config.fill_from(config, read_config(workdir))
+    else:
+        config = copy.deepcopy(config)
     if data_dir:
         config.data.dir = data_dir
+        if config.data.format == "synthetic":  # it has no folder, so the folder's own format counts
+            config.data.format = "auto"
+        config.data, _ = dataset.resolve(config.data)
     config.eval.update(settings or {})
     config, _ = auto_config.resolve_for_device(config)
     experiment = build.build(config)
-    checkpoints = Checkpoints(workdir_path)
-    model, trained = experiment.model, experiment.model
-    bake = None
+    checkpoints = Checkpoints(workdir)
+    trained, model, bake = experiment.model, experiment.model, None
     if config.eval.bake_occupancy and model.grid_schedule is None:
         views = experiment.load_split("train")
         options = {"view_rays": experiment.view_rays, "pixel_offset": experiment.pixel_offset}
@@ -87,29 +104,38 @@ def restore_run(
     return TrainedRun(experiment, checkpoints.steps, variables, render, identity, render_image)
 
 
-def newest_step(run: TrainedRun, workdir_path, step: int | None = None) -> int:
-    """Returns the newest checkpoint's step, or the given one; raises ValueError if there is none."""
+def render_settings(run: TrainedRun) -> dict[str, Any]:
+    """Returns the settings of the config's section `eval` that change what a run renders, by name."""
+    return {name: getattr(run.experiment.eval, name) for name in _RENDER_SETTINGS}
+
+
+def newest_step(run: TrainedRun, workdir: str | os.PathLike, step: int | None = None) -> int:
+    """Returns the newest checkpoint's step, or the given one.
+
+    Raises:
+        ValueError: if there is no such checkpoint; names the workdir.
+    """
     steps = run.steps()
     if not steps:
-        raise ValueError(f"{workdir_path}: has no checkpoint yet; train first, or wait with --watch")
+        raise ValueError(f"{workdir}: has no checkpoint yet; train first, or wait with --watch")
     if step is not None and step not in steps:
-        raise ValueError(f"{workdir_path}: has no checkpoint of step {step}, only {steps}; give one of these")
+        raise ValueError(f"{workdir}: has no checkpoint of step {step}, only {steps}; give one of these")
     return steps[-1] if step is None else step
 
 
-def load_scene(workdir_path) -> tuple[SceneFn, Callable[..., Any]]:
-    """Loads a trained model for other code.
+def load_scene(workdir: str | os.PathLike) -> tuple[SceneFn, Callable[[Rays], Rendering]]:
+    """Loads the newest checkpoint of a run for other code.
 
     Args:
-        workdir_path: the folder that training wrote.
+        workdir: the folder that training wrote.
 
     Returns:
         scene, the trained field as a function (x, viewdirs) -> (density, rgb); and render, a jitted function
-        Rays [...] -> Rendering [...] with the sampling and background that it was trained for.
+        Rays [...] -> Rendering [...] with the samples and background that the run was trained for.
 
     Raises:
         ValueError: if the folder holds no finished checkpoint; names it.
     """
-    run = restore_run(workdir_path)
-    variables = run.variables(newest_step(run, workdir_path))
+    run = restore_run(workdir)
+    variables = run.variables(newest_step(run, workdir))
     return run.experiment.model.scene(*variables), functools.partial(run.render, variables)

@@ -1,52 +1,62 @@
-"""Scores of a training while it runs."""
+"""Scores the checkpoints of a training while it runs."""
 
+import os
 import pathlib
 import sys
 import time
+from typing import Any
+
+from ml_collections import ConfigDict
 
 from jaxnerf.evaluation.evaluate import score_run, summary
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import metric_log
 
 
-def watch(folder, *, poll_seconds=10.0, config=None, data_dir=None, split=None, chunk=None):
-    """Scores every new checkpoint of a running training until its last one; says when it waits.
+def watch(
+    workdir: str | os.PathLike,
+    *,
+    poll_seconds: float = 10.0,
+    config: ConfigDict | None = None,
+    data_dir: str | None = None,
+    split: str | None = None,
+    settings: dict[str, Any] | None = None,
+) -> None:
+    """Scores every new checkpoint of a training until its last one, and reports when it waits.
 
     Args:
-        folder: the workdir, which training may not have made yet.
-        poll_seconds: how often it looks.
-        config, data_dir, split, chunk: see evaluate.
+        workdir: that training writes; it may not exist yet.
+        poll_seconds: time between searches for a new checkpoint.
+        config, data_dir, split, settings: see `evaluate`.
 
     Raises:
-        ValueError: as evaluate.
+        ValueError: as `evaluate`.
     """
-    folder, said = pathlib.Path(folder), None
-    while not (folder / "config.json").exists():
-        said = _wait(f"{folder}: no run yet", said, poll_seconds)
-    run = restore_run(folder, config, data_dir=data_dir)
+    workdir, said = pathlib.Path(workdir), None
+    while not (workdir / "config.json").exists():
+        said = _wait(f"{workdir}: no run yet", said, poll_seconds)
+    run = restore_run(workdir, config, data_dir=data_dir, settings=settings)
     split = split or run.experiment.eval.split
     suffix = "" if split == run.experiment.eval.split else f"-{split}"
     views = run.experiment.load_split(split)
     while True:
-        new = [step for step in run.steps() if not (folder / "eval" / f"{step}{suffix}").exists()]
+        new = [step for step in run.steps() if not (workdir / "eval" / f"{step}{suffix}").exists()]
         if new:
             try:
-                print(
-                    summary(score_run(run, folder, split=split, step=new[0], chunk=chunk, views=views)),
-                    flush=True,
-                )
+                results = score_run(run, workdir, split=split, step=new[0], views=views)
+                print(summary(results), flush=True)
             except ValueError:
-                if new[0] in run.steps():  # else training has removed it as too old, which is no error
+                if new[0] in run.steps():  # otherwise training has deleted it as too old, which is no error
                     raise
-        elif _ended(run, folder):
+        elif _has_ended(run, workdir):
             return
         else:
-            said = _wait(f"{folder}: no new checkpoint", said, poll_seconds)
+            said = _wait(f"{workdir}: no new checkpoint", said, poll_seconds)
 
 
-def _ended(run, folder):
+def _has_ended(run, workdir):
     """Returns whether the training has written its last checkpoint, by its steps or by its clock."""
-    options, steps, rows = run.experiment.train, run.steps(), metric_log.read_rows(folder)
+    options, steps, rows = run.experiment.train, run.steps(), metric_log.read_rows(workdir)
     if not steps:
         return False
     late = rows and rows[-1]["step"] == steps[-1] and 0 < options.max_seconds <= rows[-1]["seconds"]
@@ -54,8 +64,8 @@ def _ended(run, folder):
 
 
 def _wait(text, said, seconds):
-    """Sleeps, and says so where it was not the last thing said; returns what was."""
+    """Sleeps, after printing the text unless it was printed last; returns the text."""
     if text != said:
-        print(f"{text}; looking again every {seconds:g} s", file=sys.stderr, flush=True)
+        print(f"{text}; checking again every {seconds:g} s", file=sys.stderr, flush=True)
     time.sleep(seconds)
     return text

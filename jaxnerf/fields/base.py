@@ -1,4 +1,4 @@
-"""What a field is: parameters, and a function of them that is a scene."""
+"""The interface of fields: parameters, and a function of them that is a scene."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -7,25 +7,28 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import linen
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core import contraction
+from jaxnerf.core.types import Vector
 from jaxnerf.registry import FIELDS
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
 
 _CACHE_ROW = 512  # float32 numbers, 2 KiB
-_MORE_SAMPLES, _FEW_RAYS = 32, 16  # padding of few rays; fewer rays than that would grow much by one
+_FEW_RAYS = 16  # fewer would grow much by one more ray
+_MORE_SAMPLES = 32  # padding of each of few rays
 
 
 class Field(NamedTuple):
     """A learned scene.
 
     Attributes:
-        init: key -> params.
-        apply: (params, x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S], rgb [..., S, 3]). A
-            field may take `key` and `density_noise` as keywords, see `mlp_field`.
-        input_layers: names in params of the layers that the position enters; empty: all of them. A field
-            that no gradient reaches there is dead.
+        init: key -> params, any pytree of float arrays.
+        apply: (params, x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S] in 1 / world unit, rgb
+            [..., S, 3] in [0, 1]). A field may take `key` and `density_noise` as keywords, see `mlp_field`.
+        input_layers: keys of params, the layers that the position enters; empty: all of them. A field is dead
+            if no gradient reaches these, and training then reinitializes it.
     """
 
     init: Callable[[jax.Array], Any]
@@ -37,7 +40,7 @@ def make_field(name: str, options: Mapping[str, Any], box: Box | None) -> Field:
     """Makes a field by its registered name.
 
     Args:
-        name: "mlp", "hash_grid", or a name given to `register_field`.
+        name: "mlp", "hash_grid", or a name that was given to `register_field`.
         options: of that field.
         box: of the scene, in world units; None where the run has none.
 
@@ -47,24 +50,29 @@ def make_field(name: str, options: Mapping[str, Any], box: Box | None) -> Field:
     return FIELDS.get(name)(dict(options), box)
 
 
-def contract_field(field: Field, lower, upper) -> Field:
-    """Makes the Field of all of space from one that knows a box only.
+def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
+    """Makes the Field of all of space from one that covers a box.
 
-    The inner half of the box [3] to [3] is evaluated as it is; the outer half holds the rest of space, see
-    `contraction.contract`.
+    The inner half of the box from lower [3] to upper [3] is evaluated as it is; the outer half holds the rest
+    of space, see `contraction.contract`.
     """
     middle = (jnp.asarray(lower) + jnp.asarray(upper)) / 2
-    room = (jnp.asarray(upper) - jnp.asarray(lower)) / 4
+    quarter = (jnp.asarray(upper) - jnp.asarray(lower)) / 4
 
     def apply(params, x, viewdirs, **options):
         lead = (1,) * (x.ndim - 1)
-        center, scale = middle.reshape(*lead, 3), room.reshape(*lead, 3)
+        center, scale = middle.reshape(*lead, 3), quarter.reshape(*lead, 3)
         return field.apply(params, center + scale * contraction.contract((x - center) / scale), viewdirs, **options)
 
     return field._replace(apply=apply)
 
 
-def apply_network(network: linen.Module, params, x, viewdirs) -> tuple[jax.Array, jax.Array]:
+def apply_network(
+    network: linen.Module,
+    params: Any,
+    x: Float[ArrayLike, "*batch samples 3"],
+    viewdirs: Float[ArrayLike, "*batch #samples 3"],
+) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
     """Evaluates a network at positions in a layout that suits a CPU's cache.
 
     Rows of features that are a multiple of 2 KiB long collide in the cache, which slows each product down.

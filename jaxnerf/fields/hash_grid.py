@@ -1,4 +1,4 @@
-"""The fast field: features at the vertices of several grids, and two small networks that read them."""
+"""The hash grid: features at the vertices of several levels, decoded by two small networks."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -8,44 +8,47 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen
+from jaxtyping import Array, ArrayLike, Float
 
-from jaxnerf.core.types import check_shapes
+from jaxnerf.core.types import Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network
 from jaxnerf.fields.mlp import Dense
 
 _glorot = linen.initializers.glorot_uniform()
 
 _PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, Eq. 4
-_LARGEST = 15.0  # its exponential stops all light within 1e-5 world units
+_LARGEST_EXPONENT = 15.0  # a density that is opaque within 1e-5 world units
 
 
-def hash_grid_field(**options):
-    """Returns features in grids of several resolutions as a Field (after arXiv:2201.05989).
+def hash_grid_field(**options: Any) -> Field:
+    """Makes a Field of multi-resolution features (after arXiv:2201.05989).
 
     Args:
-        **options: attributes of FeatureGrid.
+        **options: attributes of HashGrid.
 
     Returns:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3]) returns density [..., S] in
         1 / world unit, an exponential of at most e^15, and rgb [..., S, 3] in [0, 1], both float32.
-        Outside the box the answer is that of the nearest point inside.
+        Outside the box the values are those of the nearest point inside.
 
     Raises:
-        ValueError: if the box has no inside, or a level fewer than 2 vertices a side.
+        ValueError: if the box is empty, or a level has fewer than 2 vertices along its longest side.
     """
     network = HashGrid(**options)
     lower, upper = np.asarray(network.lower, float), np.asarray(network.upper, float)
     if lower.shape != (3,) or upper.shape != (3,) or not (lower < upper).all():
-        raise ValueError(f"grid_field: the box is {network.lower} to {network.upper}, wanted lower < upper")
+        raise ValueError(f"hash_grid_field: the box is {network.lower} to {network.upper}, expected lower < upper")
     if not network.resolutions or min(network.resolutions) < 2:
-        raise ValueError(f"grid_field: resolutions are {network.resolutions}, wanted one, of at least 2")
+        raise ValueError(
+            f"hash_grid_field: resolutions are {network.resolutions}, expected at least one, each at least 2"
+        )
 
     def init(key):
         return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
 
     def apply(params, x, viewdirs):
         density, rgb = apply_network(network, params, x, viewdirs)
-        return jnp.exp(jnp.minimum(density, _LARGEST)), jax.nn.sigmoid(rgb)
+        return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), jax.nn.sigmoid(rgb)
 
     return Field(init, apply)
 
@@ -62,23 +65,38 @@ def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
 
 
 class HashGrid(linen.Module):
-    """Interpolated features, a network for the density's logarithm, and one for colour (arXiv:2201.05989)."""
+    """Interpolated features, a network for the density's logarithm, and one for colour (arXiv:2201.05989).
 
-    lower: Sequence[float]  # [3] world units, the box
-    upper: Sequence[float]  # [3]
-    resolutions: Sequence[int] = (16, 32, 64, 128)  # vertices along the longest side, a level each
+    Attributes:
+        lower, upper: [3] world units, the box.
+        resolutions: vertices along the longest side, for each level.
+        features_per_level: of each vertex.
+        table_size: rows of a level; vertices beyond share rows by a hash.
+        width: features of the density network's hidden layer.
+        geometry_features: passed from the density network to the colour network.
+        view_depth: hidden layers of the colour network.
+        view_width: features of such a layer.
+        use_viewdirs: False: colour does not depend on the direction.
+        feature_scale: features over table entries. A step changes few entries, so each should change more.
+    """
+
+    lower: Sequence[float]
+    upper: Sequence[float]
+    resolutions: Sequence[int] = (16, 32, 64, 128)
     features_per_level: int = 4
-    table_size: int = 2**17  # rows of a level; where it has more vertices, they share rows by a hash
-    width: int = 64  # of the density's hidden layer
-    geometry_features: int = 15  # passed from the density network to the colour network
-    view_depth: int = 2  # hidden layers of colour
+    table_size: int = 2**17
+    width: int = 64
+    geometry_features: int = 15
+    view_depth: int = 2
     view_width: int = 128
-    use_viewdirs: bool = True  # False: colour does not depend on the direction
-    feature_scale: float = 4.0  # of the features over their table: each step moves few of them, so further
+    use_viewdirs: bool = True
+    feature_scale: float = 4.0
 
     @linen.compact
-    def __call__(self, x, viewdirs):
-        """Returns density [..., S] and rgb [..., S, 3] before their activations; features first inside."""
+    def __call__(
+        self, x: Float[ArrayLike, "*batch samples 3"], viewdirs: Float[ArrayLike, "*batch #samples 3"]
+    ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
+        """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N]."""
         shape = x.shape[:-1]
         side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
         place = [(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)]
@@ -106,20 +124,26 @@ class HashGrid(linen.Module):
         return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 
-def vertices(side, resolution):
-    """Returns how many vertices a grid has along each side [3] of a box, for cells that are nearly cubes."""
+def vertices(side: Vector, resolution: int) -> tuple[int, int, int]:
+    """Returns the number of vertices along each side [3] of a box, for cells that are nearly cubes."""
     side = np.asarray(side, np.float64)
-    return tuple(int(max(round(share * (resolution - 1)), 1)) + 1 for share in side / side.max())
+    return tuple(int(max(round(fraction * (resolution - 1)), 1)) + 1 for fraction in side / side.max())
 
 
-def interpolate(table, place, size, *, rows):
-    """Returns features, linear between the 8 vertices around each place.
+def interpolate(
+    table: Float[ArrayLike, "rows features"],
+    place: Sequence[Float[ArrayLike, " N"]],
+    size: tuple[int, int, int],
+    *,
+    rows: range,
+) -> Float[Array, "N features"]:
+    """Interpolates features linearly between the 8 vertices around each place.
 
     Args:
         table: [T, F] features of vertices.
-        place: three times [N], x, y and z as shares of the box; held inside it.
+        place: three arrays [N], x, y and z as fractions of the box; clamped to it.
         size: vertices along x, y and z.
-        rows: range of the table's rows that belong to this grid: one a vertex, z fastest, or fewer, which
+        rows: range of the table's rows that belong to this level: one per vertex, z fastest, or fewer, which
             vertices then share by the hash of arXiv:2201.05989 (Eq. 4).
 
     Returns:
@@ -131,15 +155,15 @@ def interpolate(table, place, size, *, rows):
     check_shapes("interpolate", table=(table, "T F"), x=(place[0], "N"), y=(place[1], "N"), z=(place[2], "N"))
     spread = [jnp.clip(value, 0, 1) * (count - 1) for value, count in zip(place, size, strict=True)]
     low = [jnp.minimum(value.astype(jnp.int32), count - 2) for value, count in zip(spread, size, strict=True)]
-    share = [value - start for value, start in zip(spread, low, strict=True)]
-    weights = _of_corners(jnp.multiply, [(1 - part, part) for part in share])
+    fractions = [value - start for value, start in zip(spread, low, strict=True)]
+    corner_weights = _of_corners(jnp.multiply, [(1 - fraction, fraction) for fraction in fractions])
     total = 0.0
-    for row, weight in zip(_corner_rows(low, size, rows), weights, strict=True):
+    for row, weight in zip(_corner_rows(low, size, rows), corner_weights, strict=True):
         total = total + weight[:, None] * table.at[row].get(mode="promise_in_bounds")
     return total
 
 
-def harmonics(directions):
+def harmonics(directions: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 9"]:
     """Returns the 9 real spherical harmonics [..., 9] of degree up to 2 of unit vectors [..., 3]."""
     x, y, z = (directions[..., i] for i in range(3))
     return jnp.stack(
@@ -155,7 +179,7 @@ def harmonics(directions):
 
 
 def _corner_rows(low, size, rows):
-    """Returns the rows [N] of the 8 vertices around places, of which low is the lowest along each axis."""
+    """Returns the rows [N] of the 8 vertices around places; low holds the lowest along each axis."""
     if len(rows) == np.prod(size):
         strides = (size[1] * size[2], size[2], 1)
         along = [(v * stride, v * stride + stride) for v, stride in zip(low, strides, strict=True)]

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.encoding import encode_planes
 from jaxnerf.core.sampling import normal
@@ -15,8 +16,8 @@ from jaxnerf.fields.base import Box, Field, apply_network
 DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
 
 
-def mlp_field(**options):
-    """Returns the paper's network as a Field.
+def mlp_field(**options: Any) -> Field:
+    """Makes a Field of the paper's network.
 
     Args:
         **options: attributes of MLP; the defaults are the paper's, 595,844 parameters.
@@ -24,16 +25,16 @@ def mlp_field(**options):
     Returns:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3], key=None, density_noise=0.0)
         returns density [..., S] in 1 / world unit and rgb [..., S, 3] in [0, 1], both float32.
-        With a key (one, or one a ray) normal noise of that deviation is added to the density
+        With a key (one, or one per ray) normal noise of that standard deviation is added to the density
         before its activation, the paper's regulariser for real scenes.
 
     Raises:
-        ValueError: on an unknown density activation.
+        ValueError: if density_activation is unknown.
     """
     network = MLP(**options)
     if network.density_activation not in DENSITY_ACTIVATIONS:
         raise ValueError(
-            f"mlp_field: density_activation is {network.density_activation!r}, wanted one of "
+            f"mlp_field: density_activation is {network.density_activation!r}, expected one of "
             f"{sorted(DENSITY_ACTIVATIONS)}"
         )
     activation = DENSITY_ACTIVATIONS[network.density_activation]
@@ -58,26 +59,42 @@ def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
 
 
 class MLP(linen.Module):
-    """8 layers of 256 with the encoded position again after the fifth, and a small head for colour."""
+    """Fully connected layers, the encoded position joined again after one of them, and a small head for colour.
+
+    Attributes:
+        depth: layers before the density.
+        width: features of such a layer.
+        skip_layer: the encoded position joins again after the layer of this index.
+        view_width: features of the layer that takes the direction.
+        num_freqs: octaves of the position's encoding.
+        num_view_freqs: octaves of the direction's encoding.
+        encode: False: position and direction enter without positional encoding.
+        use_viewdirs: False: colour depends on position alone; there is no bottleneck and no view layer.
+        density_activation: "relu" or "softplus".
+        density_bias: added to the density before its activation.
+        compute_dtype: of the layers; the outputs are at least float32.
+    """
 
     depth: int = 8
     width: int = 256
-    skip_layer: int = 4  # the encoded position joins again after the layer of this index
+    skip_layer: int = 4
     view_width: int = 128
     num_freqs: int = 10
     num_view_freqs: int = 4
-    encode: bool = True  # False: position and direction as they are, without octaves
-    use_viewdirs: bool = True  # False: colour from position alone, no bottleneck and no view layer
+    encode: bool = True
+    use_viewdirs: bool = True
     density_activation: str = "relu"
-    density_bias: float = 0.0  # added before the activation
-    compute_dtype: Any = jnp.float32  # of the layers; the outputs are float32 at least
+    density_bias: float = 0.0
+    compute_dtype: Any = jnp.float32
 
     @linen.compact
-    def __call__(self, x, viewdirs):
+    def __call__(
+        self, x: Float[ArrayLike, "*batch samples 3"], viewdirs: Float[ArrayLike, "*batch #samples 3"]
+    ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations.
 
-        Inside, features come first, [F, N]: encoding and all three products of a layer's forward and
-        backward pass then run along memory, which on a CPU a small network gains most from.
+        Arrays inside are [features, N]: the encoding and all three products of a layer's forward and backward
+        pass then run along memory, from which a small network on a CPU gains most.
         """
         shape = x.shape[:-1]
         encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode).astype(self.compute_dtype)
@@ -89,7 +106,7 @@ class MLP(linen.Module):
         dtype = jnp.promote_types(jnp.float32, self.compute_dtype)
         density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
         if self.use_viewdirs:
-            # The direction is encoded and multiplied once a ray, and broadcast over its samples.
+            # The direction is encoded and multiplied once per ray, and broadcast over its samples.
             directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
             directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
             bottleneck = Affine(self.width, name="bottleneck")(self.width)
@@ -106,40 +123,47 @@ class Affine(linen.Module):
     features: int
 
     @linen.compact
-    def __call__(self, size):
+    def __call__(self, size: int) -> tuple[Float[Array, "size features"], Float[Array, " features"]]:
         """Returns kernel [size, features] and bias [features]."""
         kernel = self.param("kernel", linen.initializers.glorot_uniform(), (size, self.features))
         return kernel, self.param("bias", linen.initializers.zeros_init(), (self.features,))
 
 
 class Dense(Affine):
-    """An affine layer on the concatenation of its inputs, which is never made.
+    """An affine layer on the concatenation of its inputs, which is never materialised.
 
-    The kernel has a row a feature of the concatenation, so weights and initialisation are those of the
-    plain layer.
+    The kernel has one row for each feature of the concatenation, so parameters and initialisation are those of
+    the plain layer.
     """
 
-    def __call__(self, *inputs, before=None):
+    def __call__(
+        self,
+        *inputs: Float[ArrayLike, "..."],
+        before: tuple[Float[ArrayLike, "inputs E"], Float[ArrayLike, " E"]] | None = None,
+    ) -> Float[Array, "features ..."]:
         """Returns [features, ...] for inputs [D_i, ...], whose axes of length 1 are broadcast.
 
-        before: kernel [D_0, E] and bias [E] of an affine layer that the first input goes through. With no
-        activation between them, two layers are one, whose kernel costs less than a layer of all samples.
+        Args:
+            *inputs: [D_i, ...].
+            before: kernel [D_0, E] and bias [E] of an affine layer that is applied to the first input. With no
+                activation between them the two layers are one, whose kernel costs less than a layer of all
+                samples.
         """
         sizes = [value.shape[0] for value in inputs]
         if before:
             sizes[0] = before[1].size
         kernel, bias = super().__call__(sum(sizes))
-        blocks = jnp.split(kernel, np.cumsum(sizes)[:-1])
+        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
         if before:
-            first, highest = blocks[0], jax.lax.Precision.HIGHEST
+            first, highest = parts[0], jax.lax.Precision.HIGHEST
             bias = bias + jnp.matmul(before[1], first, precision=highest)
-            blocks[0] = jnp.matmul(before[0], first, precision=highest)
+            parts[0] = jnp.matmul(before[0], first, precision=highest)
         total = bias.astype(inputs[0].dtype).reshape(-1, *(1,) * (inputs[0].ndim - 1))
-        for rows, value in zip(blocks, inputs, strict=True):
+        for rows, value in zip(parts, inputs, strict=True):
             total = total + jnp.tensordot(rows.astype(value.dtype), value, axes=(0, 0))
         return total
 
 
-def planes(vectors):
+def planes(vectors: Float[ArrayLike, "*batch 3"]) -> Float[Array, "3 N"]:
     """Returns vectors [..., 3] as [3, N]."""
     return jnp.moveaxis(vectors, -1, 0).reshape(3, -1)

@@ -1,21 +1,26 @@
-"""Published weights as a run of ours: a workdir that evaluates, renders and trains on."""
+"""Converts published weights into a workdir, which can be scored, rendered and trained further."""
 
 import dataclasses
-import hashlib
 import json
+import os
 import pathlib
 import shutil
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import optax
+from ml_collections import ConfigDict
 
-from jaxnerf.interop.published_weights import read_weights
+from jaxnerf.data import dataset
+from jaxnerf.interop.published_weights import Network, read_weights
+from jaxnerf.runtime import atomic_files
+from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.training import auto_config, build, workdir
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
 
-# Which field of a network's section sets a layer's rows and its columns.
+# The fields of a network's section that set the rows and the columns of a layer.
 _FIELDS = {
     "trunk_0": ("num_freqs", "width"),
     "trunk": ("skip_layer", "width"),
@@ -24,54 +29,71 @@ _FIELDS = {
 _HEADS = ("bottleneck", "view", "density", "rgb")
 
 
-def convert(files, config, folder, *, legacy_posenc_order=False):
-    """Writes a workdir with one checkpoint, of the weights in files of another code.
+def convert(
+    files: Sequence[str | os.PathLike],
+    config: ConfigDict,
+    workdir: str | os.PathLike,
+    *,
+    legacy_posenc_order: bool = False,
+) -> str:
+    """Writes a workdir with one checkpoint that holds the networks in files of another code.
 
-    If the run is trained on, Adam begins anew, at the learning rate of the checkpoint's step. That takes
-    a capture which is there: what a configuration leaves to it is settled now, and may not change later.
+    Further training starts with new Adam moments and the learning rate of the checkpoint's step. It is
+    possible only if the dataset exists now, because "auto" fields of the config are resolved against it here.
 
     Args:
-        files: names; see read_weights, also for legacy_posenc_order.
-        config: ConfigDict of such a network.
-        folder: the workdir, which must not be there, or be empty.
+        files: see `read_weights`.
+        config: describes the networks and the dataset.
+        workdir: a folder that does not exist or is empty.
+        legacy_posenc_order: see `read_weights`.
 
     Returns:
-        A line that says what was read and written.
+        A line about what was read and written.
 
     Raises:
-        ValueError: if the files are not as the configuration says, or the folder holds something.
+        ValueError: if the files do not match the config, or if the folder is not empty.
     """
-    folder, paths = pathlib.Path(folder), [pathlib.Path(name) for name in files]
+    folder, paths = pathlib.Path(workdir), [pathlib.Path(name) for name in files]
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise ValueError(f"{folder}: is there already; give a new --workdir")
-    weights = read_weights(paths, legacy_posenc_order=legacy_posenc_order)
-    build.check_released(config, weights.origin)
-    config, _ = auto_config.resolve_data(config, missing_ok=True)
+        raise ValueError(f"{folder}: exists and is not an empty folder; give a new --workdir")
+    published = read_weights(paths, legacy_posenc_order=legacy_posenc_order)
+    build.check_released(config, published.origin)
+    config = _resolved(config)
     experiment = build.build(config)
-    # Shapes alone: to draw weights that are replaced would take longer than all the rest.
+    # Only shapes count: drawing initial parameters would take longer than everything else.
     like = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, experiment.seed))
-    params = _params(weights.networks, like.params, ", ".join(map(str, paths)))
+    params = _params(published.networks, like.params, ", ".join(map(str, paths)))
     origin = {
-        "origin": weights.origin,
-        "step": weights.step,
+        "origin": published.origin,
+        "step": published.step,
         "legacy_posenc_order": legacy_posenc_order,
-        "sha256": {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths},
+        "sha256": {str(path): file_sha256(path) for path in paths},
     }
-    _write(folder, config, _state(like, experiment.optimizer, weights.step, params), origin)
+    _write(folder, config, _state(like, experiment.optimizer, published.step, params), origin)
     names = " and ".join(params)
-    return f"{weights.origin}, step {weights.step}: {names} network, written to {folder}"
+    return f"{published.origin}, step {published.step}: {names} network, written to {folder}"
 
 
-def _params(networks, template, files):
-    """Returns the networks as parameters like the template's; ValueError where they differ."""
+def _resolved(config: ConfigDict) -> ConfigDict:
+    """Returns the config resolved against its dataset, or the config itself if there is no dataset."""
+    try:
+        if config.data.format != "synthetic":
+            dataset.dataset_folder(config.data.dir)
+    except ValueError:
+        return config
+    return auto_config.resolve(config).config
+
+
+def _params(networks: Sequence[Network], template: dict, files: str) -> dict:
+    """Returns the networks as parameters with the template's structure; ValueError if they differ."""
     if len(networks) != len(template):
         raise ValueError(
-            f"{files}: {len(networks)} network(s), wanted {' and '.join(template)}; give as many, or change "
-            "sampling.num_fine, which at 0 makes one"
+            f"{files}: {len(networks)} network(s), expected {' and '.join(template)}; give as many, or change "
+            "sampling.num_fine: 0 means a single network"
         )
     params = {}
-    for (name, wanted), layers in zip(template.items(), networks, strict=True):
-        _check(name, wanted, layers, files)
+    for (name, expected), layers in zip(template.items(), networks, strict=True):
+        _check(name, expected, layers, files)
         params[name] = {
             layer: {"kernel": jnp.asarray(kernel), "bias": jnp.asarray(bias)}
             for layer, (kernel, bias) in layers.items()
@@ -79,33 +101,36 @@ def _params(networks, template, files):
     return params
 
 
-def _check(name, wanted, layers, files):
-    """Raises a ValueError unless a network's layers are those wanted."""
-    if ("view" in layers) != ("view" in wanted):
-        found = "sees" if "view" in layers else "does not see"
+def _check(name, expected, layers, files):
+    """Raises a ValueError if a network does not have the expected layers."""
+    if ("view" in layers) != ("view" in expected):
+        found = "uses" if "view" in layers else "does not use"
         raise ValueError(f"{files}: the {name} network {found} view directions; change {name}.use_viewdirs")
-    depth, wanted_depth = (sum(layer.startswith("trunk_") for layer in part) for part in (layers, wanted))
-    if depth != wanted_depth:
+    depth, expected_depth = (sum(layer.startswith("trunk_") for layer in part) for part in (layers, expected))
+    if depth != expected_depth:
         raise ValueError(
-            f"{files}: the {name} network has {depth} layers before density, wanted {wanted_depth}; change {name}.depth"
+            f"{files}: the {name} network has {depth} layers before density, expected {expected_depth}; "
+            f"change {name}.depth"
         )
-    if layers.keys() != wanted.keys():
+    if layers.keys() != expected.keys():
         raise ValueError(
-            f"{files}: the {name} network has layers {sorted(layers)}, wanted {sorted(wanted)}; no field "
-            "of a configuration makes such a network"
+            f"{files}: the {name} network has layers {sorted(layers)}, expected {sorted(expected)}; no field "
+            "of the config changes that"
         )
-    # What is wrong in one layer shows in those after it.
-    for layer in sorted(wanted, key=lambda layer: _HEADS.index(layer) if layer in _HEADS else -1):
-        found, shape = layers[layer][0].shape, wanted[layer]["kernel"].shape
+    # A wrong size in one layer shows in the layers after it, so the heads come last, in the order of _HEADS.
+    for layer in sorted(expected, key=lambda layer: _HEADS.index(layer) if layer in _HEADS else -1):
+        found, shape = layers[layer][0].shape, expected[layer]["kernel"].shape
         if found != shape:
             axis = 0 if found[1] == shape[1] else 1
             fields = _FIELDS.get(layer) or _FIELDS.get(layer.partition("_")[0])
-            remedy = f"change {name}.{fields[axis]}" if fields else "no field of a configuration does that"
-            raise ValueError(f"{files}: {layer} of the {name} network is {list(found)}, wanted {list(shape)}; {remedy}")
+            remedy = f"change {name}.{fields[axis]}" if fields else "no field of the config changes that"
+            raise ValueError(
+                f"{files}: {layer} of the {name} network is {list(found)}, expected {list(shape)}; {remedy}"
+            )
 
 
 def _state(like, optimizer, step, params):
-    """Returns the state of a run that is at a step, has its learning rate, and no gradient in mind."""
+    """Returns a state at a step, with its learning rate and without gradient moments."""
 
     def is_schedule(part):
         return isinstance(part, optax.ScaleByScheduleState)
@@ -123,10 +148,10 @@ def _state(like, optimizer, step, params):
 def _write(folder, config, state, origin):
     try:
         workdir.claim(folder, config)
-        workdir.write_text(folder / "converted.json", json.dumps(origin, indent=2) + "\n")
+        atomic_files.write_text(folder / "converted.json", json.dumps(origin, indent=2) + "\n")
         checkpoints = Checkpoints(folder)
         checkpoints.save(state)
         checkpoints.close()
-    except BaseException:  # a full disk, Ctrl-C: nothing stays that would stand in the next try's way
+    except BaseException:  # a full disk or Ctrl-C: the same command must work afterwards
         shutil.rmtree(folder, ignore_errors=True)
         raise

@@ -1,18 +1,19 @@
-"""Lists of arrays that were pickled into .npy files of unknown origin: read as data, nothing of it is called.
+"""Reads lists of arrays that were pickled into .npy files of unknown origin, without calling anything in them.
 
-An unpickler that finds no class but numpy's is not enough: the state a file gives a dtype can have numpy
-take numbers for addresses. So the opcodes are followed here, what they want made is kept as a record
-beside its arguments, and numpy is given bytes of floating point alone.
+An unpickler that is restricted to numpy's classes is not safe: with a crafted dtype state numpy dereferences
+numbers in the file as addresses. This module therefore interprets the opcodes itself, keeps each object as a
+record of its name and arguments, and passes only floating-point bytes to numpy.
 """
 
 import math
+import pathlib
 import pickletools
 
 import numpy as np
 
-from jaxnerf.data.readers.npy import read_header
+from jaxnerf.data.readers.validation import read_npy_header
 
-# All that a list of arrays needs, in numpy 1 and 2 and, with bytes as text, in pickles of protocol 2.
+# The names in a pickled list of arrays: of numpy 1 and 2, and of protocol 2, which encodes bytes as text.
 _NAMES = {
     "numpy.core.multiarray _reconstruct": "array",
     "numpy._core.multiarray _reconstruct": "array",
@@ -28,41 +29,41 @@ _FLOATS = ("f2", "f4", "f8")
 
 
 class Record:
-    """What a pickle wants made, by which name and of what, and the state it is to be given."""
+    """An object of a pickle, not created: its name, its arguments (None for the name alone) and its state."""
 
-    def __init__(self, name, arguments):
+    def __init__(self, name: str, arguments: tuple | None):
         self.name, self.arguments, self.state = name, arguments, None
 
 
-def read_array_list(path, wanted):
-    """Returns the arrays, of floating point, of a .npy file that holds a list of them.
+def read_array_list(path: pathlib.Path, expected: str) -> list[np.ndarray]:
+    """Returns the floating-point arrays of a .npy file that holds a list of them.
 
     Args:
-        path: Path of the file.
-        wanted: what it should hold, for the message.
+        path: the file.
+        expected: the content, for the message.
 
     Raises:
-        ValueError: if it is missing, damaged or holds anything else; names the file.
+        ValueError: if the file is missing, damaged or holds anything else; names the file.
     """
     try:
         with path.open("rb") as file:
-            shape, _, dtype = read_header(file)
+            shape, _, dtype = read_npy_header(file)
             if not dtype.hasobject:
                 raise ValueError(f"one array of {dtype}{list(shape)}, not a list")
             content = file.read()
         arrays = [_array(record) for record in _items(_follow(content))]
         if shape != (len(arrays),) or sum(array.nbytes for array in arrays) > len(content):
-            raise ValueError(f"{len(arrays)} arrays, its header says {list(shape)}")
+            raise ValueError(f"{len(arrays)} arrays, but its header states {list(shape)}")
     except FileNotFoundError:
-        raise ValueError(f"{path}: no such file, wanted {wanted}; correct the name") from None
-    except Exception as error:  # of damaged files almost any
+        raise ValueError(f"{path}: no such file, expected {expected}; correct the name") from None
+    except Exception as error:  # a damaged file can raise almost any exception
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ValueError(f"{path}: unreadable ({reason}), wanted {wanted}; fetch it again") from None
+        raise ValueError(f"{path}: unreadable ({reason}), expected {expected}; fetch it again") from None
     return arrays
 
 
 def _follow(content):
-    """Returns what a pickle describes, with a Record for each object that it wants made."""
+    """Returns the content of a pickle, with a Record in place of each object."""
     stack, marks, memo = [], [], {}
     for opcode, argument, position in pickletools.genops(content):
         name = opcode.name
@@ -87,7 +88,7 @@ def _follow(content):
 
 
 def _combine(name, stack, marks):
-    """Follows an opcode that takes several things from the stack."""
+    """Executes an opcode that takes several values from the stack."""
     if name in ("TUPLE", "APPENDS"):
         first = marks.pop()
     else:
@@ -106,26 +107,26 @@ def _combine(name, stack, marks):
         taken[0].state = taken[1]
         stack.append(taken[0])
     else:
-        raise ValueError(f"it does more than list arrays: {name}")
+        raise ValueError(f"it does more than list arrays: opcode {name}")
 
 
 def _name(name):
     if name not in _NAMES:
-        raise ValueError(f"it asks for {name.replace(' ', '.')!r}, which is never called")
+        raise ValueError(f"it refers to {name.replace(' ', '.')!r}, which is never called")
     return Record(_NAMES[name], None)
 
 
 def _state(record):
-    """Returns version, shape, dtype, whether columns come first, and contents, as numpy pickles an array."""
+    """Returns the state of a pickled array: version, shape, dtype, whether in Fortran order, content."""
     if not isinstance(record, Record) or record.name != "array":
-        raise ValueError(f"{type(record).__name__} where an array should be")
+        raise ValueError(f"{type(record).__name__} in place of an array")
     return record.state
 
 
 def _items(record):
     content = _state(record)[4]
     if not isinstance(content, list):
-        raise ValueError("it is no list of arrays")
+        raise ValueError("it is not a list of arrays")
     return content
 
 
@@ -138,7 +139,7 @@ def _array(record):
 
 
 def _bytes(content):
-    """Returns bytes, which protocol 2 writes as text to be encoded, and Python 2 as text."""
+    """Returns bytes, which protocol 2 writes as an encoding of text, and Python 2 as text."""
     if isinstance(content, Record) and content.name == "bytes":
         content = content.arguments[0]
     return content.encode("latin1") if isinstance(content, str) else content

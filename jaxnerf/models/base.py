@@ -1,47 +1,49 @@
-"""What a model is: how a run's fields are sampled along rays and rendered."""
+"""The interface of models: a sampler places samples along rays and renders a run's fields there."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 
+from jaxnerf.core.types import Rendering, SceneFn
 from jaxnerf.fields.base import Field
+from jaxnerf.models.grid_schedule import GridSchedule
 from jaxnerf.registry import SAMPLERS
 
 
 class Model(NamedTuple):
-    """Pure functions of parameters, an occupancy grid and rays; the grid is None where a model has none.
+    """Pure functions of parameters, an occupancy grid (None if the model has none) and rays.
 
     Attributes:
-        init: key -> params, a dict with an entry for each network. The one that counts is "fine".
-        render: (keys [B], params, grid, Rays [B], step) -> Renderings [B] for training, the one that counts
-            last. They carry weights and samples, for losses.
+        init: key -> params, a dict with an entry for each network. "fine" is the one that images show.
+        render: (keys [B], params, grid, Rays [B], step) -> Renderings [B] for training, that of "fine" last.
+            They carry weights and samples, for losses.
         view: (params, grid, Rays [...]) -> Rendering [...] without weights and samples, for images.
-        scene: (params, grid) -> the scene that counts.
-        samples_per_ray: evaluations of the largest network for a ray in training, about.
-        grid_schedule: how the occupancy grid is made and updated; None without one.
-        input_layers: network name -> see `Field`.
+        scene: (params, grid) -> the scene that images show.
+        samples_per_ray: about how often a ray evaluates the largest network in training.
+        grid_schedule: how the occupancy grid is created and updated; None without one.
+        input_layers: by network, see `Field`.
         cull: (grid, Rays [...]) -> bool [...], which rays may hit an occupied cell, and the Rendering [...]
             of those that cannot; None where all may.
     """
 
     init: Callable[[jax.Array], Any]
-    render: Callable[..., tuple]
-    view: Callable[..., Any]
-    scene: Callable[..., Callable]
+    render: Callable[..., tuple[Rendering, ...]]
+    view: Callable[..., Rendering]
+    scene: Callable[..., SceneFn]
     samples_per_ray: float
-    grid_schedule: Any = None
+    grid_schedule: GridSchedule | None = None
     input_layers: Mapping[str, tuple[str, ...]] = {}
     cull: Callable[..., tuple] | None = None
 
 
 class SamplerContext(NamedTuple):
-    """What a sampler makes a model from.
+    """The parts of a resolved config from which a sampler makes a model.
 
     Attributes:
-        make_field: name of a network ("fine", "coarse") -> its Field.
-        sections: the resolved config's sections as plain dicts, by name.
-        background: [3] behind the scene, or None for black.
+        make_field: name of a network ("fine" or "coarse") -> its Field.
+        sections: the config's sections as plain dicts, by name.
+        background: [3] colour behind the scene; None: black.
     """
 
     make_field: Callable[[str], Field]
@@ -53,6 +55,6 @@ def make_model(sampler: str, context: SamplerContext) -> Model:
     """Makes a model by the registered name of its sampler.
 
     Raises:
-        ValueError: if there is no sampler of that name, or a section holds what it cannot do.
+        ValueError: if there is no sampler of that name, or it cannot do what a section asks for.
     """
     return SAMPLERS.get(sampler)(context)

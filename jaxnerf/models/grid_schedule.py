@@ -1,62 +1,84 @@
-"""The box of a scene, and what training finds to be empty in it."""
+"""The occupancy grid of a model: its box, and when training updates which cells."""
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, update_grid
+from jaxnerf.fields.base import Field
 
-_CHUNK = 8160  # cells asked at once: their activations stay in a processor's cache, and do not collide there
+_CHUNK = 8160  # cells evaluated at once: their activations fit a processor's cache, and do not collide there
+
+Corner = tuple[float, float, float]
 
 
 class GridSchedule(NamedTuple):
-    """The box of a model that asks only where there is something, and how that is kept up to date."""
+    """The box of a model with an occupancy grid, and how the grid is kept up to date.
 
-    lower: tuple[float, float, float]  # world units
-    upper: tuple[float, float, float]
-    shape: tuple[int, int, int]  # cells
-    step_size: float  # world units between samples
-    threshold: float | np.ndarray  # 1 / world unit, the density below which a cell is empty; or of each
-    create: Callable[..., OccupancyGrid]  # possible [X, Y, Z] bool -> Grid
-    update: Callable[..., OccupancyGrid]  # (key, step, params, Grid, cells [L] int32) -> Grid
-    contracted: bool = False  # see Grid
+    Attributes:
+        lower, upper: [3] world units, the box.
+        shape: cells along x, y and z.
+        step_size: world units between samples.
+        threshold: 1 / world unit, the density below which a cell is empty, or that of each cell [X, Y, Z].
+        create: valid [X, Y, Z] bool -> OccupancyGrid.
+        update: (key, step, params, OccupancyGrid, cells [L] int32) -> OccupancyGrid.
+        contracted: see OccupancyGrid.
+    """
+
+    lower: Corner
+    upper: Corner
+    shape: tuple[int, int, int]
+    step_size: float
+    threshold: float | np.ndarray
+    create: Callable[..., OccupancyGrid]
+    update: Callable[..., OccupancyGrid]
+    contracted: bool = False
 
     @property
-    def cell(self):
+    def cell(self) -> Corner:
         """The size of a cell [3], world units."""
         sides = zip(self.lower, self.upper, self.shape, strict=True)
         return tuple((high - low) / count for low, high, count in sides)
 
+    def box(self) -> dict[str, Any]:
+        """Returns the arguments by which `visible_grid` describes the same grid."""
+        names = ("lower", "upper", "shape", "step_size", "threshold", "contracted")
+        return {name: getattr(self, name) for name in names}
+
 
 def make_grid_schedule(
-    lower,
-    upper,
+    lower: Corner,
+    upper: Corner,
     *,
-    resolution,
-    step_size,
-    field,
-    threshold,
-    update_every,
-    cells_per_update,
-    contracted=False,
-    initial_passes=8,
-):
-    """Returns the Space of a box.
+    resolution: int,
+    step_size: float,
+    field: Field | None,
+    threshold: float,
+    update_every: int,
+    cells_per_update: int,
+    contracted: bool = False,
+    initial_passes: int = 8,
+) -> GridSchedule:
+    """Makes the GridSchedule of a box.
 
     Args:
         lower, upper: [3] world units.
-        resolution: cells along the longest side; along the others so many that they are cubes.
+        resolution: cells along the longest side; the number along the others makes them cubes.
         step_size: world units between samples, where space is plain.
-        field: Field; its density under params["fine"] is what counts. None where there are no updates.
-        threshold: the share of light absorbed in a step below which a cell is empty.
-        update_every: steps between two looks.
-        look_at_once: cells a look. Where there are more, looks at the start come more often, until all cells
-            have been seen passes_from_start times; and that long neighbours of dense cells count, too.
-        contracted: whether the box holds all of space, see Grid.
+        field: Field, whose density under params["fine"] updates the grid. None where there are no updates.
+        threshold: opacity of one step below which a cell is empty.
+        update_every: training steps between updates.
+        cells_per_update: if there are more cells, updates at first come more often, until each cell has been
+            updated initial_passes times; during that time neighbours of dense cells are occupied, too.
+        contracted: whether the box holds all of space, see OccupancyGrid.
+        initial_passes: see cells_per_update.
+
+    Raises:
+        ValueError: if threshold or step_size is not above 0.
     """
     if threshold <= 0 or step_size <= 0:
         raise ValueError(
@@ -68,7 +90,7 @@ def make_grid_schedule(
     empty_below = density / _stretches(shape) if contracted else density
 
     def create(valid):
-        # What is not looked at yet counts as ten times the threshold: half a dozen looks empty a cell.
+        # A cell starts at ten times the threshold: half a dozen updates empty it.
         return create_grid(
             jnp.asarray(lower, jnp.float32),
             jnp.asarray(upper, jnp.float32),
@@ -80,17 +102,17 @@ def make_grid_schedule(
     def update(key, step, params, grid, cells):
         if cells.size == 0:
             return grid
-        looks = -(-cells.size // cells_per_update)  # that see all cells
-        count = -(-cells.size // looks)
-        often = max(update_every // looks, 1)
+        rounds = -(-cells.size // cells_per_update)  # updates that visit all cells
+        count = -(-cells.size // rounds)
+        often = max(update_every // rounds, 1)
         young = step < initial_passes * update_every
         interval = jnp.where(young, often, update_every)
-        look = jnp.where(young, step // often, step // update_every)
+        num_updates = jnp.where(young, step // often, step // update_every)
 
-        def looked():
-            # Whole chunks, as a rest of another size would be compiled too.
+        def updated():
+            # Whole chunks, as a remainder of another size would be compiled too.
             place = jnp.arange(count + (-count % _CHUNK if count > _CHUNK else 0))
-            index = look % looks * count + place
+            index = num_updates % rounds * count + place
             beyond = (place >= count) | (index >= cells.size)
             chosen = jnp.where(beyond, grid.valid.size, cells[jnp.minimum(index, cells.size - 1)])
             return update_grid(
@@ -103,13 +125,13 @@ def make_grid_schedule(
                 chunk=_CHUNK,
             )
 
-        return jax.lax.cond(step % interval == interval - 1, looked, lambda: grid)
+        return jax.lax.cond(step % interval == interval - 1, updated, lambda: grid)
 
     return GridSchedule(tuple(lower), tuple(upper), shape, step_size, empty_below, create, update, contracted)
 
 
 def _stretches(shape):
-    """Returns [X, Y, Z], how much longer than where space is plain the steps across contracted cells are."""
+    """Returns [X, Y, Z], the length of steps across contracted cells over that of steps in plain space."""
     along = [np.abs(4 * (np.arange(size) + 0.5) / size - 2) for size in shape]
     largest = np.max(np.meshgrid(*along, indexing="ij"), axis=0)
     return np.float32(1 / np.minimum(2 - largest, 1) ** 2)

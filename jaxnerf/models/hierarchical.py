@@ -8,7 +8,7 @@ import jax
 
 from jaxnerf.core.rendering import render_hierarchical, render_rays
 from jaxnerf.core.sampling import split_key
-from jaxnerf.core.types import without_samples
+from jaxnerf.core.types import Background, without_samples
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model, SamplerContext
 
@@ -36,17 +36,18 @@ def hierarchical_model(
     in_disparity: bool,
     importance_padding: float,
     density_noise: float,
-    background,
+    background: Background | None,
     stratified: bool = True,
     sample_multiplier: float = 1.0,
 ) -> Model:
     """Makes the paper's model from the fields "coarse" and "fine", or from "fine" alone where num_fine is 0.
 
     Args:
-        fields: name -> Field.
+        fields: Field by name.
         density_noise: 1 / world unit, standard deviation of the noise on the density in training.
-        stratified: whether training draws its samples; otherwise they are at fixed places, as in images.
-        sample_multiplier: samples of images over those of training.
+        stratified: whether training draws its samples at random; otherwise they are at fixed places, as in
+            images.
+        sample_multiplier: samples along a ray of images over those of training.
         num_coarse, num_fine, rule, in_disparity, importance_padding, background: see `render_hierarchical`.
 
     Raises:

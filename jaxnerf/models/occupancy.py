@@ -3,21 +3,24 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxnerf.core.occupancy.from_scene import crop_grid, num_visibility_rays, visible_grid
-from jaxnerf.core.occupancy.grid import mask_samples, mask_scene
+from jaxnerf.core.occupancy.grid import OccupancyGrid, mask_samples, mask_scene
 from jaxnerf.core.occupancy.packed import render_packed
 from jaxnerf.core.occupancy.ray_culling import rays_may_hit, render_background
 from jaxnerf.core.occupancy.ray_marching import march_rays
+from jaxnerf.core.types import Background, Rays, Rendering, SceneFn
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 
 _LONG_STEP = 3.0  # times the step size
-_ONE_RAY_OPAQUE = 1e-30  # transmittance below which every ray has ended
+_SMALLEST_EPS = 1e-30  # in place of an early_stop_eps of 0: transmittance below which nothing is left
 
 
 def from_context(context: SamplerContext) -> Model:
@@ -45,7 +48,7 @@ def from_context(context: SamplerContext) -> Model:
     )
 
 
-def schedule_from_section(section, field: Field | None) -> GridSchedule:
+def schedule_from_section(section: Mapping[str, Any], field: Field | None) -> GridSchedule:
     """Makes the GridSchedule that a resolved section `occupancy` describes; field: None without updates."""
     names = ("resolution", "step_size", "threshold", "update_every", "cells_per_update", "contracted")
     return make_grid_schedule(
@@ -53,7 +56,7 @@ def schedule_from_section(section, field: Field | None) -> GridSchedule:
     )
 
 
-def view_options(context: SamplerContext) -> dict:
+def view_options(context: SamplerContext) -> dict[str, Any]:
     """Returns the options of occupancy_model that concern images."""
     names = ("early_stop_eps", "sample_multiplier", "max_samples")
     section = context.sections["eval"]
@@ -71,17 +74,17 @@ def occupancy_model(
     early_stop_eps: float,
     sample_multiplier: float,
     max_samples: int,
-    background,
+    background: Background | None,
 ) -> Model:
-    """Makes the model of one field that is evaluated only where its grid is occupied.
+    """Makes the model of one field that is evaluated only in the occupied cells of its grid.
 
     Args:
-        field: Field.
-        schedule: GridSchedule.
+        field: any Field.
+        schedule: of the occupancy grid.
         pool_samples_per_ray: size of training's sample buffer over the number of rays. Rays whose samples do
             not fit are dropped and counted.
-        long_steps_until: the training step before which samples are three times as long, as fog looks the
-            same and more rays fit.
+        long_steps_until: the training step before which samples are three times as long: early fog looks the
+            same, and more rays fit.
         max_optical_depth: optical depth, as the grid estimates it, beyond which training evaluates nothing;
             0: no limit.
         occlusion_start_step: the training step from which max_optical_depth applies.
@@ -120,14 +123,14 @@ def occupancy_model(
 def bake_occupancy(
     model: Model,
     schedule: GridSchedule,
-    visibility_rays,
+    visibility_rays: Callable[[int], Rays],
     *,
-    early_stop_eps,
-    sample_multiplier,
-    max_samples,
-    background,
-):
-    """Makes a model for images of one that was trained without a grid, with a grid of its visible matter.
+    early_stop_eps: float,
+    sample_multiplier: float,
+    max_samples: int,
+    background: Background | None,
+) -> tuple[Model, Callable[[Any], OccupancyGrid]]:
+    """Makes a model that renders images through a grid of its visible matter, of one trained without a grid.
 
     Args:
         model: Model without a grid.
@@ -136,7 +139,7 @@ def bake_occupancy(
         early_stop_eps, sample_multiplier, max_samples, background: see `occupancy_model`.
 
     Returns:
-        Model, which evaluates nothing outside its grid; and params -> that grid, see `visible_grid`.
+        Model, which evaluates only occupied cells; and the function params -> its grid, see `visible_grid`.
     """
 
     def scene(params):
@@ -145,21 +148,31 @@ def bake_occupancy(
     @jax.jit
     def find(params, rays):
         options = {"max_samples": max_samples, "background": background}
-        return visible_grid(scene(params), schedule, rays, **options)
+        return visible_grid(scene(params), rays, **schedule.box(), **options)
 
-    rays = visibility_rays(num_visibility_rays(schedule))
+    rays = visibility_rays(num_visibility_rays(schedule.shape))
     view = _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background)
     model = model._replace(view=view, cull=_cull(schedule, background))
     return model, lambda params: crop_grid(find(params, rays))
 
 
-def render_with_grid(scene, grid, rays, *, step_size, cell, early_stop_eps, max_samples, background=None):
-    """Renders rays [...] through a scene where its grid is occupied: Rendering [...] without weights.
+def render_with_grid(
+    scene: SceneFn,
+    grid: OccupancyGrid,
+    rays: Rays,
+    *,
+    step_size: float,
+    cell: Sequence[float],
+    early_stop_eps: float,
+    max_samples: int,
+    background: Background | None = None,
+) -> Rendering:
+    """Renders rays [...] through the occupied cells of a grid: Rendering [...] without weights.
 
     Args:
         scene, grid, rays, background: see `render_packed`.
         step_size, cell: see `march_rays`.
-        early_stop_eps: a ray ends where its transmittance falls below it; 0: where nothing is left.
+        early_stop_eps: transmittance below which a ray ends; 0: where nothing is left of it.
         max_samples: samples evaluated at once; the rest follow in further rounds.
     """
     samples = march_rays(None, grid, rays, step_size=step_size, cell=cell)
@@ -169,7 +182,7 @@ def render_with_grid(scene, grid, rays, *, step_size, cell, early_stop_eps, max_
         rays,
         samples,
         max_samples=max_samples,
-        early_stop_eps=early_stop_eps or _ONE_RAY_OPAQUE,
+        early_stop_eps=early_stop_eps or _SMALLEST_EPS,
         background=background,
     )
 
@@ -198,11 +211,11 @@ def _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, backg
 
 
 def _over_background(rendering, occluded, background):
-    """Composites a Rendering of black over a background.
+    """Composites a Rendering on black over a background.
 
     Where occluded samples were skipped, the remaining light is taken to look like the rest of the ray. If the
-    background showed there, the field would grow opaque too early, the grid's estimate with it, and both
-    would run away.
+    background showed there, the field would grow opaque too early, and with it the grid's estimate, which
+    would skip more samples: a feedback loop.
     """
     transmittance = (1 - rendering.opacity)[..., None]
     behind = jnp.zeros(3) if background is None else jnp.asarray(background)

@@ -1,78 +1,169 @@
-"""What the command line programs share: errors of a user's making take one line and no traceback."""
+"""Flags, signals and error messages that the command-line programs share."""
 
+import ast
 import ctypes
 import gc
+import importlib
+import os
+import pathlib
 import signal
 import sys
 import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from absl import app, flags, logging
+from ml_collections import config_flags
 
-FORMATS = ("blender", "transforms", "colmap", "llff")
+from jaxnerf.registry import READERS
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
+
+flags.disclaim_key_flags()  # a flag defined here belongs to the program that calls
 
 
-def run(main, *, positional=False, stopped="before there was anything to save; the same command starts again"):
-    """Parses flags and runs main(argv); exits 2 on a wrong flag and 1 on bad input, each with one line.
+def run(
+    main: Callable[[list[str]], Any],
+    *,
+    positional: bool = False,
+    stopped: str = "before anything was saved; the same command starts again",
+) -> None:
+    """Parses the flags, imports the plugins and calls main(argv).
 
-    positional: whether arguments without a flag are taken, as argv[1:].
-    stopped: what Ctrl-C or SIGTERM left behind, and what to do.
+    The process exits with 2 on a wrong flag and with 1 on a ValueError or OSError, each reported in one line,
+    and with 128 plus the signal's number on SIGINT or SIGTERM.
+
+    Args:
+        main: the program. Its module's docstring opens the help.
+        positional: whether arguments that are not flags are accepted, as argv[1:].
+        stopped: completes the message "stopped ..." after a signal: what was saved, and how to continue.
     """
     _keep_memory()
-    # Tracing a step makes hundreds of thousands of objects, hardly any in cycles: looking for those every 700
-    # objects, as Python does, takes a good part of its time.
+    # Tracing a step creates hundreds of thousands of objects, few of them in cycles. Python's default of one
+    # collection per 700 objects takes a good part of the tracing time.
     gc.set_threshold(50_000)
     signal.signal(signal.SIGTERM, _interrupt)
-    app.run(_without_traceback(main, positional, stopped), flags_parser=_parse)
+    plugins = flags.DEFINE_list(
+        "plugins", [], "Modules to import first: they register fields, samplers, losses or dataset readers."
+    )
+
+    def program(argv):
+        try:
+            if len(argv) > 1 and not positional:
+                raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
+            _import_plugins(plugins.value)
+            # Imported after the flags are parsed, so that a wrong flag is reported at once.
+            from jaxnerf.runtime.compilation_cache import use_compilation_cache
+
+            use_compilation_cache()
+            return main(argv)
+        except (ValueError, OSError) as error:
+            _leave(1, error)
+        except KeyboardInterrupt as interrupt:
+            _leave(128 + (interrupt.args or (signal.SIGINT,))[0], f"stopped {stopped}")
+
+    app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
 
 
-def use_data(config, data_dir, format=None):
-    """Lets --data_dir override the scene's folder, and --format what is read there."""
+def define_config(help: str, *, required: bool = False) -> flags.FlagHolder:
+    """Defines --config, which takes the name or the path of a config file, followed by `:argument` or not."""
+    config = config_flags.DEFINE_config_file("config", None, f"{help} --config=help lists the names.")
+    parser = flags.FLAGS["config"].parser
+    load = parser.parse
+    parser.parse = lambda value: load(_list_configs() if value == "help" else config_path(value))
+    if required:
+        flags.mark_flag_as_required("config")
+    return config
+
+
+def define_count(name: str, help: str) -> flags.FlagHolder:
+    """Defines a flag that is "auto" or an integer of at least 1; None when it is not given."""
+    return flags.DEFINE(_Count(), name, None, help)
+
+
+def use_data(config, data_dir: str | None, format: str | None = None):
+    """Puts --data_dir and --format into a config and returns it.
+
+    Raises:
+        ValueError: if there is no such format.
+    """
+    if format and format != "auto":
+        READERS.get(format)
     if data_dir:
         config.data.dir = data_dir
-        if config.data.format == "synthetic":  # which has no folder: what is there counts
+        if config.data.format == "synthetic":  # the embedded scene has no folder
             config.data.format = "auto"
     if format:
         config.data.format = format
     return config
 
 
-def define_count(name, help):
-    """Defines a flag that is "auto", which gives 0, or a whole number of at least 1; None when not given."""
-    return flags.DEFINE(_Count(), name, None, help)
+def config_names() -> list[str]:
+    """Returns the names that --config takes."""
+    return sorted(path.stem for path in CONFIGS.glob("*.py") if path.stem != "__init__")
+
+
+def config_path(value: str) -> str:
+    """Returns the path of the config that a value of --config selects, with the value's `:argument`.
+
+    An existing file wins over a config of the same name.
+
+    Raises:
+        ValueError: if there is neither a file nor a config of this name.
+    """
+    name, colon, argument = value.partition(":")
+    if os.path.isfile(name):
+        return value
+    if name not in config_names():
+        raise ValueError(
+            f"there is no file and no config {name!r}, expected a path or one of {', '.join(config_names())}"
+        )
+    return f"{CONFIGS / name}.py{colon}{argument}"
+
+
+def _list_configs():
+    for name in config_names():
+        docstring = ast.get_docstring(ast.parse((CONFIGS / f"{name}.py").read_text()))
+        print(f"{name:15} {docstring.splitlines()[0]}")
+    sys.exit(0)
 
 
 class _Count(flags.ArgumentParser):
-    syntactic_help = "auto, or a whole number of at least 1"
+    syntactic_help = "auto, or an integer of at least 1"
 
     def parse(self, argument):
         if argument == "auto":
-            return 0
+            return argument
         if not str(argument).isdecimal() or int(argument) < 1:
-            raise ValueError(f"wanted {self.syntactic_help}")
+            raise ValueError(f"expected {self.syntactic_help}")
         return int(argument)
 
 
 def _keep_memory():
-    """Lets freed memory stay with the process, where the C library is glibc.
+    """Keeps freed memory in the process, where the C library is glibc.
 
-    It gives blocks of 32 MiB and more back at once. A step on a CPU takes one such block for its
-    activations, and would fault in each page of it anew, which can take as long as the step itself.
+    By default glibc returns blocks of 32 MiB and more to the system at once. A training step on a CPU
+    allocates such a block for its activations and would page-fault through all of it in every step, which
+    can take as long as the step itself.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt:
-        mallopt(-4, 0)  # M_MMAP_MAX: no block apart from the others
+        mallopt(-4, 0)  # M_MMAP_MAX: no block is mapped separately
         mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
-        mallopt(-2, 2**28)  # M_TOP_PAD, without which what other threads free is given back still
+        mallopt(-2, 2**28)  # M_TOP_PAD: without it, memory that other threads free is still returned
 
 
-def _parse(argv):
+def _parse(argv: Sequence[str], module: str) -> list[str]:
+    if {"--help", "-help", "-h", "--helpshort"} & set(argv[1:]):
+        print(_help(module))
+        sys.exit(0)
     try:
         rest = flags.FLAGS(argv)
         if not flags.FLAGS["verbosity"].present:
-            logging.set_verbosity(logging.FATAL)  # orbax tells of every file it touches
+            logging.set_verbosity(logging.FATAL)  # orbax logs every file that it touches
         return rest
     except AttributeError as error:
-        _leave(2, f"the configuration has no such field ({error}); configs/default.py lists them all")
+        _leave(2, f"the config has no such field ({error}); {CONFIGS / 'default.py'} lists all fields")
     except (
         flags.Error,
         KeyError,
@@ -86,34 +177,38 @@ def _parse(argv):
         _leave(2, error)
 
 
-def _without_traceback(main, positional, stopped):
-    def wrapped(argv):
+def _help(module: str) -> str:
+    """Returns a program's docstring and flags; absl's own help lists no flags of an installed program."""
+    lines = [(sys.modules[module].__doc__ or "").strip(), "", "Flags:"]
+    for flag in sorted(flags.FLAGS.get_key_flags_for_module(module), key=lambda flag: flag.name):
+        name = f"[no]{flag.name}" if flag.boolean else flag.name
+        default = f" Default: {flag.default_as_str.strip(chr(39))}." if flag.default else ""
+        lines.append(flags.text_wrap(f"--{name}: {flag.help}{default}", 100, indent="      ", firstline_indent="  "))
+    return "\n".join([*lines, "", "--helpfull lists the flags of the libraries, too."])
+
+
+def _import_plugins(names: Sequence[str]) -> None:
+    if names:
+        sys.path.append(os.getcwd())  # the path of an installed program does not contain it
+    for name in names:
         try:
-            if len(argv) > 1 and not positional:
-                raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
-            from jaxnerf.runtime.compilation_cache import (
-                use_compilation_cache,  # after the flags: a wrong one is said at once
-            )
-
-            use_compilation_cache()
-            return main(argv)
-        except (ValueError, OSError) as error:
-            _leave(1, error)
-        except KeyboardInterrupt as interrupt:
-            _leave(128 + (interrupt.args or (signal.SIGINT,))[0], f"stopped {stopped}")
-
-    return wrapped
+            importlib.import_module(name)
+        except Exception as error:  # a plugin is the user's code: report any failure in one line
+            raise ValueError(
+                f"--plugins: cannot import {name!r} ({type(error).__name__}: {error}); "
+                "correct the module, or set PYTHONPATH to its folder"
+            ) from error
 
 
 def _interrupt(number, _):
-    """Lets SIGTERM clean up as Ctrl-C does."""
+    """Makes SIGTERM clean up as SIGINT does."""
     raise KeyboardInterrupt(number)
 
 
 def _leave(code, error):
     line = " ".join(str(error).split())
     print(f"error: {line}", file=sys.stderr)
-    # What was under way fails while it is torn down, as on a full disk, and has nothing to add.
+    # Operations that are torn down can fail again, for instance on a full disk; one message is enough.
     sys.unraisablehook = lambda _: None
     warnings.simplefilter("ignore")
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""Compiled programs, kept between runs in the user's cache folder. Failing to keep them is never an error."""
+"""A cache of compiled programs in the user's cache folder. Failing to write it is never an error."""
 
 import contextlib
 import os
@@ -9,60 +9,61 @@ from pathlib import Path
 
 import jax
 
+from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import default_folder
 
-LARGEST = 2**30  # bytes of programs: a training step takes half a megabyte, so a thousand and more of them
+MAX_BYTES = 2**30  # a training step takes half a megabyte, so this holds over a thousand programs
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
-def use_compilation_cache():
-    """Lets JAX keep what it compiles, unless JAX_COMPILATION_CACHE_DIR says where, or, if empty, nowhere."""
+def use_compilation_cache() -> None:
+    """Sets JAX's compilation cache, unless JAX_COMPILATION_CACHE_DIR is set: to a folder, or empty for no cache."""
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir:
         return
     folder = None
     try:
         folder = default_folder() / "compiled" / _machine()
         folder.mkdir(parents=True, exist_ok=True)
-        tidy(folder)
+        prune(folder)
     except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
         place = f"{folder}: " if folder else ""
-        print(f"{place}what is compiled cannot be kept ({error}); training goes on", file=sys.stderr)
+        print(f"{place}compiled programs cannot be cached ({error}); continuing without", file=sys.stderr)
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        # JAX's own limit of 1 s leaves out dozens of small programs, which take as long together.
+        # JAX's own limit of 1 s excludes dozens of small programs, which take as long together.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def tidy(folder, largest=LARGEST):
-    """Removes programs cut short by a kill, which JAX would find broken at every start and never write anew,
-    and the longest unused ones where all together are too large.
+def prune(folder: Path, max_bytes: float = MAX_BYTES) -> None:
+    """Removes truncated programs, and the least recently used ones until the rest fits into max_bytes.
 
-    JAX has a limit of its own, but a kill at the wrong moment makes it fail forever after.
+    JAX would report a program that a killed process left truncated at every start, and never replace it. JAX
+    has a size limit of its own, but a kill at the wrong moment makes that fail forever after.
     """
     stamp = folder / "checked"
     since = stamp.stat().st_mtime if stamp.exists() else 0.0
-    stamp.touch()  # before the look: what is written meanwhile is looked at the next time
+    stamp.touch()  # first: files that are written meanwhile are checked at the next start
     kept = []
     for path in folder.glob("*-cache"):
-        with contextlib.suppress(FileNotFoundError):  # another start may tidy too
+        with contextlib.suppress(FileNotFoundError):  # another process may prune, too
             status = path.stat()
-            if status.st_mtime >= since - 2 and not _whole(path.read_bytes()):  # 2 s: coarse clocks of files
+            if status.st_mtime >= since - 2 and not _is_complete(path.read_bytes()):  # 2 s: file times are coarse
                 path.unlink()
             else:
                 kept.append((max(status.st_atime, status.st_mtime), status.st_size, path))
     size = sum(entry[1] for entry in kept)
     for _, bytes_, path in sorted(kept):
-        if size <= largest:
+        if size <= max_bytes:
             break
         path.unlink(missing_ok=True)
         size -= bytes_
 
 
-def _whole(content):
-    """Returns whether a file holds all of what was compressed into it."""
+def _is_complete(content):
+    """Returns whether a file decompresses."""
     if content.startswith(_ZSTD):
-        return _whole_zstd(content)
+        return _is_complete_zstd(content)
     try:
         zlib.decompress(content)
     except zlib.error:
@@ -70,7 +71,7 @@ def _whole(content):
     return True
 
 
-def _whole_zstd(content):
+def _is_complete_zstd(content):
     try:
         import zstandard
     except ImportError:  # then JAX wrote it with another library, or for another Python
@@ -83,9 +84,9 @@ def _whole_zstd(content):
 
 
 def _machine():
-    """Returns a name for what this processor can do: a program for more than that would end in a crash."""
+    """Returns a name for this processor's instruction set; a program for a larger one would crash."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        said = {line for line in lines if line.startswith(("model name", "flags", "Features"))}
-        return f"{platform.machine()}-{zlib.crc32(repr(sorted(said)).encode()):08x}"
+        features = {line for line in lines if line.startswith(("model name", "flags", "Features"))}
+        return f"{platform.machine()}-{fingerprint(*sorted(features))[:8]}"
     return platform.machine() or "any"

@@ -1,14 +1,16 @@
-"""The one place that knows about devices: the same step under jit, sharded jit and pmap.
+"""Devices: the same training step under jit, sharded jit and pmap.
 
-With several processes (see hosts.cluster) the devices are those of all of them. Each process reads all
-training views and keeps them on each of its devices. It cannot do with less: a ray may be of any pixel, and
-of which follows from its position in the whole batch, so that batches are the same on any number of devices.
-It draws, renders and differentiates the rays of its own devices only; gradients are summed over all devices.
-The first process alone writes config.json, metrics.jsonl and what is printed; all take part in a checkpoint.
+With several processes (see `processes.cluster`) the devices are those of all of them. Each process reads all
+training views and copies them to each of its devices, as any ray may be drawn from any pixel: which one depends
+only on the ray's position in the whole batch, so batches are the same on any number of devices. A process draws,
+renders and differentiates the rays of its own devices; gradients are summed over all devices. Only the first
+process writes config.json and metrics.jsonl and prints; all take part in a checkpoint.
 """
 
 import functools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,36 +21,39 @@ from jax.sharding import PartitionSpec as P
 from jaxnerf.runtime import memory, processes
 
 MODES = ("auto", "jit", "sharded", "pmap")
-CPU_BLOCK_SAMPLES = 12_288
+CPU_MICROBATCH_SAMPLES = 12_288  # the fastest in experiments/speed: activations stay in the cache
 
 
-def compile_step(train_step, state, data, *, batch_size, microbatch_size=0, samples_per_ray=1, mode="auto"):
-    """Returns the step compiled for the devices, and the state and data placed for it.
+def compile_step(
+    train_step: Callable[..., tuple],
+    state: Any,
+    data: Any,
+    *,
+    batch_size: int,
+    microbatch_size: int | None = None,
+    mode: str = "auto",
+) -> tuple[Callable[..., tuple], Any, Any]:
+    """Compiles a training step for the devices, and places its state and data there.
 
     Args:
-        train_step: see step.make_train_step.
-        state: TrainState, or a function that makes one, which then runs while the step compiles. That of
-            the first process counts.
-        data: what the step's draw takes; copied to every device. The same in all processes.
-        batch_size: rays a step, over all devices of all processes.
-        block_size: rays whose gradient is taken at once. 0: all that a device has, or on a CPU as
-            many as its cache holds the activations of.
-        samples_per_ray: of the largest network, for that choice.
-        mode: "jit" (one device), "sharded" (jit over a mesh of all devices), "pmap", or "auto": jit
-            where there is one device, else sharded.
+        train_step: see `make_train_step`.
+        state: TrainState, or a function that makes one, which runs while the step compiles. With several
+            processes the first one's state counts.
+        data: what the step draws from; copied to every device. The same in all processes.
+        batch_size: rays per step, over all devices of all processes.
+        microbatch_size: rays whose gradient is computed at once; None, or more than a device has: all of them.
+        mode: "jit" (one device), "sharded" (jit over a mesh of all devices), "pmap", or "auto": jit on one
+            device, otherwise sharded.
 
     Returns:
         run, state, data: run(state, data) -> (state, metrics) consumes its state; run.compiled is what JAX
-        compiled, with its memory_analysis() and as_text(), but for pmap in several processes.
+        compiled, with its memory_analysis() and as_text(), except for pmap in several processes.
 
     Raises:
         ValueError: if the batch does not split evenly, the processes' data differ, or on an unknown mode.
-        memory.NoRoom: if the step would need more memory than there is.
+        memory.OutOfMemory: if the step needs more memory than is free.
     """
     devices = devices_of(mode)
-    microbatch_size = microbatch_size or default_microbatch(
-        batch_size // len(devices), samples_per_ray, devices[0].platform
-    )
     positions = split_positions(batch_size, len(devices), microbatch_size)
     mesh = Mesh(np.array(devices), ("batch",))
     single = mode == "jit" or (mode == "auto" and len(devices) == 1)
@@ -71,13 +76,13 @@ def compile_step(train_step, state, data, *, batch_size, microbatch_size=0, samp
     processes.check_same("data or configuration", data)
     data = place(data, everywhere)
     with ThreadPoolExecutor(1) as pool:
-        made = pool.submit(_to_plain_code(state, devices[0]) if callable(state) else make)
-        if mode == "pmap" and jax.process_count() > 1:  # whose pmap JAX compiles at its first call only
-            compiled = _with_state_everywhere(jitted, everywhere)
+        made = pool.submit(_unoptimized(state, devices[0]) if callable(state) else make)
+        if mode == "pmap" and jax.process_count() > 1:  # JAX compiles this at the first call only
+            compiled = _with_global_state(jitted, everywhere)
         else:
             compiled = jitted.lower(shapes, data, positions).compile()
             memory.check(compiled)
-        state = place(processes.from_first(made.result()), everywhere)
+        state = place(processes.broadcast(made.result()), everywhere)
 
     def run(state, data):
         return compiled(state, data, positions)
@@ -98,28 +103,28 @@ def _sharded(train_step, mesh):
     return jax.jit(sharded, donate_argnums=0)
 
 
-def _to_plain_code(function, device):
-    """Returns a jitted function that runs once: to make its code fast would take longer than to run it."""
-    plain = {"xla_backend_optimization_level": 0} if device.platform == "cpu" else None
-    return jax.jit(function, compiler_options=plain)
+def _unoptimized(function, device):
+    """Jits a function that runs once: optimizing its code takes longer than running it."""
+    options = {"xla_backend_optimization_level": 0} if device.platform == "cpu" else None
+    return jax.jit(function, compiler_options=options)
 
 
-def _with_state_everywhere(run, everywhere):
-    """Returns the pmapped step with a state of all processes, where pmap gives one of its own devices."""
+def _with_global_state(run, everywhere):
+    """Returns the pmapped step with a state on the devices of all processes; pmap returns one on its own only."""
 
-    def whole(leaf):
+    def to_global(leaf):
         parts = [shard.data for shard in leaf.addressable_shards]
         return jax.make_array_from_single_device_arrays(leaf.shape, everywhere, parts)
 
     def compiled(state, data, positions):
         state, metrics = run(state, data, positions)
-        return jax.tree.map(whole, state), metrics
+        return jax.tree.map(to_global, state), metrics
 
     return compiled
 
 
-def place(tree, sharding):
-    """Returns arrays on the devices of a sharding; some may be other processes', which have the same tree."""
+def place(tree: Any, sharding: jax.sharding.Sharding) -> Any:
+    """Places arrays on the devices of a sharding; other processes that own some of them have the same tree."""
     if sharding.is_fully_addressable:
         return jax.device_put(tree, sharding)
 
@@ -130,38 +135,40 @@ def place(tree, sharding):
     return jax.tree.map(put, tree)
 
 
-def devices_of(mode):
-    """Returns the devices, of all processes, that a mode uses; ValueError if there is no such mode."""
+def devices_of(mode: str) -> list[jax.Device]:
+    """Returns the devices, of all processes, that a mode uses; raises ValueError on an unknown mode."""
     if mode not in MODES:
-        raise ValueError(f"train.parallel is {mode!r}, wanted one of {MODES}")
+        raise ValueError(f"train.parallel is {mode!r}, expected one of {MODES}")
     if mode == "jit" and jax.process_count() > 1:
         raise ValueError(f"train.parallel is 'jit' in {jax.process_count()} processes; set it to 'auto'")
     return jax.devices()[: 1 if mode == "jit" else None]
 
 
-def default_microbatch(share, samples_per_ray, platform):
-    """Returns how many of a device's share of rays to take the gradient of at once."""
+def default_microbatch(rays: int, samples_per_ray: float, platform: str) -> int:
+    """Returns the microbatch size with which a device is fastest.
+
+    Args:
+        rays: of a step on this device.
+        samples_per_ray: of the largest network.
+        platform: of the device.
+    """
     if platform != "cpu":
-        return share
-    # The best size in experiments/step_cost.py; the activations of a whole batch would leave the cache.
-    fitting = max(CPU_BLOCK_SAMPLES // int(samples_per_ray), 1)
-    return max(size for size in range(1, min(share, fitting) + 1) if share % size == 0) if share > 0 else 0
+        return rays
+    fitting = max(CPU_MICROBATCH_SAMPLES // int(samples_per_ray), 1)
+    return max(size for size in range(1, min(rays, fitting) + 1) if rays % size == 0) if rays > 0 else 0
 
 
-def microbatch_of(train, samples_per_ray):
-    """Returns the microbatch size that the devices of a train section are fastest with."""
-    devices = devices_of(train.parallel)
-    share = train.batch_size // len(devices)
-    return default_microbatch(share, samples_per_ray, devices[0].platform)
+def split_positions(batch_size: int, num_devices: int, microbatch_size: int | None = None) -> np.ndarray:
+    """Returns [devices, microbatches, rays] int32, every position in the batch once, in order.
 
-
-def split_positions(batch_size, num_devices, microbatch_size):
-    """Returns [devices, blocks, rays] int32, every place in the batch once, in order."""
-    share, uneven = divmod(batch_size, num_devices)
-    microbatch_size = min(microbatch_size, share) or share
-    if uneven or share < 1 or share % microbatch_size:
+    Raises:
+        ValueError: if the batch does not split evenly.
+    """
+    rays, uneven = divmod(batch_size, num_devices)
+    size = rays if microbatch_size is None else min(microbatch_size, rays)
+    if uneven or size < 1 or rays % size:
         raise ValueError(
-            f"batch_size {batch_size} on {num_devices} device(s) in microbatches of {microbatch_size} rays does not "
-            "come out even; change train.batch_size or train.microbatch_size"
+            f"train.batch_size {batch_size} does not split evenly over {num_devices} device(s) in microbatches of "
+            f"{size} rays; change train.batch_size or train.microbatch_size"
         )
-    return np.arange(batch_size, dtype=np.int32).reshape(num_devices, share // microbatch_size, microbatch_size)
+    return np.arange(batch_size, dtype=np.int32).reshape(num_devices, rays // size, size)

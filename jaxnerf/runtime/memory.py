@@ -1,45 +1,56 @@
-"""How much memory is left, whether a program has room in it, and going on with less where it has not."""
+"""Memory: how much is free, whether a program fits, and retrying with smaller parts when it does not."""
 
+import functools
 import pathlib
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import jax
 
-_HOST_SHARE = 0.8  # of what a host has left, that a program may take: more, and the system ends processes
-_MARGIN = 0.9  # what scales with a size also has a part that does not
+from jaxnerf.core.occupancy.ray_culling import render_selected
+from jaxnerf.core.rendering import render_image
+from jaxnerf.core.types import Rays, Rendering
+
+_HOST_FRACTION = 0.8  # of the host's free memory that a program may take: beyond, the system kills processes
+_MARGIN = 0.9  # part of what a program needs does not scale with the size of its parts
 
 
-class NoRoom(Exception):
-    """A program needs more memory than there is, by what its compiler says."""
+class OutOfMemory(Exception):
+    """A program needs more memory than is free, as its compiler computes.
 
-    def __init__(self, needed, room):
-        super().__init__(f"needs {needed / 1e6:,.1f} MB where {max(room, 0) / 1e6:,.1f} MB are left")
-        self.share = room / needed
+    Attributes:
+        fraction: what is free over what it needs.
+    """
+
+    def __init__(self, needed: float, free: float):
+        super().__init__(f"needs {needed / 1e6:,.1f} MB, {max(free, 0) / 1e6:,.1f} MB are free")
+        self.fraction = free / needed
 
 
-def check(compiled):
-    """Raises NoRoom where a compiled program's results and temporaries find none; its arguments are there."""
+def check(compiled: Any) -> None:
+    """Raises OutOfMemory if a compiled program's results and temporaries do not fit; its arguments exist already."""
     stats = compiled.memory_analysis() if hasattr(compiled, "memory_analysis") else None
-    room = left()
-    if stats is None or room is None:
+    free = available()
+    if stats is None or free is None:
         return
     needed = stats.temp_size_in_bytes + stats.output_size_in_bytes - stats.alias_size_in_bytes
-    if needed > room:
-        raise NoRoom(needed, room)
+    if needed > free:
+        raise OutOfMemory(needed, free)
 
 
-def left():
-    """Returns the bytes that one of the local devices may still take; None where nobody tells."""
+def available() -> float | None:
+    """Returns the bytes that are free on one of the local devices; None where the device does not report them."""
     device = jax.local_devices()[0]
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         return stats["bytes_limit"] - stats["bytes_in_use"]
-    found = _host_left() if device.platform == "cpu" else []
-    return _HOST_SHARE * min(found) / jax.local_device_count() if found else None
+    found = _host_available() if device.platform == "cpu" else []
+    return _HOST_FRACTION * min(found) / jax.local_device_count() if found else None
 
 
-def _host_left(system="/"):
-    """Returns what the host and each limit of the process's control group leave, in bytes."""
+def _host_available(system="/"):
+    """Returns the bytes that the host and each limit of the process's control group allow."""
     found, system = [], pathlib.Path(system)
     try:
         lines = (system / "proc/meminfo").read_text().splitlines()
@@ -54,42 +65,123 @@ def _host_left(system="/"):
             stats = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
         except (OSError, ValueError):
             continue
-        if limit != "max":  # pages of files that nobody uses just now are given back when needed
+        if limit != "max":  # the system frees cached pages of files when it needs them
             found.append(int(limit) - int(used) + int(stats.get("inactive_file", 0)))
     return found
 
 
-def back_off(attempt, size, *, cause, unit, least=1, whole=False):
-    """Returns attempt(size), and the size; where memory runs out it says so and goes on with less.
+def back_off(
+    attempt: Callable[[int], Any], size: int, *, cause: str, unit: str, least: int = 1, divisors: bool = False
+) -> tuple[Any, int]:
+    """Returns attempt(size) and the size; where memory runs out, prints a line and retries with a smaller size.
 
     Args:
-        attempt: size -> result. It may raise NoRoom, or what JAX raises when memory runs out.
-        size: to begin with.
-        cause: what it is that needs the memory, for the line.
-        unit: what the size counts, for the line.
-        least: below which there is no attempt.
-        whole: whether sizes must divide the first one.
+        attempt: size -> result. It may raise OutOfMemory, or what JAX raises when memory runs out.
+        size: of the first attempt.
+        cause: what needs the memory, for the message.
+        unit: what the size counts, for the message.
+        least: the smallest size to try.
+        divisors: whether sizes must divide the first one.
 
     Raises:
-        ValueError: if there is no room for the least either.
+        ValueError: if the least does not fit either.
     """
     while True:
         try:
             return attempt(size), size
-        except (NoRoom, jax.errors.JaxRuntimeError) as error:
-            if not ran_out(error):
+        except (OutOfMemory, jax.errors.JaxRuntimeError) as error:
+            if isinstance(error, OutOfMemory):
+                why, fraction = str(error), min(_MARGIN * error.fraction, 0.5)
+            elif "RESOURCE_EXHAUSTED" in str(error):
+                why, fraction = "the device has no more memory", 0.5
+            else:
                 raise
-            why = f"{error}" if isinstance(error, NoRoom) else "the device has no more"
-            share = min(_MARGIN * error.share, 0.5) if isinstance(error, NoRoom) else 0.5
-        smaller = max(int(size * share), least)
-        if whole:
+        smaller = max(int(size * fraction), least)
+        if divisors:
             smaller = max(part for part in range(1, smaller + 1) if size % part == 0)
         if smaller >= size:
-            raise ValueError(f"out of memory in the {cause}: {size} {unit}, the least that can be: {why}")
-        print(f"out of memory in the {cause}: {size} {unit}: {why}; going on with {smaller}", file=sys.stderr)
+            raise ValueError(f"out of memory in the {cause} with {size} {unit}, which is the minimum: {why}")
+        print(f"out of memory in the {cause} with {size} {unit}: {why}; continuing with {smaller}", file=sys.stderr)
         size = smaller
 
 
-def ran_out(error):
-    """Returns whether an error says that memory ran out."""
-    return isinstance(error, NoRoom) or "RESOURCE_EXHAUSTED" in str(error)
+def fit_step(
+    compile_step: Callable[..., tuple], state: Any, data: Any, microbatch_size: int
+) -> tuple[Callable[..., tuple], Any, Any]:
+    """Returns what compile_step(state, data, microbatch_size) returns, with smaller microbatches if necessary.
+
+    Whether a size fits is checked when the step is compiled, and again by the first step, which is repeated
+    with a smaller size if memory runs out. Later steps need no more than the first. The batch stays the same,
+    so except for rounding a step does, too.
+
+    Args:
+        compile_step: (state, data, microbatch size) -> run, state, data; see `devices.compile_step`.
+        state, data: see `devices.compile_step`.
+        microbatch_size: rays.
+    """
+    options = {"cause": "training step", "unit": "rays per microbatch (--batch)", "divisors": True}
+    if jax.process_count() > 1:
+        options["least"] = microbatch_size  # all processes run the same program, so one cannot change it
+    (run, state, data), size = back_off(lambda size: compile_step(state, data, size), microbatch_size, **options)
+    tried = False
+
+    def run_once_or_retry(state, data):
+        nonlocal run, size, tried
+        if tried:
+            return run(state, data)
+        kept = jax.device_get(state)  # a step consumes its state, also one that fails
+
+        def attempt(new_size):
+            nonlocal run
+            given = state, data
+            if new_size != size:
+                run, *given = compile_step(kept, data, new_size)
+            return jax.block_until_ready(run(*given))
+
+        result, size = back_off(attempt, size, **options)
+        tried = True
+        return result
+
+    return run_once_or_retry, state, data
+
+
+def image_renderer(
+    render: Callable[[Any, Rays], Rendering], default: int, cull: Callable[..., tuple] | None = None
+) -> Callable[..., Rendering]:
+    """Makes the function (variables, rays [...], chunk=None) -> Rendering [...], in chunks that fit into memory.
+
+    Args:
+        render: (variables, Rays [N]) -> Rendering [N], jitted.
+        default: rays per chunk where none are given. An image with fewer rays has one chunk of about its size.
+        cull: (variables, Rays [...]) -> bool [...], which rays to render, and the Rendering of the others;
+            None: all are rendered.
+    """
+    fitting = {}  # requested chunk -> the one that fits
+
+    def image(variables, rays, chunk=None):
+        requested = min(default if chunk is None else chunk, 1 << (rays.near.size - 1).bit_length())
+        key = requested, _shapes(variables)
+
+        def attempt(size):
+            if fitting.get(key) != size:
+                part = jax.tree.map(lambda leaf: _chunk_of(leaf, rays.near.ndim, size), rays)
+                check(render.lower(variables, part).compile())  # cached for the calls below
+            part = functools.partial(render, variables)
+            if cull is None:
+                return jax.block_until_ready(render_image(part, rays, chunk=size))
+            return jax.block_until_ready(render_selected(part, rays, *cull(variables, rays), chunk=size))
+
+        result, fitting[key] = back_off(
+            attempt, fitting.get(key, requested), cause="image", unit="rays per chunk (--chunk)"
+        )
+        return result
+
+    return image
+
+
+def _chunk_of(leaf, axes, size):
+    return jax.ShapeDtypeStruct((size, *leaf.shape[axes:]), leaf.dtype)
+
+
+def _shapes(tree):
+    return tuple((leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(tree))

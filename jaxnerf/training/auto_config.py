@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,26 +14,32 @@ from jaxnerf.data import dataset
 from jaxnerf.data.geometry import poses, visual_hull
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.runtime import devices
-from jaxnerf.runtime.config_fields import AUTO, is_auto
+from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.build import build_model
 
-_SPACING = 0.7  # of a pixel's footprint: the finest detail that images resolve, and a little finer
-_FINEST = (32, 256)  # vertices along the longest side, at least and at most
-_MOST_STEPS = 144  # along the longest side: finer images need finer features sooner than finer steps
-_STEPS_PER_ROOT_PIXEL = 1000  # training steps: finer images need more, though not as many more
-_WIDEST_BOX = 3.0  # times all of contracted space: a box that is wider is no better than that
-_LARGEST_GRID = 128  # cells: beyond, updating them costs more than the samples that they save
+_CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
+_FINEST = (32, 256)  # vertices along the longest side, minimum and maximum
+_MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features sooner than finer steps
+_TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps grow with the root of an image's side in pixels
+_MAX_STATED_BOX = 3.0  # times all of contracted space: a stated box that is larger is no better than contraction
+_MAX_RESOLUTION = 128  # cells: updating more costs more than the samples that they save
 
 # These depend on the device, so they are inferred at every start and stay "auto" in the workdir.
 DEVICE_FIELDS = ("train.microbatch_size", "eval.chunk", "eval.max_samples")
 
 
 class Resolved(NamedTuple):
-    """A config without "auto", the views that it was resolved against, and what was inferred."""
+    """A resolved config.
+
+    Attributes:
+        config: without "auto", except in DEVICE_FIELDS.
+        views: of the split "train", which it was resolved against.
+        lines: one per inferred value that the run uses, with its reason.
+    """
 
     config: ConfigDict
-    views: Views  # of the split "train"
-    lines: list[str]  # one per inferred value, with its reason
+    views: Views
+    lines: list[str]
 
 
 def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
@@ -54,41 +61,51 @@ def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
     lines = lines + _resolve_sizes(config, views)
     left = [name for name in auto_fields(config) if name not in DEVICE_FIELDS]
     if left:
-        raise ValueError(f"{left[0]} is 'auto', which nothing infers; set a value")
+        raise ValueError(f"{left[0]} is 'auto', which is not inferred for this field; set a value")
     return Resolved(config, views, lines)
 
 
 def resolve_for_device(config: ConfigDict) -> tuple[ConfigDict, list[str]]:
-    """Resolves the fields that depend on the device that runs this process, of an otherwise resolved config."""
+    """Resolves DEVICE_FIELDS of an otherwise resolved config for the devices of this process.
+
+    Returns:
+        A copy of the config, and one line per inferred value.
+    """
     config, lines = copy.deepcopy(config), []
+    infer = _inferring(lines)
     cpu = jax.default_backend() == "cpu"
-    if is_auto(config.eval.max_samples):
-        # On a CPU activations stay in the cache; an accelerator is slow with little to do.
-        config.eval.max_samples = 2**10 if cpu else 2**17
-        lines.append(f"images        {config.eval.max_samples} samples evaluated at once, for this device")
-    if is_auto(config.eval.chunk):
-        config.eval.chunk = 2**12 if cpu else 2**16
-        lines.append(f"images        {config.eval.chunk} rays rendered at once, for this device")
+    # On a CPU activations stay in the cache; an accelerator needs many samples to be busy.
+    samples, rays = (2**10, 2**12) if cpu else (2**17, 2**16)
+    infer(config.eval, "max_samples", samples, f"images        {samples} samples per batch, for this device")
+    infer(config.eval, "chunk", rays, f"images        {rays} rays per chunk, for this device")
     if is_auto(config.train.microbatch_size):
-        samples = build_model(config).samples_per_ray
-        config.train.microbatch_size = devices.microbatch_of(config.train, samples)
+        used = devices.devices_of(config.train.parallel)
+        device_rays = config.train.batch_size // len(used)
+        size = devices.default_microbatch(device_rays, build_model(config).samples_per_ray, used[0].platform)
+        infer(config.train, "microbatch_size", size, f"microbatch    {size} rays, for this device")
     return config, lines
 
 
 def fill_from(config: ConfigDict, resolved: ConfigDict) -> ConfigDict:
-    """Returns a copy of a config whose "auto" fields have the values of a resolved one."""
+    """Returns a copy of a config whose "auto" fields have the values of a resolved one.
+
+    Raises:
+        ValueError: if the resolved one lacks such a field.
+    """
     config = copy.deepcopy(config)
     for name in auto_fields(config):
         *sections, field = name.split(".")
         ours, theirs = config, resolved
         for section in sections:
-            ours, theirs = ours[section], theirs[section]
+            ours, theirs = ours[section], theirs.get(section, {})
+        if field not in theirs:
+            raise ValueError(f"{name} is 'auto', and the config of the workdir has no such field; set a value")
         ours[field] = theirs[field]
     return config
 
 
 def auto_fields(config: ConfigDict) -> list[str]:
-    """Returns the dotted names of the fields that are "auto" by inference; train.parallel knows "auto" itself."""
+    """Returns the dotted names of the fields that are "auto"; train.parallel = "auto" is a value of its own."""
 
     def names(section, prefix):
         for key, value in section.items():
@@ -100,114 +117,129 @@ def auto_fields(config: ConfigDict) -> list[str]:
     return [name for name in names(config.to_dict(), "") if name != "train.parallel"]
 
 
+def _inferring(lines: list[str]) -> Callable[..., None]:
+    """Returns the function that fills a field in if it is "auto", and adds a line if the run uses it."""
+
+    def infer(section: Any, name: str, value: Any, line: str, *, used: bool = True) -> None:
+        if is_auto(section[name]):
+            section[name] = value
+            if used:
+                lines.append(line)
+
+    return infer
+
+
 def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     """Fills the sizes of grids, networks and training into a config; returns lines."""
     lines: list[str] = []
+    infer = _inferring(lines)
     section, train, ndc = config.occupancy, config.train, config.data.ndc
-
-    def infer(owner: Any, name: str, value: Any, line: str) -> None:
-        if is_auto(owner[name]):
-            owner[name] = value
-            lines.append(line)
-
-    # Alpha prunes the box of what is trained in it; a grid that is baked later is for the cameras alone.
-    in_box = config.sampler != "hierarchical" or config.field != "mlp"
-    use_alpha = in_box and section.use_alpha and views.pixels.shape[-1] == 4 and not ndc
+    paper = config.sampler == "hierarchical" and config.field == "mlp"  # it knows no box
+    use_box = {"used": not paper or config.eval.bake_occupancy}
+    # Alpha bounds the box of a field that lives in it. A box for images alone holds all that cameras see.
+    use_alpha = not paper and section.use_alpha and views.pixels.shape[-1] == 4 and not ndc
     if is_auto(section.contracted):
-        section.contracted, why = _contracted(config, views, use_alpha)
-        lines.append(f"contraction   {'on' if section.contracted else 'off'}: {why}")
-    footprint = _footprint(views, ndc)
+        contracted, why = _contracted(config, views, use_alpha)
+        infer(section, "contracted", contracted, f"contraction   {'on' if contracted else 'off'}: {why}", **use_box)
+    footprint = 2 / float(np.max(views.size[:, 1])) if ndc else _LookAt(views).footprint
     if is_auto(section.lower) or is_auto(section.upper):
         lower, upper, why = _box(views, use_alpha, ndc=ndc, contracted=section.contracted)
         digits = 4 - math.floor(math.log10(max(upper - lower)))
         for name, bound in (("lower", lower), ("upper", upper)):
-            if is_auto(section[name]):
-                section[name] = tuple(round(float(x), digits) for x in bound)
-        lines.append(f"box           {_text(section.lower)} to {_text(section.upper)}, {why}")
+            infer(section, name, tuple(round(float(x), digits) for x in bound), "", used=False)
+        if use_box["used"]:
+            lines.append(f"box           {_point(section.lower)} to {_point(section.upper)}, {why}")
     longest = max(high - low for low, high in zip(section.lower, section.upper, strict=True))
     if not longest > 0:
         raise ValueError(
             f"occupancy.lower is {section.lower} and occupancy.upper {section.upper}, expected lower < upper"
         )
-    finest = int(np.clip(round(longest / (_SPACING * footprint)), *_FINEST))
-    step_size = longest / min(finest, _MOST_STEPS)
-    infer(section, "step_size", step_size, f"step size     {step_size:.4g}, a pixel covers {footprint:.4g}")
-    resolution = min(finest, _LARGEST_GRID)
-    infer(section, "resolution", resolution, f"grid          {resolution} cells along the longest side")
+    finest = int(np.clip(round(longest / (_CELL_PER_PIXEL * footprint)), *_FINEST))
+    step_size = longest / min(finest, _MAX_STEPS_PER_SIDE)
+    line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
+    infer(section, "step_size", step_size, line, **use_box)
+    resolution = min(finest, _MAX_RESOLUTION)
+    infer(section, "resolution", resolution, f"grid          {resolution} cells along the longest side", **use_box)
     octaves = int(np.clip(round(1 + math.log2(2 * math.pi / (4 * footprint))), 1, 16))
-    for name in ("coarse", "fine"):
-        infer(
-            config[name],
-            "num_freqs",
-            octaves,
-            f"octaves       {octaves}, down to waves of four pixels ({name})",
-        )
+    for name, used in (("coarse", config.sampler == "hierarchical"), ("fine", config.field == "mlp")):
+        line = f"octaves       {octaves} in {name}; the shortest wave is four pixels long"
+        infer(config[name], "num_freqs", octaves, line, used=used)
     levels = tuple(max(finest // 2**level, 2) for level in (3, 2, 1, 0))
-    infer(config.hash_grid, "resolutions", levels, f"hash grid     {levels} vertices along the longest side")
-    root = float(np.sqrt(np.prod(views.size, axis=1)).mean()) ** 0.5
-    steps = round(_STEPS_PER_ROOT_PIXEL * root)
-    infer(train, "max_steps", steps, f"training      {steps:,} steps, by the size of the images")
-    infer(train, "lr_steps", train.max_steps, f"learning rate falls for {train.max_steps:,} steps, all of them")
+    line = f"hash grid     {levels} vertices along the longest side"
+    infer(config.hash_grid, "resolutions", levels, line, used=config.field == "hash_grid")
+    side = float(np.sqrt(np.prod(views.size, axis=1)).mean())
+    steps = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5)
+    infer(train, "max_steps", steps, f"training      {steps:,} steps, for images {side:.0f} px wide")
+    infer(train, "lr_steps", train.max_steps, f"training      learning rate decays over {train.max_steps:,} steps")
     return lines
 
 
-def _footprint(views, ndc):
-    """Returns the size of a pixel at the point that the cameras look at, in world units."""
-    if ndc:
-        return 2 / float(np.max(views.size[:, 1]))
-    eyes = np.asarray(views.cameras.to_world, np.float64)[:, :, 3]
-    distances = np.linalg.norm(eyes - poses.gaze_center(views.cameras.to_world), axis=-1)
-    return float(np.median(distances / np.asarray(views.cameras.focal)[:, 0]))
+class _LookAt:
+    """What the cameras look at.
+
+    Attributes:
+        center: [3] world units, the point nearest to the cameras' axes. Where the axes are parallel, all
+            cameras are at one point, or there is one view, no such point lies in front of the cameras; then it
+            is the mean of the middles of the views' depth ranges.
+        distance: [V] of it from the cameras.
+        half_size: [V, 2] half the width and height of the images there.
+        footprint: the size of a pixel there, the median over views.
+    """
+
+    def __init__(self, views):
+        to_world = np.asarray(views.cameras.to_world, np.float64)
+        eyes, axes = to_world[:, :, 3], to_world[:, :, 2]
+        middle = (np.asarray(views.near, np.float64) + np.asarray(views.far, np.float64)) / 2
+        self.center = poses.gaze_center(to_world)
+        self.distance = np.linalg.norm(eyes - self.center, axis=-1)
+        spread = np.linalg.eigvalsh(np.eye(3) - axes.T @ axes / len(axes))[0]
+        if spread < 1e-6 or np.median(self.distance) < 1e-3 * np.median(middle):
+            self.center = (eyes - middle[:, None] * axes).mean(axis=0)
+            self.distance = middle
+        focal = np.asarray(views.cameras.focal, np.float64)
+        self.half_size = self.distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / focal
+        self.footprint = float(np.median(self.distance / focal[:, 0]))
+
+    @property
+    def inner_half_side(self):
+        """Half the side of the cube that most images show whole, which deserves most cells."""
+        return float(np.median(self.half_size.min(axis=1)))
 
 
 def _contracted(config, views, use_alpha):
     """Returns whether the box holds all of space, and why."""
     if config.data.ndc:
-        return False, "normalised device coordinates hold all that is seen"
+        return False, "normalised device coordinates hold everything in view"
     if config.data.world != "around":
         return False, f"the world is {config.data.world!r}"
-    if views.box is not None and _side(views.box) <= _WIDEST_BOX * 4 * _inner_half_side(views):
-        return False, "the file states the scene's bounds"
+    if views.box is not None:
+        side = float(np.max(np.asarray(views.box[1]) - np.asarray(views.box[0])))
+        if side <= _MAX_STATED_BOX * 4 * _LookAt(views).inner_half_side:
+            return False, "the dataset states the scene's bounds"
     if use_alpha:
-        return False, "alpha shows where the object ends"
-    return True, "nothing states how far the surroundings extend"
+        return False, "alpha bounds the object"
+    return True, "nothing bounds the surroundings"
 
 
 def _box(views, use_alpha, *, ndc, contracted):
-    """Returns lower, upper, and how they were found."""
+    """Returns lower [3], upper [3], and how they were found."""
     if ndc:
-        lower, upper = _ends_of_rays(views)
-        return lower, upper, "the bounds of all rays"
+        return *_ends_of_rays(views), "the bounds of all rays"
     if views.box is not None and not contracted:
-        return *np.asarray(views.box, np.float64), "as the file states"
-    center, width = _widths(views)
+        return *np.asarray(views.box, np.float64), "as the dataset states"
+    look_at = _LookAt(views)
     if contracted:
-        half = _inner_half_side(views)
-        return center - 2 * half, center + 2 * half, f"not contracted within {half:.2g} of its centre"
-    lower, upper = center - width.max(), center + width.max()
+        half = look_at.inner_half_side
+        return look_at.center - 2 * half, look_at.center + 2 * half, f"not contracted within {half:.2g} of its centre"
+    half = look_at.half_size.max()
+    lower, upper = look_at.center - half, look_at.center + half
     if not use_alpha:
-        return lower, upper, "as wide as the images where all cameras look"
-    return *visual_hull.hull_bounds(views, lower, upper), "the bounds of what alpha leaves"
-
-
-def _widths(views):
-    """Returns the point that the cameras look at [3], and half the size of the images there [V, 2]."""
-    center = poses.gaze_center(views.cameras.to_world)
-    distance = np.linalg.norm(np.asarray(views.cameras.to_world)[:, :, 3] - center, axis=-1)
-    return center, distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / np.asarray(views.cameras.focal)
-
-
-def _inner_half_side(views):
-    """Returns half the side of the cube that most images show whole, which is worth most cells."""
-    return float(np.median(_widths(views)[1].min(axis=1)))
-
-
-def _side(box):
-    return float(np.max(np.asarray(box[1]) - np.asarray(box[0])))
+        return lower, upper, "as large as the images at the point that all cameras look at"
+    return *visual_hull.hull_bounds(views, lower, upper), "the bounds of the visual hull"
 
 
 def _ends_of_rays(views):
-    """Returns the bounds of all rays: of those through the images' corners, as NDC rays are straight."""
+    """Returns lower [3] and upper [3] of all rays: NDC rays are straight, so those of the corners bound all."""
     ends = []
     for index, (height, width) in enumerate(np.asarray(views.size)):
         corners = np.float32([[0, 0], [width, 0], [0, height], [width, height]])
@@ -218,8 +250,5 @@ def _ends_of_rays(views):
     return ends.min(axis=0), ends.max(axis=0)
 
 
-def _text(point):
+def _point(point):
     return "(" + ", ".join(f"{value:.2f}" for value in point) + ")"
-
-
-__all__ = ["AUTO", "DEVICE_FIELDS", "Resolved", "auto_fields", "fill_from", "resolve", "resolve_for_device"]

@@ -1,4 +1,4 @@
-"""Turns a resolved config into the functions of a run. Nothing else reads a resolved config."""
+"""Turns a resolved config into the functions of a run. Nothing else reads the sections of a resolved config."""
 
 import dataclasses
 import functools
@@ -27,23 +27,40 @@ _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha")  # of the optional ones
 
 
 class Experiment(NamedTuple):
-    """All that the training and evaluation loops need of a config."""
+    """Everything that the training and evaluation loops need of a config.
+
+    Attributes:
+        model: the config's field and sampler.
+        losses: those with a weight.
+        optimizer: see `make_optimizer`.
+        schedule: step -> learning rate.
+        load_split: split -> Views.
+        draw: (step, positions, TrainData) -> (keys, Batch).
+        pixel_ids: (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes.
+        view_rays: (Views, index, pixels) -> Rays.
+        world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
+        prepare: Views -> (valid cells, or None without a grid; TrainData).
+        seed: of everything random.
+        pixel_offset: px, from a pixel's index to the point that its ray goes through.
+        train, eval: the config's sections.
+        conventions: see `conventions`.
+    """
 
     model: Model
     losses: tuple[StepLoss, ...]
     optimizer: optax.GradientTransformation
-    schedule: Callable[[int], float]  # step -> learning rate
-    load_split: Callable[[str], Views]  # split -> Views
-    draw: Callable[..., tuple]  # (step, positions, TrainData) -> (keys, Batch)
-    pixel_ids: Callable[..., Any]  # (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes
-    view_rays: Callable[..., Any]  # (Views, index, pixels) -> Rays
-    world_depth: Callable[..., Any]  # (Views, index, pixels, depth in t) -> distance in the file's units
-    prepare: Callable[..., tuple]  # Views -> (valid cells, or None without a grid; TrainData)
+    schedule: Callable[[int], float]
+    load_split: Callable[[str], Views]
+    draw: Callable[..., tuple]
+    pixel_ids: Callable[..., Any]
+    view_rays: Callable[..., Any]
+    world_depth: Callable[..., Any]
+    prepare: Callable[..., tuple]
     seed: int
     pixel_offset: float
-    train: SimpleNamespace  # the config's section
+    train: SimpleNamespace
     eval: SimpleNamespace
-    conventions: dict[str, Any]  # see conventions
+    conventions: dict[str, Any]
 
 
 def build(config: ConfigDict) -> Experiment:
@@ -52,7 +69,7 @@ def build(config: ConfigDict) -> Experiment:
     Raises:
         ValueError: names the field that holds what cannot be built.
     """
-    model, losses = build_model(config), build_losses(config.losses)
+    model, losses = build_model(config), build_losses(dict(config.losses))
     optimizer, schedule = make_optimizer(config.train)
     options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
     batching = {"batching": config.train.batching}
@@ -115,7 +132,7 @@ def build_losses(weights: Mapping[str, Any]) -> tuple[StepLoss, ...]:
 
 
 def bake_model(config: ConfigDict, model: Model, visibility_rays):
-    """Returns what `bake_occupancy` does, for the box of a resolved config's section `occupancy`."""
+    """Calls `bake_occupancy` for the box of a resolved config's section `occupancy`."""
     schedule = schedule_from_section(_section(config, "occupancy"), None)
     return bake_occupancy(model, schedule, visibility_rays, **view_options(_context(config)))
 
@@ -131,12 +148,12 @@ def load_split(config: ConfigDict, split: str | None = None) -> tuple[Views, str
 
 
 def conventions(data: ConfigDict) -> dict[str, Any]:
-    """Returns how the views of a data section are read, which an evaluation's protocol repeats."""
+    """Returns the fields of a data section that an evaluation protocol records."""
     return {name: data[name] for name in ("format", "background", "pixel_offset", "factor", "hold_out", "num_views")}
 
 
 def identity(config: ConfigDict) -> str:
-    """Returns as text what renderings depend on: not how the run was trained, nor where the data lies."""
+    """Returns the parts of a config that renderings depend on as text: not its training, nor the dataset's folder."""
     plain = json.loads(config.to_json_best_effort())
     data = {name: value for name, value in plain["data"].items() if name != "dir"}
     rest = {name: value for name, value in plain.items() if name not in ("train", "eval", "data", "losses")}
@@ -144,7 +161,7 @@ def identity(config: ConfigDict) -> str:
 
 
 def check_released(config: ConfigDict, origin: str) -> None:
-    """Raises a ValueError where a config's networks do what those of a released code do not."""
+    """Raises a ValueError if a config's networks differ from those of a released code."""
     if config.sampler != "hierarchical" or config.field != "mlp":
         raise ValueError(
             f"sampler is {config.sampler!r} and field {config.field!r}, expected 'hierarchical' and 'mlp' as in "
@@ -184,7 +201,7 @@ def _make_field(config, sections, box, network) -> Field:
     if name == "mlp" and is_auto(options["num_freqs"]):
         raise ValueError(f"{network}.num_freqs is 'auto'; resolve the config against a dataset, or set a number")
     field = make_field(name, options, box)
-    # The paper's networks see the world as it is; all else lives in the box.
+    # The paper's networks are not contracted; all other fields live in the box.
     in_box = config.sampler != "hierarchical" or name != "mlp"
     if in_box and sections["occupancy"]["contracted"] is True:
         return contract_field(field, *box)
@@ -192,8 +209,8 @@ def _make_field(config, sections, box, network) -> Field:
 
 
 def _section(config, name):
-    """Returns a section as a plain dict."""
-    section = dict(config[name])
+    """Returns a section as a plain dict, with tuples for the lists of a config.json."""
+    section = {field: tuple(value) if isinstance(value, list) else value for field, value in config[name].items()}
     for field, value in section.items():
         if name == "occupancy" and config.sampler == "occupancy" and is_auto(value):
             raise ValueError(f"occupancy.{field} is 'auto'; resolve the config against a dataset, or set a value")

@@ -1,76 +1,81 @@
-"""Checkpoints: whole or not there, checked by a sum, the last few kept (orbax v1)."""
+"""Checkpoints: complete or absent, verified by a fingerprint, the last few kept (orbax v1)."""
 
-import dataclasses
 import functools
 import json
 import os
 import pathlib
 import sys
-import zlib
+from collections.abc import Sequence
 
 import jax
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from jaxnerf.runtime import processes
+from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.training.state import TrainState
+
+_FINGERPRINT = "fingerprint"
 
 
 class Checkpoints:
-    """The checkpoints under a workdir, step by step."""
+    """The checkpoints in a workdir, one folder per step."""
 
-    def __init__(self, workdir, *, max_to_keep=None):
-        """Opens the folder; max_to_keep: how many of the newest stay, None for reading only."""
+    def __init__(self, workdir: str | os.PathLike, *, max_to_keep: int | None = None):
+        """Opens the folder; max_to_keep: how many of the newest to keep, None for reading only."""
         self._folder = pathlib.Path(workdir).absolute() / "checkpoints"
         policies = ocp.training.preservation_policies
         self._preservation = policies.LatestN(max_to_keep) if max_to_keep else None
         self._writer = None
 
-    def steps(self):
+    def steps(self) -> list[int]:
         """Returns the steps of all finished checkpoints, ascending."""
         if not self._folder.is_dir():
             return []
         names = (path.name for path in self._folder.iterdir() if path.is_dir())
         return sorted(int(name) for name in names if name.isdigit())
 
-    def save(self, state):
-        """Writes the state under its step and returns when it is on the disk; once a step only."""
+    def save(self, state: TrainState) -> None:
+        """Writes the state under its step unless it is there, and returns when it is on the disk.
+
+        Raises:
+            ValueError: if it cannot be written.
+        """
         step = int(state.step)
         if step not in self.steps():
             try:
-                _hush()
-                self._open().save(step, state, force=True, custom_metadata={"crc32": _sum(state)})
+                _silence_orbax()
+                self._open().save(step, state, force=True, custom_metadata={_FINGERPRINT: _fingerprint(state)})
             except Exception as error:  # orbax raises many kinds
                 raise ValueError(
-                    f"{self._folder / str(step)}: cannot be written ({_reason(error)}); make room and start "
-                    "again, which goes on from the one before"
+                    f"{self._folder / str(step)}: cannot be written ({_reason(error)}); free disk space and "
+                    "start again, which continues from the previous checkpoint"
                 ) from error
 
-    def load(self, step, like):
-        """Returns the state at a step, shaped and placed as like; counters newer than it are those of like.
+    def load(self, step: int, like: TrainState) -> TrainState:
+        """Returns the state at a step, with the shapes and shardings of `like`.
 
         Raises:
             ValueError: if the checkpoint does not fit, or is not what was saved; names it.
         """
         abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
-        _hush()
+        _silence_orbax()
         try:
             self._open().reload()  # another process may have written it since
-            saved = self._open().metadata(step).metadata["counters"]
-            known = {name: counter for name, counter in abstract.counters.items() if name in saved}
-            state = self._open().load(step, dataclasses.replace(abstract, counters=known))
-            self._check_sum(step, state)
-            return dataclasses.replace(state, counters={**like.counters, **state.counters})
+            state = self._open().load(step, abstract)
+            self._verify(step, state)
+            return state
         except Exception as error:  # orbax raises many kinds
             raise ValueError(
                 f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
-                "remove it to go on from the one before"
+                "remove it to continue from the previous checkpoint"
             ) from error
 
-    def load_newest(self, like):
-        """Returns the state of the newest checkpoint that can be read, or like; and lines on the others.
+    def load_newest(self, like: TrainState) -> tuple[TrainState, Sequence[str]]:
+        """Returns the newest state that can be read, or `like` if there is none; and lines about the others.
 
-        Those that are newer and cannot be read are renamed, never removed. Where none can be read, the
-        fault is more likely ours than the disk's, and starting anew would waste the run.
+        Newer checkpoints that cannot be read are renamed, never removed. If none can be read, the cause is more
+        likely the program than the disk, and a new start would waste the run.
 
         Raises:
             ValueError: if there are checkpoints and none can be read; names the newest.
@@ -92,56 +97,51 @@ class Checkpoints:
     def _newest_steps(self):
         """Returns the steps of the newest 16 checkpoints, descending, as the first process sees them."""
         steps = self.steps()[::-1][:16]
-        padded = processes.from_first(np.int32(steps + [-1] * (16 - len(steps))))
+        padded = processes.broadcast(np.int32(steps + [-1] * (16 - len(steps))))
         return [int(step) for step in padded if step >= 0]
 
-    def close(self):
+    def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
 
     def _open(self):
         if self._writer is None:
-            # Opened late: it makes the folder, and a reader should make none. Only the one that writes may
-            # take an unfinished checkpoint for the rest of a killed process.
+            # Opened late, as it creates the folder, which a reader must not. Only the process that writes may
+            # remove an unfinished checkpoint: it knows that a killed process left it.
             self._writer = ocp.training.Checkpointer(
                 self._folder,
                 preservation_policy=self._preservation,
                 cleanup_tmp_directories=self._preservation is not None,
-                lightweight_initialize=True,  # else a damaged one would keep all from being read
+                lightweight_initialize=True,  # otherwise a damaged checkpoint prevents reading the others
             )
         return self._writer
 
-    def _check_sum(self, step, state):
-        """Raises a ValueError where a state is not the one that was saved: orbax notices no wrong number."""
-        wanted = json.loads((self._folder / str(step) / "_CHECKPOINT_METADATA").read_text())
-        wanted = (wanted.get("custom_metadata") or {}).get("crc32")  # which older runs do not have
-        if wanted is not None and wanted != _sum(state):
+    def _verify(self, step, state):
+        """Raises a ValueError if a state is not the one that was saved; orbax does not detect changed numbers."""
+        metadata = json.loads((self._folder / str(step) / "_CHECKPOINT_METADATA").read_text())
+        if metadata["custom_metadata"][_FINGERPRINT] != _fingerprint(state):
             raise ValueError("its numbers are not those that were saved")
 
     def _set_aside(self, step, error):
         path, number = self._folder / f"{step}.unreadable", 1
         while path.exists():
             path, number = self._folder / f"{step}.unreadable-{number + 1}", number + 1
-        processes.wait()
+        processes.barrier()
         if processes.is_first():
             os.replace(self._folder / str(step), path)
-        processes.wait()
-        self._writer.reload()  # else it would still count as there
-        why = str(error).removesuffix("; remove it to go on from the one before")
-        return f"{why}; kept as {path.name}, going on from the one before"
+        processes.barrier()
+        self._writer.reload()  # otherwise it still lists the renamed one
+        why = str(error).removesuffix("; remove it to continue from the previous checkpoint")
+        return f"{why}; kept as {path.name}, continuing from the previous checkpoint"
 
 
-def _sum(state):
-    """Returns a checksum of all numbers of a state."""
-    value = 0
-    for leaf in jax.tree.leaves(state):
-        value = zlib.crc32(np.asarray(leaf).tobytes(), value)
-    return value
+def _fingerprint(state):
+    return fingerprint(jax.tree.map(np.asarray, state))
 
 
 @functools.cache
-def _hush():
-    """Leaves out what orbax's readers and writers say that are under way when another of them has failed."""
+def _silence_orbax():
+    """Hides what orbax's pending readers and writers print after another of them has failed."""
     before = sys.unraisablehook
 
     def hook(unraisable):
@@ -152,6 +152,6 @@ def _hush():
 
 
 def _reason(error):
-    while error.__cause__ is not None:  # orbax says last what it tried, and first what went wrong
+    while error.__cause__ is not None:  # the root of orbax's chain of errors says what went wrong
         error = error.__cause__
     return (str(error).splitlines() or [type(error).__name__])[0][:400]

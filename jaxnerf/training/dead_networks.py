@@ -1,122 +1,132 @@
-"""Networks that have died: found by the gradient that no longer goes through them, and begun anew."""
+"""Dead networks: detected by the gradient that no longer reaches their input, and reinitialized."""
 
 import dataclasses
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
-LOOK_EVERY = 50  # steps
-PATIENCE = 100  # steps: momentum alone can bring a network back, which takes it a dozen at most
-_ERROR = 1e-3  # mean square (30 dB): below it there is next to nothing that a network could miss
-_GRADIENT = 1e-5  # its norm over the root of that error; healthy: 1e-2 and more, 1e-4 in the first steps
+from jaxnerf.models.base import Model
+from jaxnerf.training.state import TrainState
+
+CHECK_EVERY = 50  # steps
+PATIENCE = 100  # steps: momentum alone can revive a network, which takes a dozen steps at most
+_ERROR = 1e-3  # mean square (30 dB): a network that renders better than this can hardly be dead
+_GRADIENT = 1e-5  # norm over the root of that error; a healthy network has 1e-2, and 1e-4 in the first steps
 
 
-def count_dead_steps(counters, grads, errors, input_layers):
-    """Returns for how many steps in a row each network has been dead, as counters "dead_<name>".
+def count_dead_steps(
+    counters: Mapping[str, Any],
+    grads: Mapping[str, Any],
+    errors: Sequence[Any],
+    input_layers: Mapping[str, Sequence[str]],
+) -> dict[str, Any]:
+    """Counts for how many steps in a row each network has been dead, as counters "dead_<name>".
 
-    A network is dead when its rays show an error and no gradient reaches what the position enters. Either
-    its density is 0 wherever it is asked, as a ReLU's input is negative everywhere (an empty image); or it
-    is a wall before the camera whose colour is saturated; or a layer of ReLUs is 0 everywhere, and what is
-    left is the same fog at all places. Adam's momentum can still bring it back for a dozen steps; later
-    nothing can. A batch without an error, of a scene that is empty there, says nothing and leaves the
-    count as it was.
+    A network is dead when its rays have an error and no gradient reaches the layers that take the position.
+    Then its density is 0 everywhere, as the input of a ReLU is negative everywhere (an empty image); or it is
+    an opaque wall in front of the camera whose colour is saturated; or a layer of ReLUs is 0 everywhere, which
+    leaves the same fog at all positions. Adam's momentum can still revive it for a dozen steps; later nothing
+    can. A batch without an error, of a part of the scene that is empty, leaves the count unchanged.
 
-    The gradient tells more than opacity and density do, and is at hand: an image of one colour from which
-    training is still on its way out is not dead, and what is dead is so whatever it looks like.
+    The gradient is a better criterion than opacity or density, and costs nothing: an image of one colour that
+    training is about to leave is not dead, and a dead network is dead whatever its image looks like.
 
     Args:
-        counters: those of before; int32 [].
-        grads: network name -> gradient, over the whole batch.
+        counters: of the step before; int32 [].
+        grads: network name -> gradient over the whole batch.
         errors: [networks], in the order of grads, the mean squared error of each network's rendering.
-        entrances: network name -> names of the parameters that the position enters; none: all.
+        input_layers: network name -> names of the layers that take the position; empty: all layers.
     """
     dead = {}
     for (name, grad), error in zip(grads.items(), errors, strict=True):
-        seeing = [grad[layer] for layer in input_layers.get(name) or grad]
-        still = optax.tree.norm(seeing) <= _GRADIENT * jnp.sqrt(error)
+        inputs = [grad[layer] for layer in input_layers.get(name) or grad]
+        still = optax.tree.norm(inputs) <= _GRADIENT * jnp.sqrt(error)
         before = counters[f"dead_{name}"]
         dead[f"dead_{name}"] = jnp.where(error > _ERROR, (before + 1) * still.astype(jnp.int32), before)
     return dead
 
 
-def dead_networks(metrics):
-    """Returns the names of the networks that will not come back, of a step's metrics or of a row."""
+def dead_networks(metrics: Mapping[str, Any]) -> tuple[str, ...]:
+    """Returns the names of the networks that stay dead, from the metrics of a step or a row."""
     names = sorted(name for name in metrics if name.startswith("dead_"))
     return tuple(name.removeprefix("dead_") for name in names if int(metrics[name]) >= PATIENCE)
 
 
-def make_reinitializer(experiment, folder):
-    """Returns look(step, state, metrics) -> (state, metrics), which begins dead networks anew now and then.
+def make_reinitializer(experiment: Any, folder: str | os.PathLike) -> Callable[..., tuple]:
+    """Makes the function (step, state, metrics) -> (state, metrics) that reinitializes dead networks.
 
-    It decides by what the state holds, at steps that do not depend on what is logged or saved when, so that
-    a resumed run does the same.
+    It checks every CHECK_EVERY steps. It decides from the state, at steps that do not depend on what is logged
+    or saved when, so a resumed run does the same.
 
     Raises:
-        ValueError: from look, where more networks have died than train.max_reinits allows to begin anew.
+        ValueError: from that function, if more networks have died than train.max_reinits allows.
     """
     reinitialize = make_reinitialize(experiment.model, experiment.optimizer, experiment.seed)
     allowed = experiment.train.max_reinits
 
-    def look(step, state, metrics):
-        names = dead_networks(metrics) if allowed and step % LOOK_EVERY == 0 else ()
+    def check(step, state, metrics):
+        names = dead_networks(metrics) if allowed and step % CHECK_EVERY == 0 else ()
         if not names:
             return state, metrics
-        if int(metrics["num_reinits"]) + len(names) > allowed:
+        done = int(metrics["num_reinits"])
+        if done + len(names) > allowed:
             raise ValueError(
-                f"{folder}: no gradient has gone through the {' and the '.join(names)} network for "
-                f"{PATIENCE} steps up to {step}, after {int(metrics['num_reinits'])} new beginnings (learning "
-                f"rate {float(experiment.schedule(step - 1)):.2g}): what it shows is empty or of one "
-                "colour; lower train.lr_init, raise train.warmup_steps, or set "
-                "density_activation to 'softplus' and density_bias to -1; train.max_reinits=0 lets it be"
+                f"{folder}: at step {step} the {' and the '.join(names)} network has had no gradient for {PATIENCE} "
+                f"steps, after {done} reinitializations (learning rate {float(experiment.schedule(step - 1)):.2g}), "
+                "so its image is empty or of one colour; lower train.lr_init, raise train.warmup_steps, or set "
+                "density_activation to 'softplus' and density_bias to -1; train.max_reinits=0 continues regardless"
             )
         state = reinitialize(state, names)
         # Copies, as the next step consumes the state.
         return state, {**metrics, **jax.tree.map(int, state.counters)}
 
-    return look
+    return check
 
 
-def make_reinitialize(model, optimizer, seed):
-    """Returns revive(state, names) -> TrainState, where the networks of these names begin anew.
+def make_reinitialize(model: Model, optimizer: optax.GradientTransformation, seed: int) -> Callable[..., TrainState]:
+    """Makes the function (state, names) -> TrainState that reinitializes the networks of these names.
 
-    Their parameters are drawn again, from the seed and the step, and the optimiser forgets them; a model's
-    grid holds all that is possible. The others stay as they are, and so does the learning rate's schedule.
+    Their parameters are drawn again, from the seed and the step; the optimizer's moments of them become 0 and
+    averages begin at the new parameters; all valid cells of the model's grid become occupied. The other
+    networks, and the schedule of the learning rate, stay as they are.
     """
 
     def reinitialize(state, names):
-        # No ray has this position, so the key is the step's own.
+        # No ray has this position in the batch, so the key is unused otherwise.
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), state.step), 2**32 - 3)
         fresh = model.init(key)
-        anew = {name: jax.tree.map(lambda _, name=name: name in names, tree) for name, tree in fresh.items()}
-        # As init makes it: moments of 0, but an average begins at the parameters.
-        begins = optax.tree.map_params(
+        is_new = {name: jax.tree.map(lambda _, name=name: name in names, tree) for name, tree in fresh.items()}
+        replaced = optax.tree.map_params(
             optimizer,
-            lambda old, anew: old if _is_masked(old) else anew,
+            lambda old, new: old if _is_masked(old) else new,
             state.opt_state,
-            anew,
+            is_new,
             transform_non_params=lambda _: False,
             is_leaf=_is_masked,
         )
-        forgotten = dict.fromkeys((f"dead_{name}" for name in names), jnp.zeros((), jnp.int32))
+        reset = dict.fromkeys((f"dead_{name}" for name in names), jnp.zeros((), jnp.int32))
         num_reinits = state.counters["num_reinits"] + len(names)
         return dataclasses.replace(
             state,
             params={name: (fresh if name in names else state.params)[name] for name in fresh},
             opt_state=jax.tree.map(
-                lambda old, new, anew: new if anew else old, state.opt_state, optimizer.init(fresh), begins
+                lambda old, new, replace: new if replace else old, state.opt_state, optimizer.init(fresh), replaced
             ),
             grid=None if model.grid_schedule is None else model.grid_schedule.create(state.grid.valid),
-            counters={**state.counters, **forgotten, "num_reinits": num_reinits},
+            counters={**state.counters, **reset, "num_reinits": num_reinits},
         )
 
     def placed(state, names):
-        places = jax.tree.map(lambda leaf: leaf.sharding, state)
-        return jax.jit(reinitialize, static_argnums=1, out_shardings=places)(state, names)
+        shardings = jax.tree.map(lambda leaf: leaf.sharding, state)
+        return jax.jit(reinitialize, static_argnums=1, out_shardings=shardings)(state, names)
 
     return placed
 
 
 def _is_masked(part):
-    """Returns whether this stands for parameters that another part of the optimiser moves."""
+    """Returns whether a part of the optimizer's state stands for parameters that another optimizer updates."""
     return isinstance(part, optax.MaskedNode)

@@ -3,91 +3,106 @@
 import contextlib
 import dataclasses
 import functools
+import os
 import pathlib
+import signal
+import threading
 import time
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import numpy as np
+from ml_collections import ConfigDict
 
+from jaxnerf.core.types import Views
 from jaxnerf.data.ray_batches import Gathered
-from jaxnerf.runtime import chunking, processes
-from jaxnerf.runtime.devices import compile_step as compile_on_devices
-from jaxnerf.runtime.devices import devices_of, split_positions
-from jaxnerf.training import build, dead_networks, metric_log, status, workdir
+from jaxnerf.runtime import devices, memory, processes
+from jaxnerf.training import build, metric_log, workdir
 from jaxnerf.training.auto_config import resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.control import Clock, Interrupt
-from jaxnerf.training.lock import workdir_lock
+from jaxnerf.training.dead_networks import make_reinitializer
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step
 
 
-def train(config, folder, *, views=None, at_end=None):
-    """Trains as a configuration says, from the last checkpoint under folder if there is one.
+def train(
+    config: ConfigDict,
+    folder: str | os.PathLike,
+    *,
+    views: Views | None = None,
+    at_end: Callable[[str | os.PathLike], bool] | None = None,
+) -> bool:
+    """Trains as a config says, from the last checkpoint in a workdir if there is one.
 
     Args:
-        config: ConfigDict, see configs/default.py.
+        config: see configs/default.py.
         folder: the workdir; made if missing.
         views: of the split "train" where they have been read.
-        at_end: called with the workdir when training has ended, if `eval.at_end` is set; it returns whether
-            it came to its own end.
+        at_end: called with the workdir when training is complete, if `eval.at_end` is set; returns whether it
+            has completed.
 
     Returns:
-        Whether training came to its end (False: stopped by Ctrl-C or SIGTERM, and saved).
+        Whether training, and at_end, have completed. False: stopped by Ctrl-C or SIGTERM and saved.
 
     Raises:
-        ValueError: on bad input, when another process trains in folder, or when too many steps in a row
+        ValueError: on bad input, when another process trains in the workdir, or when too many steps in a row
             were not finite.
     """
     started = time.perf_counter()
-    config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves nothing
-    on_device, _ = resolve_for_device(config)
-    experiment = build.build(on_device)
+    config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves no trace
+    experiment = build.build(resolve_for_device(config)[0])
     options = experiment.train
-    devices = devices_of(options.parallel)
-    split_positions(options.batch_size, len(devices), options.microbatch_size)
-    processes.check_same("configuration", config.to_json_best_effort())
+    num_devices = len(devices.devices_of(options.parallel))
+    devices.split_positions(options.batch_size, num_devices, options.microbatch_size)
+    processes.check_same("config", config.to_json_best_effort())
     with contextlib.ExitStack() as stack:
 
         def claim():
-            stack.enter_context(workdir_lock(folder))
+            stack.enter_context(workdir.workdir_lock(folder))
             workdir.claim(folder, config)
 
-        processes.first_does(claim, pathlib.Path(folder) / "config.json")
-        processes.say(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
+        processes.run_on_first(claim, pathlib.Path(folder) / "config.json")
+        processes.print_once(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
         finished = run_training(experiment, views, folder)
         return finished and (at_end is None or not experiment.eval.at_end or at_end(folder))
 
 
-def run_training(experiment, views, folder):
-    """Runs the loop of train_and_evaluate on Views that were read; returns whether it came to its end."""
+def run_training(experiment: build.Experiment, views: Views, folder: str | os.PathLike) -> bool:
+    """Runs the loop of `train` on the Views of the split "train"; returns whether it has completed."""
     options = experiment.train
-    run, state, data, survey_seconds, compile_seconds = _compile(experiment, views)
+    run, state, data, seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, max_to_keep=options.max_to_keep)
     state, unreadable = checkpoints.load_newest(state)
-    processes.say(*unreadable)
     first = int(state.step)
     log = metric_log.MetricLog(folder, first_step=first, write=processes.is_first())
     before = log.rows[-1]["seconds"] if log.rows else 0.0
-    processes.say(status.header(experiment, views, state, survey_seconds, compile_seconds))
+    processes.print_once(*unreadable, *metric_log.header(experiment, views, state, **seconds))
     progress = metric_log.Progress(options.max_steps, show=processes.is_first())
-    clock = Clock(before, first * options.batch_size - int(state.counters.get("rays_dropped", 0)))
-    look = dead_networks.make_reinitializer(experiment, folder)
+    clock = _Clock(before, first * options.batch_size - int(state.counters.get("rays_dropped", 0)))
+    reinitialize_dead = make_reinitializer(experiment, folder)
     recent = []
     done = processes.any_of(first >= options.max_steps or 0 < options.max_seconds <= before)
-    with Interrupt() as interrupt:
+    with _Interrupt() as interrupt:
         for step in range(first + 1, first + 1 if done else options.max_steps + 1):
-            state, metrics = look(step, *run(state, data))
+            state, metrics = reinitialize_dead(step, *run(state, data))
             recent.append(metrics)
-            jax.block_until_ready(recent[-2:][0])  # one step in flight, no more: a stop is prompt
-            late = 0 < options.max_seconds <= clock.seconds()
-            stopped = processes.any_of(late or interrupt.caught, step)
+            jax.block_until_ready(recent[-2:][0])  # at most one step in flight, so that stopping is prompt
+            out_of_time = 0 < options.max_seconds <= clock.seconds()
+            stopped = processes.any_of(out_of_time or interrupt.caught, step)
             last = step == options.max_steps or stopped
             save = step % options.save_every == 0 or last
-            if step % options.log_every == 0 or save:  # a checkpoint's row holds its clock
-                row = status.row(experiment, step, recent, clock, compile_seconds)
+            if step % options.log_every == 0 or save:  # a resumed run reads the clock from the checkpoint's row
+                row = metric_log.row(
+                    experiment,
+                    step,
+                    recent,
+                    seconds=clock.seconds(),
+                    rate=clock.rate,
+                    compile_seconds=seconds["compile_seconds"],
+                )
                 log.append(row)
-                progress.show(step, status.line(row, options, late))
+                progress.show(step, metric_log.line(row, options, out_of_time=out_of_time))
                 recent = []
                 _check_finite(row, options, folder)
             if save:
@@ -98,47 +113,120 @@ def run_training(experiment, views, folder):
     progress.close()
     checkpoints.close()
     log.close()
-    caught = processes.any_of(interrupt.caught)
-    if caught:
-        processes.say(f"stopped at step {int(state.step)} and saved; the same command goes on from there")
-    return not caught
+    interrupted = processes.any_of(interrupt.caught)
+    if interrupted:
+        processes.print_once(f"stopped at step {int(state.step)} and saved; the same command continues from there")
+    return not interrupted
 
 
 def _compile(experiment, views):
+    """Returns run, state, data, see `devices.compile_step`; and the seconds that it took, by name."""
     options = experiment.train
     started = time.perf_counter()
     valid, data = experiment.prepare(views)
-    surveyed = time.perf_counter() - started
-    pixels, gather = views.pixels, chunking.has_no_room(views.pixels)
+    prepared = time.perf_counter()
+    pixels, gather = views.pixels, _stay_on_host(views.pixels)
     if gather:
         rows = np.zeros_like(pixels, shape=(options.batch_size, pixels.shape[1]))
         gathered = Gathered(rows=rows, shape=pixels.shape)
         data = data._replace(views=dataclasses.replace(data.views, pixels=gathered))
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
-    compile_step = functools.partial(
-        compile_on_devices,
-        step,
-        batch_size=options.batch_size,
-        mode=options.parallel,
-    )
-    state = functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, valid)
-    run, *placed = chunking.fit_step(
-        lambda state, data, block: compile_step(state, data, microbatch_size=block),
-        state,
+
+    def compile_step(state, data, microbatch_size):
+        sizes = {"batch_size": options.batch_size, "microbatch_size": microbatch_size}
+        return devices.compile_step(step, state, data, mode=options.parallel, **sizes)
+
+    run, *placed = memory.fit_step(
+        compile_step,
+        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, valid),
         data,
-        min(options.microbatch_size, options.batch_size // len(devices_of(options.parallel))),
+        min(options.microbatch_size, options.batch_size // len(devices.devices_of(options.parallel))),
     )
     if gather:
         ids = functools.partial(experiment.pixel_ids, positions=np.arange(options.batch_size))
-        run = chunking.gather_ahead(run, jax.jit(lambda step, data: ids(step, data=data)), pixels)
-    return run, *placed, surveyed, time.perf_counter() - started - surveyed
+        run = _gather_ahead(run, jax.jit(lambda step, data: ids(step, data=data)), pixels)
+    seconds = {"prepare_seconds": prepared - started, "compile_seconds": time.perf_counter() - prepared}
+    return run, *placed, seconds
+
+
+def _stay_on_host(pixels):
+    """Returns whether pixels stay on the host, as they would fill over half of a device's free memory."""
+    if jax.local_devices()[0].platform == "cpu":  # it maps them
+        return False
+    free = memory.available()
+    return free is not None and pixels.nbytes > free / 2
+
+
+def _gather_ahead(run, ids, pixels):
+    """Returns a step for data whose views' pixels are Gathered: it receives only the pixels that it draws.
+
+    Args:
+        run: (state, data) -> (state, metrics), the step.
+        ids: (step, data) -> [batch] int32, the pixels that a step draws; jitted.
+        pixels: [P, C] of all views, on the host.
+    """
+    step, drawn = None, None
+
+    def gathered(state, data):
+        nonlocal step, drawn
+        if step is None:
+            step = int(state.step)
+            drawn = ids(step, data)
+        template = data.views.pixels
+        rows = devices.place(pixels[np.asarray(drawn)], template.rows.sharding)
+        step += 1
+        drawn = ids(step, data)  # before the step starts, as the device would compute this after it
+        views = dataclasses.replace(data.views, pixels=dataclasses.replace(template, rows=rows))
+        return run(state, data._replace(views=views))
+
+    return gathered
 
 
 def _check_finite(row, options, folder):
     if row["nonfinite_in_a_row"] >= options.max_nonfinite:
         raise ValueError(
-            f"{folder}: {row['nonfinite_in_a_row']} steps in a row up to {row['step']} had a loss or "
-            f"gradient that is not finite (loss {row['loss']}, gradient norm {row['grad_norm']}, "
-            f"learning rate {row['lr']:.2g}); nothing of them was kept: lower train.lr_init, or check "
-            "images and poses"
+            f"{folder}: the loss or gradient of {row['nonfinite_in_a_row']} steps in a row up to {row['step']} is not "
+            f"finite (loss {row['loss']}, gradient norm {row['grad_norm']}, learning rate {row['lr']:.2g}); these "
+            "steps changed nothing: lower train.lr_init, or check images and poses"
         )
+
+
+class _Clock:
+    """Measures the seconds of training, without compiling and saving, continued from an earlier start."""
+
+    def __init__(self, seconds: float, rays: int):
+        self._started = time.perf_counter() - seconds
+        self._last = (seconds, rays)
+
+    def seconds(self) -> float:
+        return time.perf_counter() - self._started
+
+    def rate(self, rays: int) -> float:
+        """Returns the rays per second since the last call."""
+        (seconds, before), self._last = self._last, (self.seconds(), rays)
+        return (rays - before) / max(self._last[0] - seconds, 1e-9)
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        entered = time.perf_counter()
+        yield
+        self._started += time.perf_counter() - entered
+
+
+class _Interrupt:
+    """Turns the first Ctrl-C or SIGTERM into the flag `caught`; a second one ends the program as usual."""
+
+    def __enter__(self) -> Any:
+        self.caught = False
+        self._old = {}
+        if threading.current_thread() is threading.main_thread():  # only there Python allows signal handlers
+            self._old = {number: signal.signal(number, self._catch) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _catch(self, *_):
+        self.caught = True
+        self.__exit__()

@@ -1,22 +1,37 @@
-"""What a run says of itself: metrics.jsonl, TensorBoard events, and a line or a bar on the terminal."""
+"""The record of a run: metrics.jsonl, event files for TensorBoard, and what the terminal shows."""
 
 import json
 import logging
+import os
 import pathlib
 import shutil
 import sys
+import time
+from typing import Any, TextIO
 
-from jaxnerf.training.events import Events
-from jaxnerf.training.workdir import naming, write_text
+import jax
+import numpy as np
+
+from jaxnerf.core.metrics import decibels
+from jaxnerf.core.types import Views
+from jaxnerf.runtime.atomic_files import naming, write_text
+from jaxnerf.runtime.devices import devices_of
+from jaxnerf.training.dead_networks import dead_networks
+from jaxnerf.training.state import TrainState
 
 
 class MetricLog:
-    """The metrics of a run, a JSON object a line, ascending in step."""
+    """The rows of metrics.jsonl, one JSON object a line, ascending in step; also written as events."""
 
-    def __init__(self, workdir, *, first_step, write=True):
-        """Opens the file to append; what lies past first_step, or is no row, is dropped, the latter aloud.
+    def __init__(self, workdir: str | os.PathLike, *, first_step: int, write: bool = True):
+        """Opens the file to append, without rows after first_step.
 
-        write: False keeps rows in memory only, as of several processes one writes.
+        Lines that are no rows are dropped with a message, and the damaged file is kept.
+
+        Args:
+            workdir: of the run.
+            first_step: at which training resumes.
+            write: False keeps rows in memory only; of several processes the first one writes.
         """
         self._path = pathlib.Path(workdir) / "metrics.jsonl"
         rows, damaged, cut = _parse(self._path)
@@ -28,14 +43,14 @@ class MetricLog:
             kept = self._path.with_name("metrics.jsonl.damaged")
             shutil.copyfile(self._path, kept)
             lines = f"{len(damaged)} lines from line {damaged[0]} on that are no rows"
-            print(f"{self._path}: left out {lines}; the file is kept as {kept.name}", file=sys.stderr)
+            print(f"{self._path}: dropped {lines}; the file is kept as {kept.name}", file=sys.stderr)
         if cut:
-            print(f"{self._path}: left out a last line that was cut short", file=sys.stderr)
+            print(f"{self._path}: dropped an incomplete last line", file=sys.stderr)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self.rows))
-        self._events = Events(workdir, first_step=first_step)
+        self._events = _Events(workdir, first_step=first_step)
 
-    def append(self, row):
-        """Adds a row: step and other numbers. NaN and infinity are written as JSON knows them in Python."""
+    def append(self, row: dict[str, Any]) -> None:
+        """Adds a row: "step" and other numbers. NaN and infinity are written as Python's json writes them."""
         self.rows.append(row)
         if not self._write:
             return
@@ -43,31 +58,31 @@ class MetricLog:
             file.write(json.dumps(row) + "\n")
         self._events.append(row)
 
-    def close(self):
+    def close(self) -> None:
         if self._events is not None:
             self._events.close()
 
 
-def read_rows(workdir):
-    """Returns the whole rows of a workdir's metrics; a last line may be in writing and is left out."""
+def read_rows(workdir: str | os.PathLike) -> list[dict[str, Any]]:
+    """Returns the complete rows of a workdir's metrics.jsonl; its last line may be incomplete while a run writes."""
     path = pathlib.Path(workdir) / "metrics.jsonl"
     rows, damaged, _ = _parse(path)
     if damaged:
-        logging.warning("%s: left out %d lines from line %d on", path, len(damaged), damaged[0])
+        logging.warning("%s: skipped %d lines from line %d on", path, len(damaged), damaged[0])
     return rows
 
 
 def _parse(path):
-    """Returns rows, the numbers of lines that are none, and whether the last line was cut short."""
+    """Returns rows, the numbers of lines that are no rows, and whether the last line is incomplete."""
     *lines, last = path.read_bytes().split(b"\n") if path.exists() else [b""]
-    found = [_row(line) for line in lines]
+    found = [_parse_row(line) for line in lines]
     damaged = [number for number, row in enumerate(found, 1) if row is None]
-    if _row(last):
-        found.append(_row(last))
-    return [row for row in found if row], damaged, bool(last) and not _row(last)
+    if _parse_row(last):
+        found.append(_parse_row(last))
+    return [row for row in found if row], damaged, bool(last) and not _parse_row(last)
 
 
-def _row(line):
+def _parse_row(line):
     """Returns the row that a line in bytes holds, or None."""
     try:
         row = json.loads(line)
@@ -76,25 +91,176 @@ def _row(line):
     return row if isinstance(row, dict) and type(row.get("step")) is int and "seconds" in row else None
 
 
-class Progress:
-    """A bar that stays in place on a terminal, and plain lines in a log file."""
+class _Events:
+    """An event file for TensorBoard where tensorboardX is installed; an error in writing it only prints a line."""
 
-    def __init__(self, total, stream=sys.stderr, show=True):
+    def __init__(self, workdir, *, first_step):
+        """Opens a new file; TensorBoard ignores what earlier files hold after first_step."""
+        self._folder, self._writer = pathlib.Path(workdir) / "tensorboard", None
+        try:
+            # Not SummaryWriter: it writes from a thread, and waits forever for it once the disk is full.
+            from tensorboardX.event_file_writer import EventsWriter
+            from tensorboardX.proto.event_pb2 import SessionLog
+        except ImportError:
+            return
+
+        def begin():
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._writer = EventsWriter(str(self._folder / "events"))
+            self._write(first_step, file_version="brain.Event:2")
+            self._write(first_step, session_log=SessionLog(status=SessionLog.START))
+
+        self._try(begin)
+
+    def append(self, row):
+        """Adds the numbers of a row."""
+
+        def add():
+            from tensorboardX.summary import scalar
+
+            for name, value in row.items():
+                self._write(row["step"], summary=scalar(name, value))
+            self._writer.flush()
+
+        if self._writer is not None:
+            self._try(add)
+
+    def close(self):
+        if self._writer is not None:
+            self._try(self._writer.close)
+
+    def _write(self, step, **content):
+        from tensorboardX.proto.event_pb2 import Event
+
+        self._writer.write_event(Event(step=step, wall_time=time.time(), **content))
+
+    def _try(self, write):
+        try:
+            write()
+        except OSError as error:
+            self._writer = None
+            why = f"event files end here ({error.strerror}); metrics.jsonl holds all metrics"
+            print(f"{self._folder}: {why}", file=sys.stderr)
+
+
+class Progress:
+    """A progress bar on a terminal; plain lines in a log file."""
+
+    def __init__(self, total: int, stream: TextIO = sys.stderr, show: bool = True):
         self._total, self._stream, self._shown = total, stream, show
         self._terminal = show and stream.isatty()
 
-    def show(self, done, text):
-        """Shows how many of the total steps are done, and a text of the moment."""
+    def show(self, done: int, text: str) -> None:
+        """Shows how many of the total steps are done, followed by a text."""
         if not self._shown:
             return
-        share = min(done / self._total, 1.0)
+        fraction = min(done / self._total, 1.0)
         if self._terminal:
-            bar = "#" * int(24 * share)
-            self._stream.write(f"\r\033[K[{bar:<24}] {100 * share:3.0f} %  {text}")
+            bar = "#" * int(24 * fraction)
+            self._stream.write(f"\r\033[K[{bar:<24}] {100 * fraction:3.0f} %  {text}")
         else:
             self._stream.write(f"{done}/{self._total}  {text}\n")
         self._stream.flush()
 
-    def close(self):
+    def close(self) -> None:
         if self._terminal:
             self._stream.write("\n")
+
+
+def header(
+    experiment: Any, views: Views, state: TrainState, *, prepare_seconds: float, compile_seconds: float
+) -> list[str]:
+    """Returns the lines that describe a run before its first step."""
+    options = experiment.train
+    devices = devices_of(options.parallel)
+    processes = f", in {jax.process_count()} processes" if jax.process_count() > 1 else ""
+    counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
+    parts = ", ".join(f"{name} {count:,}" for name, count in counts.items())
+    dtype = jax.tree.leaves(state.params)[0].dtype
+    eyes = np.asarray(views.cameras.to_world)[:, :, 3]
+    lines = [
+        f"device        {len(devices)} x {devices[0].device_kind} ({devices[0].platform}){processes}",
+        f"parameters    {sum(counts.values()):,} {dtype} ({parts})",
+        f"views         {len(views.offset)} with {views.pixels.shape[0]:,} pixels, "
+        f"t from {np.min(views.near):g} to {np.max(views.far):g}",
+        f"cameras       from {_point(eyes.min(0))} to {_point(eyes.max(0))}",
+    ]
+    if state.grid is not None:
+        cells = "x".join(map(str, state.grid.valid.shape))
+        fraction = float(state.grid.valid.mean())
+        lines.append(f"grid          {fraction:.1%} of {cells} cells valid, in {prepare_seconds:.1f} s")
+    lines += [
+        f"compiled      in {compile_seconds:.1f} s",
+        f"steps         {int(state.step)} of {options.max_steps} done, {options.batch_size} rays per step in "
+        f"microbatches of {min(options.microbatch_size, options.batch_size)}",
+    ]
+    return lines
+
+
+def row(
+    experiment: Any, step: int, recent: list[dict[str, Any]], *, seconds: float, rate: Any, compile_seconds: float
+) -> dict[str, Any]:
+    """Returns the row of metrics at a step.
+
+    Args:
+        experiment: of the run.
+        step: steps taken.
+        recent: the metrics of each step since the last row. Losses and errors are averaged over them; of the
+            rest the last values count.
+        seconds: of training so far.
+        rate: rays so far -> rays per second since the last row.
+        compile_seconds: that compiling the step took.
+    """
+    values = {name: np.array([float(metrics[name]) for metrics in recent]) for name in recent[0]}
+    last = {name: value[-1] for name, value in values.items()}
+    rays_dropped = int(last.get("rays_dropped", 0))
+    rays = step * experiment.train.batch_size - rays_dropped
+    return {
+        "step": step,
+        "seconds": seconds,
+        "compile_seconds": compile_seconds,
+        "rays": rays,
+        "rays_per_second": rate(rays),
+        "loss": values["loss"].mean(),
+        **{name: value.mean() for name, value in values.items() if name.startswith("loss_")},
+        "psnr_coarse": float(decibels(values["mse_coarse"].mean())),
+        "psnr_fine": float(decibels(values["mse"].mean())),
+        "lr": float(experiment.schedule(step - 1)),
+        "grad_norm": last["grad_norm"],
+        "nonfinite": int(last["nonfinite"]),
+        "nonfinite_in_a_row": int(last["nonfinite_in_a_row"]),
+        "rays_dropped": rays_dropped,
+        **{name: int(last[name]) for name in last if name == "num_reinits" or name.startswith("dead_")},
+    }
+
+
+def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
+    """Returns a row as a line for the terminal.
+
+    Args:
+        row: see `row`.
+        options: the config's section `train`.
+        out_of_time: whether train.max_seconds has passed.
+    """
+    left = (options.max_steps - row["step"]) * options.batch_size / max(row["rays_per_second"], 1e-9)
+    if options.max_seconds:
+        left = min(left, options.max_seconds - row["seconds"])
+    notes = f"  {row['nonfinite']} nonfinite steps" if row["nonfinite"] else ""
+    if row["rays_dropped"]:
+        fraction = row["rays_dropped"] / (row["rays"] + row["rays_dropped"])
+        notes += f"  {fraction:.0%} of rays dropped"
+    notes += "".join(f"  {name} network dead" for name in dead_networks(row))
+    notes += f"  {row['num_reinits']} networks reinitialized" if row["num_reinits"] else ""
+    return (
+        f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
+        f"{_minutes(row['seconds'])} elapsed, {_minutes(0.0 if out_of_time else left)} left{notes}"
+    )
+
+
+def _minutes(seconds):
+    minutes, seconds = divmod(int(seconds), 60)
+    return f"{minutes}:{seconds:02d}"
+
+
+def _point(values):
+    return "(" + ", ".join(f"{value:.2f}" for value in values) + ")"

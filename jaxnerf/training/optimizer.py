@@ -1,43 +1,50 @@
-"""How parameters descend: by Adam, as the paper's, or the matrices of layers by Muon and the rest by Adam."""
+"""The optimizer: Adam as in the paper, optionally Muon for the matrices of layers, and averaged parameters."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxnerf.training.averaging import with_averaging
+from jaxnerf.training.state import TrainState
 
-_FEWEST = 8  # inputs and outputs of a layer whose matrix has directions enough to make alike
-_ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; given one by one they compile once, as a loop
+_MIN_SIDE = 8  # inputs and outputs of a layer whose matrix Muon updates; it would gain nothing on smaller ones
+_ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; one by one they compile once, as a loop
 
 
-def make_optimizer(train):
-    """Returns the optimiser that a train section describes, and its learning rate: step -> float.
+def make_optimizer(train: Any) -> tuple[optax.GradientTransformation, Callable[[Any], Any]]:
+    """Makes the optimizer of a config's section `train`.
+
+    Returns:
+        The optimizer, and its learning rate: step -> float.
 
     Raises:
         ValueError: names the field that is below 0.
     """
-    power, muon = (train.get(name, 0.0) for name in ("averaging_power", "muon"))
-    for name, value in (("averaging_power", power), ("muon", muon)):
-        if value < 0:
-            raise ValueError(f"train.{name} is {value}, wanted more than 0, or 0 for none")
+    for name in ("averaging_power", "muon"):
+        if train[name] < 0:
+            raise ValueError(f"train.{name} is {train[name]}, expected a number above 0, or 0 for off")
     schedule = _schedule(train)
     optimizer = optax.adam(schedule, train.beta1, train.beta2, train.epsilon)
-    if muon:
-        optimizer = with_muon(optimizer, schedule, muon)
-    return with_averaging(optimizer, power) if power else optimizer, schedule
+    if train.muon:
+        optimizer = with_muon(optimizer, schedule, train.muon)
+    return with_averaging(optimizer, train.averaging_power) if train.averaging_power else optimizer, schedule
 
 
-def with_muon(optimizer, schedule, size):
-    """Returns an optimiser that moves the matrices of layers by Muon, and all else as another does.
+def with_muon(
+    optimizer: optax.GradientTransformation, schedule: Callable[[Any], Any], size: float
+) -> optax.GradientTransformation:
+    """Returns an optimizer that updates the matrices of layers by Muon and all other parameters by another one.
 
-    Muon's steps are as long in each direction of a matrix, so that those along which the gradient is small
-    are learned as soon as the others (arXiv:2502.16982). A table of features has rows, not directions, and
-    an output of one or three features hardly any: they are left to the other.
+    Muon's updates have the same length in each direction of a matrix, so directions along which the gradient
+    is small are learned as soon as the others (arXiv:2502.16982). The rows of a hash grid's table are not
+    directions, and an output of one or three features has hardly any: these stay with the other optimizer.
 
     Args:
-        optimizer: an optax gradient transformation.
+        optimizer: updates the other parameters.
         schedule: step -> learning rate.
-        size: root mean square of a matrix's step, in learning rates.
+        size: root mean square of a matrix's update over the learning rate.
     """
     muon = optax.contrib.muon(schedule, _ITERATIONS, consistent_rms=size)
     return optax.partition({"muon": muon, "other": optimizer}, _labels)
@@ -46,7 +53,7 @@ def with_muon(optimizer, schedule, size):
 def _labels(params):
     def label(path, leaf):
         matrix = getattr(path[-1], "key", None) == "kernel" and leaf.ndim == 2
-        return "muon" if matrix and min(leaf.shape) >= _FEWEST else "other"
+        return "muon" if matrix and min(leaf.shape) >= _MIN_SIDE else "other"
 
     return jax.tree_util.tree_map_with_path(label, params)
 
@@ -57,3 +64,48 @@ def _schedule(train):
     if not train.warmup_steps:
         return decay
     return lambda step: decay(step) * jnp.minimum(1.0, (step + 1) / train.warmup_steps)
+
+
+class Averaging(NamedTuple):
+    """The state of an optimizer with averaging.
+
+    Attributes:
+        count: int32 [], updates so far.
+        average: like the parameters.
+        inner: the state of the optimizer itself.
+    """
+
+    count: jax.Array
+    average: Any
+    inner: Any
+
+
+def with_averaging(optimizer: optax.GradientTransformation, power: float) -> optax.GradientTransformation:
+    """Returns an optimizer that makes the same updates and also averages the parameters.
+
+    The average has polynomial decay (arXiv:1212.1824): after step t the parameters of step s have a weight of
+    about (s / t)^power. It thus spans about the last 1 / power of all steps, however many there are. After the
+    first update it equals the parameters.
+
+    Args:
+        optimizer: makes the updates.
+        power: > 0.
+    """
+
+    def init(params):
+        return Averaging(jnp.zeros((), jnp.int32), jax.tree.map(jnp.array, params), optimizer.init(params))
+
+    def update(grads, state, params):
+        updates, inner = optimizer.update(grads, state.inner, params)
+        count = state.count + 1
+        fraction = (power + 1) / (power + count)
+        new = optax.apply_updates(params, updates)
+        average = jax.tree.map(lambda old, new: old + fraction * (new - old), state.average, new)
+        return updates, Averaging(count, average, inner)
+
+    return optax.GradientTransformation(init, update)
+
+
+def averaged_params(state: TrainState) -> Any:
+    """Returns the parameters that images show: the averaged ones, or the last ones where nothing is averaged."""
+    return state.opt_state.average if isinstance(state.opt_state, Averaging) else state.params

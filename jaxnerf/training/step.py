@@ -1,4 +1,4 @@
-"""One training step: draw rays, render them, and descend on the weighted sum of the losses."""
+"""The training step: draw rays, render them, and descend on the weighted sum of the losses."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -17,46 +17,62 @@ from jaxnerf.training.state import TrainState
 
 
 class TrainData(NamedTuple):
-    """What a run's steps read and never change. The seed is part of it, so runs that differ by it compile once."""
+    """What the steps of a run read and never change.
 
-    seed: Any  # uint32
+    Attributes:
+        seed: uint32 []. As data, not a constant, it lets runs that differ by it share a compiled step.
+        views: of the split "train".
+        active_pixels: the pixels to draw from; None: all.
+        cells: [M] int32, the cells of the grid that are updated; None without a grid.
+    """
+
+    seed: Any
     views: Views
-    active_pixels: PixelRuns | None  # the pixels to draw from; None: all
-    cells: Any  # [M] int32, the cells of the grid that are updated; None without a grid
+    active_pixels: PixelRuns | None
+    cells: Any
 
 
 class StepLoss(NamedTuple):
-    """A loss of the training step."""
+    """A loss of the training step.
+
+    Attributes:
+        name: of the loss, see `register_loss`.
+        function, on, needs: see `register_loss`.
+        weight: step -> number.
+    """
 
     name: str
     function: Callable[..., Any]
-    on: str  # "renderings" or "params", see register_loss
-    weight: Callable[[Any], Any]  # step -> number
-    needs: tuple[str, ...] = ()  # optional fields of Batch
+    on: str
+    weight: Callable[[Any], Any]
+    needs: tuple[str, ...] = ()
 
 
-def make_train_step(model: Model, optimizer: optax.GradientTransformation, draw, losses: Sequence[StepLoss]):
+def make_train_step(
+    model: Model, optimizer: optax.GradientTransformation, draw: Callable[..., tuple], losses: Sequence[StepLoss]
+) -> Callable[..., tuple]:
     """Makes the pure training step.
 
     Args:
-        model: see `jaxnerf.models.base.Model`. Of its Renderings in training the last one counts.
+        model: see `Model`; the last of its Renderings in training counts.
         optimizer: an optax gradient transformation.
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see `draw_batch`.
         losses: at least one of the renderings.
 
     Returns:
-        train_step(state, data, positions, *, axis_name=None) -> (state, metrics). `data` is TrainData, or
-        whatever `draw` takes where the model has no grid. `positions` is [N, B] int32, the places of this
-        device's rays in the whole batch, in N microbatches: they run one after the other and their gradients
-        add up, so that the activations of B rays stay in the cache (or in the memory) whatever the batch
-        size. With an `axis_name` all sums are also over that axis of devices. `metrics` are scalars: "loss",
-        "mse" (last rendering), "mse_coarse" (first), "loss_<name>" for each loss (unweighted) if there are
-        several, "grad_norm", the number of "rays" that counted, and the counters.
+        train_step(state, data, positions, *, axis_name=None) -> (state, metrics).
 
-        The counters: "nonfinite" steps, whose loss or gradient was not finite; they leave parameters,
-        optimizer and grid as they were. "nonfinite_in_a_row". "dead_<name>" of each network, see
-        `count_dead_steps`, and "num_reinits", which only reinitialization changes. With a grid also
-        "rays_dropped": some of their samples did not fit into the buffer, so they count for nothing.
+        `data` is TrainData; for a model without a grid it may be anything that `draw` accepts. `positions` is
+        [N, B] int32, the positions of this device's rays in the whole batch, in N microbatches. These run one
+        after the other and their gradients are summed, so the activations of only B rays must fit into the
+        cache or memory. With an `axis_name` all sums are also over that axis of devices.
+
+        `metrics` are scalars: "loss", "mse" (last rendering), "mse_coarse" (first rendering), "loss_<name>" of
+        each loss (unweighted) if there are several, "grad_norm", the number of "rays" that were not dropped,
+        and the counters. These are "nonfinite", the steps whose loss or gradient was not finite, which leave
+        parameters and optimizer unchanged; "nonfinite_in_a_row"; "dead_<name>" of each network, see
+        `count_dead_steps`; "num_reinits", which only reinitialization changes; and with a grid "rays_dropped",
+        the rays that were ignored because some of their samples did not fit into the sample buffer.
     """
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
     regularizers = [loss for loss in losses if loss.on == "params"]
@@ -111,7 +127,7 @@ def make_train_step(model: Model, optimizer: optax.GradientTransformation, draw,
             updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
             return optax.apply_updates(state.params, updates), opt_state
 
-        # A branch: selecting between old and new arrays would take about as long as the update itself.
+        # A branch, as selecting between old and new arrays takes about as long as the update itself.
         params, opt_state = jax.lax.cond(finite, descend, lambda: (state.params, state.opt_state))
         missed = (~finite).astype(jnp.int32)
         counters = {
@@ -123,7 +139,7 @@ def make_train_step(model: Model, optimizer: optax.GradientTransformation, draw,
         grid = state.grid
         if model.grid_schedule is not None:
             counters["rays_dropped"] = state.counters["rays_dropped"] + drawn - rays
-            # No ray has this position, so the key is the step's own.
+            # No ray has this position in the batch, so the key is unused otherwise.
             key = jax.random.fold_in(ray_batches.step_key(data.seed, state.step), 2**32 - 2)
             grid = model.grid_schedule.update(key, state.step, params, grid, data.cells)
         state = TrainState(step=state.step + 1, params=params, opt_state=opt_state, grid=grid, counters=counters)
@@ -133,12 +149,12 @@ def make_train_step(model: Model, optimizer: optax.GradientTransformation, draw,
 
 
 def _scaled(weight, value):
-    """Returns the product; a weight of 1 adds no operation."""
+    """Returns weight * value; a constant weight of 1 adds no operation."""
     return value if isinstance(weight, int | float) and weight == 1 else weight * value
 
 
 def _mean_over_rays(sums, grads):
-    """Returns means over the rays that counted: metrics, gradient; and how many rays those were."""
+    """Returns metrics and gradient as means over the rays that were not dropped, and the number of these rays."""
     rays = sums.pop("rays")
     scale = 1 / jnp.maximum(rays, 1)
     return *jax.tree.map(lambda leaf: leaf * scale, (sums, grads)), rays

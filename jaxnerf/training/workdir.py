@@ -1,92 +1,144 @@
-"""The folder of a run: which configuration it belongs to, files that are whole or not there."""
+"""The folder of a run: its config.json, and a lock that lets one training at a time write there."""
 
 import contextlib
 import json
 import os
 import pathlib
+import socket
+import sys
+import time
+from collections.abc import Iterator
 
 from ml_collections import ConfigDict
 
-# What may change between the starts of one run, as it changes no step that was taken.
-FREE = (
+from jaxnerf.runtime import atomic_files
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+# A run may be resumed with other values of these fields and sections, as they change no step that was taken.
+CHANGEABLE = (
     "data.dir",
     "train.max_steps",
     "train.max_seconds",
     "train.log_every",
     "train.save_every",
     "train.max_to_keep",
+    "train.microbatch_size",
+    "train.parallel",
+    "train.max_nonfinite",
+    "train.max_reinits",
+    "eval.",
 )
-FREE += ("train.microbatch_size", "train.parallel", "train.max_nonfinite", "train.max_reinits", "eval.")
-SECTIONS = ("data", "coarse", "fine", "sampling", "train", "eval")
+SECTIONS = ("data", "coarse", "fine", "sampling", "hash_grid", "occupancy", "losses", "train", "eval")
 
 
-def claim(workdir, config):
-    """Writes the configuration into a new workdir, or checks that an old one belongs to it.
+def claim(workdir: str | os.PathLike, config: ConfigDict) -> None:
+    """Writes a resolved config into a new workdir, or checks that it belongs to the run in an existing one.
+
+    The caller holds the `workdir_lock`. Partial files of killed processes are removed.
 
     Raises:
-        ValueError: if the workdir's run had another configuration; names the fields that differ.
+        ValueError: if the run in the workdir has another config; names the fields that differ.
     """
     path = pathlib.Path(workdir) / "config.json"
     if path.exists():
         old, new = _flat(read_config(workdir)), _flat(config)
         keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
-        fixed = [key for key in keys if not key.startswith(FREE)]
+        fixed = [key for key in keys if not key.startswith(CHANGEABLE)]
         if fixed:
             shown = ", ".join(f"{key} {old.get(key)!r} -> {new.get(key)!r}" for key in fixed[:3])
             more = f" and {len(fixed) - 3} more" if len(fixed) > 3 else ""
             raise ValueError(
-                f"{workdir}: belongs to a run with another configuration ({shown}{more}); "
-                "give another --workdir, or the old configuration to go on"
+                f"{workdir}: belongs to a run with another config ({shown}{more}); "
+                "give another --workdir, or resume with the old config"
             )
     elif (path.parent / "checkpoints").exists():
         raise ValueError(f"{workdir}: has checkpoints but no config.json; give another --workdir")
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, config.to_json_best_effort(indent=2) + "\n")
+    for partial in path.parent.glob("*.tmp"):
+        partial.unlink(missing_ok=True)
+    atomic_files.write_text(path, config.to_json_best_effort(indent=2) + "\n")
 
 
-def read_config(workdir):
-    """Returns the configuration of the run in a workdir; ValueError if there is none."""
+def read_config(workdir: str | os.PathLike) -> ConfigDict:
+    """Reads the config of the run in a workdir; raises ValueError if there is none."""
     path = pathlib.Path(workdir) / "config.json"
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
-        raise ValueError(f"{path}: no such file, wanted the workdir of a training run; correct --workdir") from None
+        raise ValueError(f"{path}: no such file, expected the workdir of a training run; correct --workdir") from None
     except ValueError as error:
-        raise ValueError(f"{path}: malformed JSON ({error}); restore it or train anew") from None
+        raise ValueError(f"{path}: malformed JSON ({error}); restore it or train again") from None
     if not isinstance(content, dict) or not all(isinstance(content.get(name), dict) for name in SECTIONS):
-        raise ValueError(f"{path}: holds no configuration, wanted an object with {SECTIONS}; restore it or train anew")
-    return ConfigDict(content, type_safe=False)  # JSON does not tell the types of "auto" fields
-
-
-def write_text(path, text):
-    """Writes a text file so that it is there whole or not at all, after a loss of power too."""
-    path = pathlib.Path(path)
-    partial = path.with_name(path.name + ".tmp")
-    try:
-        with naming(path), partial.open("w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
-
-
-@contextlib.contextmanager
-def naming(path):
-    """Adds a path to errors of the system that name none, as while writing to a full disk."""
-    try:
-        yield
-    except OSError as error:
-        if error.filename is None:
-            error.filename = str(path)
-        raise
+        raise ValueError(f"{path}: is not a config, expected an object with {SECTIONS}; restore it or train again")
+    return ConfigDict(content, type_safe=False)  # JSON does not hold the types of "auto" fields
 
 
 def _flat(config):
+    """Returns {"section.field": value} as JSON holds it."""
     flat = {}
     for section, values in json.loads(config.to_json_best_effort()).items():
         fields = values.items() if isinstance(values, dict) else [(None, values)]
         flat.update({f"{section}.{key}" if key else section: value for key, value in fields})
     return flat
+
+
+@contextlib.contextmanager
+def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
+    """Holds a workdir, made if missing, for one training.
+
+    The lock is flock's on the file "running", which names its holder. The system releases it however the
+    process ends. `filelock` and the like do not name the holder.
+
+    Raises:
+        ValueError: if another process holds it, or nothing can be written there; names the folder.
+    """
+    path = pathlib.Path(workdir) / "running"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = _locked(path)
+        with atomic_files.naming(path):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%F %T')}\n")
+            file.flush()
+    except OSError as error:
+        raise ValueError(
+            f"{workdir}: cannot be written ({error.strerror}); make it writable, free disk space, or give another "
+            "--workdir"
+        ) from error
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # a file that stays behind locks nobody out
+            path.unlink()
+        file.close()
+
+
+def _locked(path):
+    """Returns the file, opened and locked; raises ValueError if another process holds it."""
+    while True:
+        # A link could point at a file that truncate would empty.
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
+        file = os.fdopen(os.open(path, flags, 0o666), "a+")
+        try:
+            if fcntl is None:
+                raise OSError(None, "this system has no flock")
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            file.close()
+            raise ValueError(
+                f"{path.parent}: {holder} is training there; wait for it, stop it, or give another --workdir"
+            ) from None
+        except OSError as error:  # as on some network file systems
+            why = f"cannot be locked ({error.strerror}), so a second training there would go unnoticed"
+            print(f"{path.parent}: {why}", file=sys.stderr)
+            return file
+        with contextlib.suppress(FileNotFoundError):
+            if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+                return file
+        file.close()  # the previous holder has just removed it

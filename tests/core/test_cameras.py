@@ -78,8 +78,8 @@ def test_undistort_inverts_the_lens(lens, k):
     np.testing.assert_allclose(got, points, atol=1e-5 if lens == "opencv" else 3e-5)
 
 
-def test_a_pixel_without_a_preimage_is_flagged_and_sees_nothing():
-    """r (1 - r^2 / 2) never exceeds 0.5443; a careless Newton returns a point from beyond the fold."""
+def test_a_pixel_without_a_preimage_is_flagged_and_has_an_empty_ray():
+    """r (1 - r^2 / 2) never exceeds 0.5443; plain Newton iterations return a point beyond the fold."""
     camera = a_camera("opencv", [-0.5, 0.0, 0.0, 0.0])
     radius = np.append(np.linspace(0, 0.53, 150), np.linspace(0.56, 3, 150))
     pixels = radius[:, None] * np.array([[30.0, 48.0]]) + np.array([[41.0, 29.0]])
@@ -144,7 +144,7 @@ def forward_rays():
 
 @pytest.mark.parametrize("near_plane", [1.0, 0.4])
 def test_ndc_rays_meet_the_same_points(near_plane):
-    """A point of the world, projected to NDC by hand, lies on the NDC ray where ndc_to_t says."""
+    """A point of the world, projected to NDC by hand, lies on the NDC ray at the t of ndc_to_t."""
     camera, rays = forward_rays()
     ndc = fast_ndc(rays, camera, near_plane=near_plane)
     np.testing.assert_array_equal(ndc.near, 0)
@@ -210,7 +210,7 @@ def test_wrong_arguments():
 
 
 @pytest.mark.parametrize("d", [(0.0, 0.0, -1e-20), (1e-3, 0.0, -1e-20), (1.0, 0.0, -1e-25), (0.3, 0.1, -1e-3)])
-def test_slopes_of_grazing_ndc_rays_are_finite(d):
+def test_gradients_of_grazing_ndc_rays_are_finite(d):
     given, camera = (jnp.array([[0.1, 0.2, 0.5]]), jnp.array([d])), a_camera()
 
     @jax.jit

@@ -12,14 +12,14 @@ from jaxnerf.core.contraction import contract, expand
 from jaxnerf.core.occupancy.from_scene import crop_grid, visible_grid
 from jaxnerf.core.occupancy.grid import is_occupied
 from jaxnerf.core.occupancy.ray_marching import march_rays
-from jaxnerf.fields.base import Field
-from jaxnerf.models.grid_schedule import contract_field, make_grid_schedule
+from jaxnerf.fields.base import Field, contract_field
+from jaxnerf.models.grid_schedule import make_grid_schedule
 
 KEY = jax.random.key(0)
-ROOM, SIDE = 0.5, 32  # half the plain part's side, cells a side
-CELL = (4 * ROOM / SIDE,) * 3
+INNER, SIDE = 0.5, 32  # half the uncontracted part's side, cells per side
+CELL = (4 * INNER / SIDE,) * 3
 CENTER = np.float32([0.3, -0.2, 0.1])
-BOX = CENTER - 2 * ROOM, CENTER + 2 * ROOM
+BOX = CENTER - 2 * INNER, CENTER + 2 * INNER
 
 
 def a_grid(valid=None, **options):
@@ -28,15 +28,15 @@ def a_grid(valid=None, **options):
 
 
 def some_rays(count=64, seed=0, near=0.05, far=1e4):
-    """Returns Rays that look from outside and from inside of the plain part in all directions."""
+    """Returns Rays that look from outside and from inside the uncontracted part in all directions."""
     rng = np.random.default_rng(seed)
     origins = CENTER + rng.normal(size=(count, 3)) * np.linspace(0.1, 3, count)[:, None]
     directions = rng.normal(size=(count, 3))
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    arrays = [np.float32(value) for value in (origins, directions, unit)]
     return Rays(
-        *[],
-        **dict(zip(("origins", "directions", "viewdirs"), arrays, strict=True)),
+        origins=np.float32(origins),
+        directions=np.float32(directions),
+        viewdirs=np.float32(unit),
         near=np.full(count, near, np.float32),
         far=np.full(count, far, np.float32),
     )
@@ -72,7 +72,7 @@ def test_a_cell_holds_what_contract_puts_there():
     rng = np.random.default_rng(1)
     valid = rng.random((SIDE,) * 3) < 0.5
     x = np.float32(CENTER + rng.normal(size=(4000, 3)) * np.geomspace(0.01, 1e3, 4000)[:, None])
-    place = (np.asarray(contract((x - CENTER) / ROOM)) + 2) / 4 * SIDE
+    place = (np.asarray(contract((x - CENTER) / INNER)) + 2) / 4 * SIDE
     index = np.clip(place.astype(int), 0, SIDE - 1)
     sure = (np.abs(place - np.rint(place)) > 1e-3).all(axis=-1)
     grid = a_grid(valid)
@@ -83,7 +83,7 @@ def test_a_cell_holds_what_contract_puts_there():
 
 def test_samples_reach_from_near_to_far_and_grow_only_outside():
     rays, step = some_rays(), 0.01
-    samples = march_rays(None, a_grid(), rays, step=step, cell=CELL)
+    samples = march_rays(None, a_grid(), rays, step_size=step, cell=CELL)
     t, delta = np.asarray(samples.t), np.asarray(samples.delta)
     used = delta > 0
     speed = np.linalg.norm(rays.directions, axis=-1)
@@ -92,27 +92,27 @@ def test_samples_reach_from_near_to_far_and_grow_only_outside():
     assert (first >= rays.near).all()
     ends = np.array([(row + d / 2)[mask][-1] for row, d, mask in zip(t, delta, used, strict=True)])
     reach = np.linalg.norm(rays.origins + ends[:, None] * rays.directions - CENTER, axis=-1)
-    assert (reach > 20 * ROOM).all()  # all but to infinity
+    assert (reach > 20 * INNER).all()  # all but to infinity
     x = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-    largest = np.abs((x - CENTER) / ROOM).max(axis=-1)
+    largest = np.abs((x - CENTER) / INNER).max(axis=-1)
     length = delta * speed[:, None]
     assert (length[used & (largest < 0.5)] < 1.3 * step).all() and (length[used] > 0.99 * step)[3:].all()
     assert (length[used & (largest > 8)] > 4 * step).all()
     # As contracted cells do: no step crosses more of them than a plain step does, by far.
     start, end = (
-        np.asarray(contract((p - CENTER) / ROOM))
+        np.asarray(contract((p - CENTER) / INNER))
         for p in (
             x - delta[..., None] / 2 * rays.directions[:, None],
             x + delta[..., None] / 2 * rays.directions[:, None],
         )
     )
     crossed = np.linalg.norm(end - start, axis=-1)[used]
-    assert crossed.max() < 4 * step / ROOM and np.median(crossed) > 0.3 * step / ROOM
+    assert crossed.max() < 4 * step / INNER and np.median(crossed) > 0.3 * step / INNER
 
 
 def test_near_and_far_are_kept():
     rays = some_rays(near=0.3, far=0.9)
-    samples = march_rays(jax.random.key(0), a_grid(), rays, step=0.05, cell=CELL)
+    samples = march_rays(jax.random.key(0), a_grid(), rays, step_size=0.05, cell=CELL)
     edges = samples.t - samples.delta / 2, samples.t + samples.delta / 2
     used = np.asarray(samples.delta) > 0
     assert np.asarray(edges[0])[used].min() > 0.3 - 1e-5 and np.asarray(edges[1])[used].max() < 0.9 + 1e-5
@@ -125,7 +125,7 @@ def test_packed_equals_dense_when_all_is_occupied():
     def scene(x, viewdirs):
         return jnp.exp(-(x**2).sum(axis=-1)) + 0.01, 0.5 + 0.4 * jnp.sin(x + viewdirs)
 
-    samples = march_rays(None, a_grid(), rays, step=0.02, cell=CELL)
+    samples = march_rays(None, a_grid(), rays, step_size=0.02, cell=CELL)
     packed = jax.jit(lambda r, s: render_packed(scene, a_grid(), r, s, max_samples=2**15, background=jnp.ones(3)))
     dense = jax.jit(lambda r, s: render_samples(scene, r, s, background=jnp.ones(3)))
     got, want = packed(rays, samples), dense(rays, samples)
@@ -134,8 +134,8 @@ def test_packed_equals_dense_when_all_is_occupied():
     np.testing.assert_allclose(got.opacity, want.opacity, atol=2e-6)
 
 
-def test_a_look_asks_where_the_cell_is():
-    """A ball far outside of the plain part is found in the cells that contract puts it in."""
+def test_an_update_evaluates_the_scene_where_the_cell_is():
+    """A ball far outside the uncontracted part is found in the cells that contract puts it in."""
     middle, radius = CENTER + np.float32([4.0, 0, 0]), 1.2
 
     def scene(x, viewdirs):
@@ -144,14 +144,14 @@ def test_a_look_asks_where_the_cell_is():
 
     grid = a_grid()
     cells = jnp.arange(SIDE**3)
-    looked = jax.jit(
+    updated = jax.jit(
         lambda grid: update_grid(jax.random.key(0), grid, scene, cells, threshold=1.0, decay=0.0, spread=True)
     )(grid)
-    place = (np.stack(np.unravel_index(np.flatnonzero(looked.occupied), (SIDE,) * 3), -1) + 0.5) / SIDE * 4 - 2
+    place = (np.stack(np.unravel_index(np.flatnonzero(updated.occupied), (SIDE,) * 3), -1) + 0.5) / SIDE * 4 - 2
     assert 0 < len(place) < 600
-    image = np.asarray(contract((middle - CENTER) / ROOM))
+    image = np.asarray(contract((middle - CENTER) / INNER))
     assert (np.abs(place - image) < 0.8).all()
-    kept = mask_scene(scene, looked)
+    kept = mask_scene(scene, updated)
     density, _ = kept(jnp.asarray(middle).reshape(1, 1, 3), jnp.ones((1, 1, 3)))
     assert density.item() == 50.0
 
@@ -161,7 +161,7 @@ def test_thresholds_fall_where_steps_grow():
         (-2.0,) * 3,
         (2.0,) * 3,
         resolution=16,
-        step=0.1,
+        step_size=0.1,
         contracted=True,
         threshold=0.01,
         update_every=1,
@@ -177,22 +177,22 @@ def test_thresholds_fall_where_steps_grow():
     assert occupied[0].all() and occupied[:, -1].all()  # over a far cell's step it is not
 
 
-def test_a_contracted_field_is_asked_inside_its_box():
+def test_a_contracted_field_is_evaluated_inside_its_box():
     field = Field(None, lambda params, x, viewdirs: (x[..., 0], x))
     whole = contract_field(field, *BOX)
     x = CENTER + np.float32([[0.1, 0.2, 0.3], [1e6, 0, 0], [0, -0.5, 0]])
     _, places = whole.apply(None, x[None], None)
     np.testing.assert_allclose(
-        places[0], CENTER + np.float32([[0.1, 0.2, 0.3], [2 * ROOM, 0, 0], [0, -0.5, 0]]), atol=1e-5
+        places[0], CENTER + np.float32([[0.1, 0.2, 0.3], [2 * INNER, 0, 0], [0, -0.5, 0]]), atol=1e-5
     )
 
 
-def test_a_scene_trained_along_whole_rays_may_skip_afterwards():
-    """What is far outside of the plain part is kept, and seen as without a grid."""
+def test_a_grid_can_be_made_for_a_scene_trained_without_one():
+    """Matter far outside the uncontracted part is kept, and renders as it does without a grid."""
     field = Field(None, lambda params, x, viewdirs: (jnp.zeros(x.shape[:-1]), x))
-    options = {"threshold": 0.01, "update_every": 1, "look_at_once": 2**15, "contracted": True}
+    options = {"threshold": 0.01, "update_every": 1, "cells_per_update": 2**15, "contracted": True}
     schedule = make_grid_schedule(
-        *(tuple(bound.tolist()) for bound in BOX), resolution=SIDE, step=0.02, field=field, **options
+        *(tuple(bound.tolist()) for bound in BOX), resolution=SIDE, step_size=0.02, field=field, **options
     )
 
     def scene(x, viewdirs):
@@ -201,10 +201,10 @@ def test_a_scene_trained_along_whole_rays_may_skip_afterwards():
         return jnp.where(near, 30.0, jnp.where(far, 1.0, 0.0)), 0.5 + 0.4 * jnp.tanh(x / 5)
 
     rays = some_rays(2048, near=0.3)
-    find = jax.jit(lambda rays: visible_grid(scene, schedule, rays, max_samples=2**16, background=None))
+    find = jax.jit(lambda rays: visible_grid(scene, rays, **schedule.box(), max_samples=2**16, background=None))
     grid = crop_grid(find(rays))
     assert grid.contracted and grid.occupied.shape == (SIDE,) * 3 and 0.05 < grid.occupied.mean() < 0.9
     rays = jax.tree.map(lambda leaf: leaf[::16], rays)
-    samples = march_rays(None, grid, rays, step=0.02, cell=CELL)
+    samples = march_rays(None, grid, rays, step_size=0.02, cell=CELL)
     show = jax.jit(lambda grid: render_packed(scene, grid, rays, samples, max_samples=2**16))
     np.testing.assert_allclose(show(grid).rgb, show(a_grid()).rgb, atol=0.02)

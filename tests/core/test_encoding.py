@@ -13,8 +13,8 @@ def test_order_is_x_then_sine_and_cosine_of_each_octave():
     x, y = 0.3, -1.1
     got = encode(jnp.array([x, y]), num_freqs=2)
     s, c = np.sin, np.cos
-    wanted = [x, y, s(x), s(y), c(x), c(y), s(2 * x), s(2 * y), c(2 * x), c(2 * y)]
-    np.testing.assert_allclose(got, wanted, atol=1e-6)
+    expected = [x, y, s(x), s(y), c(x), c(y), s(2 * x), s(2 * y), c(2 * x), c(2 * y)]
+    np.testing.assert_allclose(got, expected, atol=1e-6)
     bare = encode(jnp.array([x, y]), num_freqs=2, include_input=False)
     np.testing.assert_array_equal(bare, got[2:])
 
@@ -31,12 +31,12 @@ def test_no_octaves_leave_x():
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 10.0, 1e3, 1e6])
 def test_every_octave_keeps_its_digits(scale):
-    """The shortcuts, sin(x + pi/2) and double angles, lose everything at the far end of this."""
+    """The shortcuts, sin(x + pi/2) and double angles, lose all digits at the upper end of this range."""
     x = np.random.default_rng(0).uniform(-scale, scale, 1000).astype(np.float32)
     got = encode(x[:, None], num_freqs=16, include_input=False).reshape(-1, 16, 2)
     angles = 2.0 ** np.arange(16) * x[:, None].astype(np.float64)
-    wanted = np.stack([np.sin(angles), np.cos(angles)], axis=-1)
-    np.testing.assert_allclose(got, wanted, atol=3e-7)
+    expected = np.stack([np.sin(angles), np.cos(angles)], axis=-1)
+    np.testing.assert_allclose(got, expected, atol=3e-7)
 
 
 def test_sine_keeps_its_relative_digits_near_zero():

@@ -21,7 +21,7 @@ def opencv_distort(x, y, k1, k2, p1, p2):
 
 
 def solve(u, v, coefficients):
-    """Another solver of the lens: Banach's iteration, as OpenCV's, until nothing moves."""
+    """Inverts the lens by fixed-point iteration, as OpenCV does, until it converges."""
     x, y = u, v
     for _ in range(200):
         dx, dy = opencv_distort(x, y, *coefficients)
@@ -39,7 +39,7 @@ def test_the_whole_image_of_the_fox_is_undistorted(scenes_dir):
     # The lens bends over hundreds of pixels: every fourth, and the last, leave nothing out.
     columns, rows = (np.append(np.arange(0, size, 4), size - 1) + 0.5 for size in (1080, 1920))
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
-    wanted = np.stack(solve(*np.moveaxis((pixels - center) / focal, -1, 0), coefficients), axis=-1)
+    expected = np.stack(solve(*np.moveaxis((pixels - center) / focal, -1, 0), coefficients), axis=-1)
     run = jax.jit(undistort)
     with jax.enable_x64(True):
         camera = Camera(
@@ -51,15 +51,15 @@ def test_the_whole_image_of_the_fox_is_undistorted(scenes_dir):
         )
         points, converged = run(camera, pixels)
         assert points.dtype == np.float64 and converged.all()
-        assert np.abs((np.asarray(points) - wanted) * focal).max() < 1e-4
+        assert np.abs((np.asarray(points) - expected) * focal).max() < 1e-4
     camera = jax.tree.map(np.float32, camera)
     points, converged = run(camera, np.float32(pixels))
     assert points.dtype == np.float32 and converged.all()
-    assert np.abs(np.asarray(points) - wanted).max() < 1e-6
+    assert np.abs(np.asarray(points) - expected).max() < 1e-6
 
 
 def test_ndc_and_plain_rays_render_the_same_scene():
-    """Coloured fog with a denser ball, known in the world; in NDC its density is that over the stretch."""
+    """Coloured fog with a denser ball in world space; its density in NDC is divided by the stretch."""
     focal, height, width = 20.0, 12, 16
     pose = jnp.array([[1.0, 0, 0, 0.1], [0, 1, 0, -0.05], [0, 0, 1, 0.2]])
     camera = Camera(to_world=pose, focal=jnp.full(2, focal), center=jnp.array([8.0, 6.0]), height=height, width=width)

@@ -65,7 +65,7 @@ def test_ssim_is_that_of_the_oracle_scikit_image_and_dm_pix(noise):
     np.testing.assert_allclose(fast_ssim(a, b), oracle.ssim(a.astype(np.float64), b.astype(np.float64)), atol=1e-5)
 
 
-def test_random_images_have_the_figures_of_scikit_image_and_dm_pix():
+def test_random_images_have_the_scores_of_scikit_image_and_dm_pix():
     a, b = np.random.default_rng(7).uniform(size=(2, 17, 20, 3)).astype(np.float32)
     assert_ssim_is_theirs(a, b)
     assert_psnr_is_theirs(a, b)
@@ -73,9 +73,9 @@ def test_random_images_have_the_figures_of_scikit_image_and_dm_pix():
 
 
 @pytest.mark.scenes("lego")
-def test_photographs_have_the_figures_of_scikit_image_and_dm_pix(scenes_dir):
+def test_images_of_scenes_have_the_scores_of_scikit_image_and_dm_pix(scenes_dir):
     """200 x 200 px, mostly white; a pair, and one beside itself with noise of 40 dB in 8 bits."""
-    views = blender.load_views(scenes_dir / "lego", split="test", factor=4)
+    views = blender.load_blender(scenes_dir / "lego", split="test", factor=4)
     a, b = (np.asarray(reference(views, index)) for index in (0, 1))
     noise = np.random.default_rng(9).normal(scale=0.01, size=a.shape).astype(np.float32)
     for other in (b, np.asarray(round_to_8_bits(a + noise))):
@@ -89,7 +89,7 @@ def assert_ssim_is_theirs(a, b):
     a64, b64 = a.astype(np.float64), b.astype(np.float64)
     valid_map = skimage.metrics.structural_similarity(a64, b64, **options)[1][5:-5, 5:-5]
     np.testing.assert_allclose(fast_ssim(a, b), valid_map.mean(), atol=1e-5)
-    with jax.enable_x64(True):  # in float32 its differences of squares are 3e-5 off on a white photograph
+    with jax.enable_x64(True):  # in float32 its differences of squares are 3e-5 off on a white image
         pix = float(jax.jit(dm_pix.ssim)(a64, b64))
     np.testing.assert_allclose(fast_ssim(a, b), pix, atol=1e-5)
 
@@ -101,12 +101,12 @@ def assert_psnr_is_theirs(a, b):
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
-def test_ssim_in_flat_bright_and_dark_places(level):
-    """Where the variance is nothing beside the mean, subtracting squares loses it."""
+def test_ssim_in_flat_bright_and_dark_regions(level):
+    """Where the variance is small compared with the mean, E[x^2] - E[x]^2 cancels."""
     rng = np.random.default_rng(5)
     a, b = (np.clip(level + 0.002 * rng.normal(size=(2, 14, 14, 3)), 0, 1)).astype(np.float32)
-    wanted = oracle.ssim(a.astype(np.float64), b.astype(np.float64))
-    np.testing.assert_allclose(fast_ssim(a, b), wanted, atol=1e-5)
+    expected = oracle.ssim(a.astype(np.float64), b.astype(np.float64))
+    np.testing.assert_allclose(fast_ssim(a, b), expected, atol=1e-5)
 
 
 def test_ssim_is_symmetric_at_most_one_and_one_for_itself():

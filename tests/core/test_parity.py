@@ -41,26 +41,26 @@ def exact(array):
 
 
 def rows(function, *arrays):
-    """Returns the oracle's answer for every row."""
+    """Returns the result of the oracle for every row."""
     return np.stack([function(*row) for row in zip(*map(exact, arrays), strict=True)])
 
 
 def scene(xp, frequency):
-    """Returns a scene of waves, in jax or in numpy: density and colour everywhere, no two places alike."""
+    """Returns a scene of waves, in jax or in numpy: density and colour everywhere, different at every position."""
 
-    def ask(x, viewdirs):
+    def scene(x, viewdirs):
         phase = frequency * (x[..., 0] + 0.5 * x[..., 1] - 0.3 * x[..., 2])
         return 0.35 + 0.25 * xp.sin(phase), 0.5 + 0.3 * xp.cos(frequency * x) + 0.2 * viewdirs
 
-    return ask
+    return scene
 
 
-def assert_parity(got, wanted):
+def assert_parity(got, expected):
     """Compares a batch of renderings with a list of the oracle's."""
     for name in ("rgb", "opacity", "weights"):
-        np.testing.assert_allclose(getattr(got, name), [w[name] for w in wanted], atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(getattr(got, name), [w[name] for w in expected], atol=1e-5, err_msg=name)
     for name in ("depth", "disparity"):
-        np.testing.assert_allclose(getattr(got, name), [w[name] for w in wanted], rtol=1e-5, err_msg=name)
+        np.testing.assert_allclose(getattr(got, name), [w[name] for w in expected], rtol=1e-5, err_msg=name)
 
 
 def each_ray(rays):
@@ -104,8 +104,8 @@ def test_rays_and_ndc(seed):
 def test_edges_and_their_union(seed, in_disparity):
     near, far = sorted_uniform(seed, (RAYS, 2), 0.5, 6.0).T
     got = uniform_edges(near, far, num_segments=9, in_disparity=in_disparity)
-    wanted = rows(lambda n, f: oracle.uniform_edges(n, f, 9, in_disparity), near, far)
-    np.testing.assert_allclose(got, wanted, rtol=1e-5)
+    expected = rows(lambda n, f: oracle.uniform_edges(n, f, 9, in_disparity), near, far)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
     points = sorted_uniform(seed + 9, (RAYS, 4), 0.0, 7.0)
     union = rows(lambda e, p: np.array(sorted([*e, *p])), got, points)
     np.testing.assert_allclose(merge_edges(got, points), union, rtol=1e-5)
@@ -116,12 +116,12 @@ def test_inverse_cdf(seed):
     edges, u = sorted_uniform(seed, (RAYS, 9), 2.0, 6.0), sorted_uniform(seed + 9, (RAYS, 12))
     weights = np.random.default_rng(seed).exponential(size=(RAYS, 8)).astype(np.float32)
     weights[0], weights[1, :4], weights[2, 4:] = 0, 0, 0
-    wanted = rows(oracle.inverse_cdf, edges, weights, u)
-    np.testing.assert_allclose(inverse_cdf(edges, weights, u), wanted, rtol=1e-5)
+    expected = rows(oracle.inverse_cdf, edges, weights, u)
+    np.testing.assert_allclose(inverse_cdf(edges, weights, u), expected, rtol=1e-5)
     middle = np.broadcast_to(oracle.middle_u(7), (RAYS, 7))
-    wanted = rows(oracle.inverse_cdf, edges, weights, middle)
+    expected = rows(oracle.inverse_cdf, edges, weights, middle)
     got = importance_points(None, edges, weights, num_points=7)
-    np.testing.assert_allclose(got, wanted, rtol=1e-5)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -136,8 +136,8 @@ def test_compositing(seed):
         rows(lambda *a: oracle.weights(*a)[0], density, delta),
         atol=1e-5,
     )
-    passing = transmittance(density, delta)
-    np.testing.assert_allclose(passing, rows(lambda *a: oracle.weights(*a)[1], density, delta), atol=1e-5)
+    transmitted = transmittance(density, delta)
+    np.testing.assert_allclose(transmitted, rows(lambda *a: oracle.weights(*a)[1], density, delta), atol=1e-5)
 
 
 @pytest.mark.parametrize("background", [None, np.array([0.2, 0.9, 0.5], np.float32)], ids=["black", "grey"])
@@ -146,11 +146,11 @@ def test_render_samples(seed, background):
     rays = random_rays(seed, (RAYS,))
     edges = sorted_uniform(seed, (RAYS, 12), 2.0, 6.0)
     got = render_cells(rays, edges, background)
-    wanted = [
-        oracle.ask(scene(np, 1.0), o, d, oracle.middles(e), np.diff(e), far, background)
+    expected = [
+        oracle.evaluate(scene(np, 1.0), o, d, oracle.middles(e), np.diff(e), far, background)
         for (o, d, _, far), e in zip(each_ray(rays), exact(edges), strict=True)
     ]
-    assert_parity(got, wanted)
+    assert_parity(got, expected)
 
 
 @pytest.mark.parametrize("rule", ["points", "segments"])
@@ -159,30 +159,30 @@ def test_render_hierarchical(seed, rule):
     rays, white = random_rays(seed, (RAYS,)), np.ones(3)
     got = render_twice(rays, rule)
     scenes = scene(np, 0.7), scene(np, 1.1)
-    wanted = [oracle.hierarchy(*scenes, *ray, 16, 24, rule, white) for ray in each_ray(rays)]
+    expected = [oracle.hierarchy(*scenes, *ray, 16, 24, rule, white) for ray in each_ray(rays)]
     for pass_ in (0, 1):
-        assert_parity(got[pass_], [w[pass_] for w in wanted])
+        assert_parity(got[pass_], [w[pass_] for w in expected])
 
 
 @pytest.mark.parametrize("rule", ["points", "segments"])
 def test_random_samples_lie_where_the_paper_draws_them(rule):
-    """The scene writes down where it is asked: exactly once in each bin of Eq. 2."""
-    rays, asked = random_rays(3, (200,)), []
+    """The scene records its positions: exactly one in each bin of Eq. 2."""
+    rays, positions = random_rays(3, (200,)), []
 
     def note(x, viewdirs):
-        asked.append(x)
+        positions.append(x)
         return jnp.ones(x.shape[:-1]), jnp.ones(x.shape)
 
     @compiled
     def places(rays):
         jaxnerf.render_rays(jax.random.key(0), note, rays, num_samples=8, rule=rule)
-        return asked[-1]
+        return positions[-1]
 
     x = exact(places(rays))
     o, d = exact(rays.origins)[:, None], exact(rays.directions)[:, None]
     t = ((x - o) * d).sum(axis=-1) / (d**2).sum(axis=-1)
     edges = oracle.uniform_edges(2, 6, 8)
     lower, upper = oracle.stratified_bins(2, 6, 8) if rule == "points" else (edges[:-1], edges[1:])
-    share = (t - lower) / (upper - lower)
-    assert share.min() > -1e-5 and share.max() < 1 + 1e-5
-    assert (share.min(axis=0) < 0.1).all() and (share.max(axis=0) > 0.9).all()
+    fraction = (t - lower) / (upper - lower)
+    assert fraction.min() > -1e-5 and fraction.max() < 1 + 1e-5
+    assert (fraction.min(axis=0) < 0.1).all() and (fraction.max(axis=0) > 0.9).all()

@@ -1,4 +1,4 @@
-"""How fast each rule converges to the closed forms, what it does at edges, and its gradients.
+"""Convergence of each quadrature rule to the closed forms, its error at edges, and its gradients.
 
 Everything here runs in float64 unless it says otherwise.
 """
@@ -32,7 +32,7 @@ SMOOTH = {
     "atmosphere": analytic.atmosphere(2.0, scale_height=0.8, **COLOURED),
     "blob": analytic.blob(3.0, center=(0.0, 0.0, 0.8), deviation=0.7, **COLOURED),
 }
-# A thin layer that rays come down into, and stop in: what the paper's scenes ask of a rule.
+# A thin layer that rays enter from above and end in, the typical case of the paper's scenes.
 HAZE = analytic.atmosphere(8.0, scale_height=0.07, **COLOURED)
 SHARP = {
     "slab": analytic.slab(2.0, lower=0.4, upper=1.3, **COLOURED),
@@ -71,25 +71,25 @@ DESCENDING = make_rays(
 
 
 @functools.cache
-def answer(medium, which="oblique"):
+def exact(medium, which="oblique"):
     return compiled(medium.exact)({"oblique": OBLIQUE, "descending": DESCENDING}[which])
 
 
-def errors(medium, rays, rule, numbers, wanted):
+def errors(medium, rays, rule, numbers, expected):
     """Returns the largest errors [numbers, 3] over rays, of colour, opacity and depth.
 
-    All numbers of evaluations share one compiled shape, filled up with cells of no width: see
-    test_cells_of_no_width_change_nothing.
+    All numbers of evaluations fraction one compiled shape, padded with cells of width 0: see
+    test_cells_of_width_zero_change_nothing.
     """
     each = 2 if rule == "gauss" else 1
     render = compiled(functools.partial(padded, medium.scene, rule, max(numbers) // each))
-    return np.array([largest(render(rays, n // each), wanted) for n in numbers])
+    return np.array([largest(render(rays, n // each), expected) for n in numbers])
 
 
 def padded(scene, rule, shape, rays, cells):
-    """Returns the Rendering with so many cells, among `shape` of which the last have no width."""
-    share = jnp.minimum(jnp.arange(shape + 1) / cells, 1)
-    edges = rays.near[:, None] + (rays.far - rays.near)[:, None] * share[None]
+    """Returns the Rendering with a number of cells, among `shape` of which the last have width 0."""
+    fraction = jnp.minimum(jnp.arange(shape + 1) / cells, 1)
+    edges = rays.near[:, None] + (rays.far - rays.near)[:, None] * fraction[None]
     return render_samples(scene, rays, samples_from_edges(None, edges, rule=rule))
 
 
@@ -100,69 +100,69 @@ def even(medium, rays, rule, numbers):
 
 
 @pytest.mark.parametrize("rule", ["segments", "gauss"])
-def test_cells_of_no_width_change_nothing(rule):
+def test_cells_of_width_zero_change_nothing(rule):
     each = 2 if rule == "gauss" else 1
-    (wanted,) = even(SMOOTH["blob"], OBLIQUE, rule, [48])
+    (expected,) = even(SMOOTH["blob"], OBLIQUE, rule, [48])
     got = compiled(functools.partial(padded, SMOOTH["blob"].scene, rule, 96 // each))(OBLIQUE, 48 // each)
     for part in ("rgb", "opacity", "depth", "disparity"):
-        np.testing.assert_allclose(getattr(got, part), getattr(wanted, part), rtol=1e-13)
+        np.testing.assert_allclose(getattr(got, part), getattr(expected, part), rtol=1e-13)
     np.testing.assert_array_equal(got.weights[:, 48:], 0)
 
 
-def largest(got, wanted):
+def largest(got, expected):
     parts = ("rgb", "opacity", "depth")
-    return [np.abs(getattr(got, part) - getattr(wanted, part)).max() for part in parts]
+    return [np.abs(getattr(got, part) - getattr(expected, part)).max() for part in parts]
 
 
 @pytest.mark.parametrize("rule", ORDERS)
 @pytest.mark.parametrize("name", SMOOTH)
 def test_order_of_colour_opacity_and_depth(name, rule):
-    found = errors(SMOOTH[name], OBLIQUE, rule, (48, 96, 192), answer(SMOOTH[name]))
-    exact = found[-1] < 1e-13  # the optical depth of an affine density has no error
-    assert list(exact) == [False, name in ("fog", "linear"), False]
-    found = found[:, ~exact]
+    found = errors(SMOOTH[name], OBLIQUE, rule, (48, 96, 192), exact(SMOOTH[name]))
+    no_error = found[-1] < 1e-13  # the optical depth of an affine density has no error
+    assert list(no_error) == [False, name in ("fog", "linear"), False]
+    found = found[:, ~no_error]
     assert (np.log2(found[:-1] / found[1:]) >= ORDERS[rule]).all(), found
 
 
 @pytest.mark.parametrize("name", ["fog", "atmosphere"])
 def test_the_released_rule_stalls_where_the_far_end_is_in_matter(name):
-    wanted = answer(SMOOTH[name])
-    found = [largest(got, wanted)[0] for got in even(SMOOTH[name], OBLIQUE, "points", (48, 384))]
+    expected = exact(SMOOTH[name])
+    found = [largest(got, expected)[0] for got in even(SMOOTH[name], OBLIQUE, "points", (48, 384))]
     assert np.log2(found[0] / found[1]) / 3 < 0.6
     assert found[1] > 1e-2
 
 
-def test_evaluations_that_an_atmosphere_needs():
+def test_number_of_evaluations_for_an_atmosphere():
     enough = {"segments": {1e-3: 192, 1e-5: 1536}, "gauss": {1e-3: 48, 1e-5: 192}}
     for rule, numbers in enough.items():
         tried = [number // part for number in numbers.values() for part in (2, 1)]
-        found = errors(HAZE, DESCENDING, rule, tried, answer(HAZE, "descending"))[:, 0]
+        found = errors(HAZE, DESCENDING, rule, tried, exact(HAZE, "descending"))[:, 0]
         for bound, half, whole in zip(numbers, found[::2], found[1::2], strict=True):
             assert whole <= bound < half, (rule, bound, half, whole)
 
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_the_floor_of_float32(name):
-    """Past convergence the error is rounding's alone, and more samples do not raise it."""
-    wanted = answer(SMOOTH[name])
+    """After convergence only rounding errors are left, and more samples do not increase them."""
+    expected = exact(SMOOTH[name])
     assert all((np.float32(x) == x).all() for x in (OBLIQUE.origins, OBLIQUE.directions))
     with jax.enable_x64(False):
         rays = jax.tree.map(np.float32, OBLIQUE)
         render = functools.partial(render_rays, None, SMOOTH[name].scene, num_samples=1536, rule="gauss")
         got = compiled(render)(rays)
         assert got.rgb.dtype == np.float32
-    assert np.abs(got.rgb - wanted.rgb).max() < 1e-6
-    assert np.abs(got.opacity - wanted.opacity).max() < 1e-6
-    assert np.abs(got.depth / wanted.depth - 1).max() < 1e-6
+    assert np.abs(got.rgb - expected.rgb).max() < 1e-6
+    assert np.abs(got.opacity - expected.opacity).max() < 1e-6
+    assert np.abs(got.depth / expected.depth - 1).max() < 1e-6
 
 
 @pytest.mark.parametrize("rule", ORDERS)
 @pytest.mark.parametrize("name", SHARP)
 def test_an_edge_costs_at_most_its_cell(name, rule):
-    """An edge inside a cell moves at most to the cell's end, and takes what lies between along."""
+    """An edge inside a cell is displaced at most to the end of the cell."""
     numbers = np.array([48, 192, 768])
     cells = numbers if rule == "segments" else numbers // 2
-    found = errors(SHARP[name], OBLIQUE, rule, numbers, answer(SHARP[name]))[:, 0]
+    found = errors(SHARP[name], OBLIQUE, rule, numbers, exact(SHARP[name]))[:, 0]
     density, edges, colours = 2.0, 2, 1.0
     length = np.linalg.norm(OBLIQUE.directions, axis=-1).max() * 4.0 / cells
     assert (found <= density * edges * colours * length).all(), found
@@ -185,12 +185,12 @@ def test_an_edge_between_two_cells_costs_nothing(rule, order):
 def test_stratified_samples_converge_and_err_to_both_sides(rule, order):
     medium, draws = SMOOTH["atmosphere"], 256
     rays = jax.tree.map(lambda leaf: np.repeat(leaf[:1], draws, axis=0), OBLIQUE)
-    wanted = answer(medium).rgb[0]
+    expected = exact(medium).rgb[0]
     keys = jax.random.split(jax.random.key(0), draws)
     render = compiled(lambda keys, rays, n: render_rays(keys, medium.scene, rays, num_samples=n, rule=rule), "n")
     root_mean_square = []
     for number in (24, 96):
-        error = render(keys, rays, n=number).rgb - wanted
+        error = render(keys, rays, n=number).rgb - expected
         root_mean_square.append(np.sqrt((error**2).mean()))
         if rule == "segments":
             standard_error = error.std(axis=0) / np.sqrt(draws)
@@ -201,7 +201,7 @@ def test_stratified_samples_converge_and_err_to_both_sides(rule, order):
 @pytest.mark.parametrize("rule, order", ORDERS.items())
 def test_hierarchical_converges_to_the_closed_form(rule, order):
     medium = SMOOTH["atmosphere"]
-    wanted = answer(medium)
+    expected = exact(medium)
 
     def render(rays, n):
         return render_hierarchical(
@@ -209,26 +209,26 @@ def test_hierarchical_converges_to_the_closed_form(rule, order):
         )[1]
 
     # Over a factor of 8, as the points do not fall alike from one number to the next.
-    found = np.array([largest(compiled(render, "n")(OBLIQUE, n=n), wanted) for n in (48, 384)])
+    found = np.array([largest(compiled(render, "n")(OBLIQUE, n=n), expected) for n in (48, 384)])
     assert (np.log2(found[0] / found[1]) / 3 >= order - 0.2).all(), found
 
 
 def test_the_released_rule_converges_where_the_far_end_is_empty():
     ball = SHARP["ball"]
-    wanted = answer(ball).rgb
+    expected = exact(ball).rgb
 
     def render(rays, n):
         return render_hierarchical(
             None, ball.scene, ball.scene, rays, num_coarse=n // 2, num_fine=n // 2, rule="points"
         )[1].rgb
 
-    found = [np.abs(compiled(render, "n")(OBLIQUE, n=n) - wanted).max() for n in (24, 768)]
+    found = [np.abs(compiled(render, "n")(OBLIQUE, n=n) - expected).max() for n in (24, 768)]
     assert found[1] < 4e-3 and found[1] < found[0] / 4
 
 
 @pytest.fixture(scope="module")
 def swept():
-    """Densities [200, 12] over all of float32, with zeros, inf, and cells of no length."""
+    """Densities [200, 12] over all of float32, with zeros, inf, and cells of length 0."""
     rng = np.random.default_rng(0)
     density = np.float32(10.0 ** rng.uniform(-30, 30, (200, 12)))
     density[:40] = np.float32(rng.uniform(0, 5, (40, 12)))
@@ -239,7 +239,7 @@ def swept():
     return density, length
 
 
-def test_gauss_weights_are_shares_of_the_opacity(swept):
+def test_gauss_weights_sum_to_the_opacity(swept):
     density, length = swept
     with jax.enable_x64(False):
         weights = jaxnerf.weights_from_density
@@ -265,13 +265,13 @@ def test_gauss_weights_do_not_see_masked_samples(swept):
                 argnums=(0, 1),
             )
         )
-        seen, unseen = run(density, length), run(hidden, length)
+        seen, masked = run(density, length), run(hidden, length)
     assert all_finite(seen)
-    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(unseen), strict=True):
+    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(masked), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_splitting_cells_of_constant_density_changes_no_share():
+def test_splitting_cells_of_constant_density_changes_no_weight():
     rng = np.random.default_rng(1)
     density, length = rng.exponential(size=(50, 6)), rng.uniform(0.01, 2, (50, 6))
     weights = compiled(functools.partial(jaxnerf.weights_from_density, rule="gauss"))
@@ -280,8 +280,8 @@ def test_splitting_cells_of_constant_density_changes_no_share():
     np.testing.assert_allclose(split.reshape(50, 6, 4).sum(-1), whole.reshape(50, 6, 2).sum(-1), rtol=1e-12, atol=1e-15)
 
 
-def test_gauss_weights_follow_what_reaches_the_points():
-    """In one thin cell they are sigma exp(-tau) there, to the order of the rule."""
+def test_gauss_weights_follow_the_transmittance_at_the_points():
+    """In one thin cell they are proportional to sigma exp(-tau), to the order of the rule."""
     depth = 0.1
     first, second = jaxnerf.weights_from_density(np.ones(2), np.full(2, depth / 2), rule="gauss")
     np.testing.assert_allclose(first / second, np.exp(depth / np.sqrt(3)), rtol=1e-3)
@@ -378,16 +378,16 @@ def exact_slopes(name):
     [("atmosphere", "gauss", 2e-5), ("blob", "gauss", 2e-5), ("blob", "segments", 2e-3)],
 )
 def test_gradients_through_the_renderer(name, rule, accuracy):
-    """With respect to density, colour, pose and focal length: exact's, and those of differences."""
+    """With respect to density, colour, pose and focal length: those of the closed form, and finite differences."""
 
     def rendered(place):
         return seen(name, place, lambda medium, rays: render_rays(None, medium.scene, rays, num_samples=64, rule=rule))
 
     got = compiled(jax.jacrev(rendered))(PLACE)
-    wanted = exact_slopes(name)
-    assert (np.abs(wanted).max(axis=(0, 1)) > 1e-3).all()  # each number matters
-    scale = np.abs(wanted).max()
-    np.testing.assert_allclose(got, wanted, atol=accuracy * scale)
+    expected = exact_slopes(name)
+    assert (np.abs(expected).max(axis=(0, 1)) > 1e-3).all()  # each number matters
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(got, expected, atol=accuracy * scale)
     run, step = compiled(rendered), 1e-5
     for i, move in enumerate(step * np.eye(len(PLACE))):
         difference = (run(PLACE + move) - run(PLACE - move)) / (2 * step)

@@ -7,6 +7,7 @@ import pytest
 
 from helpers import all_finite, assert_same, compiled, random_rays
 from jaxnerf import Samples, points_on_rays, render_hierarchical, render_image, render_rays, render_samples
+from jaxnerf.core.types import without_samples
 
 SHAPE = (4, 3)
 
@@ -19,7 +20,7 @@ def fog(sigma=0.3, color=(0.2, 0.5, 0.9)):
 
 
 def ball(x, viewdirs):
-    """A soft ball of radius 2 around the origin, with a colour a place and a direction."""
+    """A soft ball of radius 2 around the origin, whose colour depends on position and direction."""
     density = 5 * jax.nn.sigmoid(4 * (2 - jnp.sqrt((x**2).sum(axis=-1) + 1e-6)))
     return density, 0.5 + 0.2 * jnp.sin(x) + 0.3 * viewdirs
 
@@ -53,7 +54,7 @@ def through_fog(key, rays, sigma, num_samples, background=None, in_disparity=Fal
 through_fog = compiled(through_fog, "num_samples", "in_disparity")
 
 
-def test_positions(rays):
+def test_points_on_rays(rays):
     t = np.broadcast_to(np.float32([0.0, 2.5]), (*SHAPE, 2))
     got = compiled(points_on_rays)(rays, t)
     np.testing.assert_array_equal(got[..., 0, :], rays.origins)
@@ -66,9 +67,9 @@ def test_fog_of_constant_density(rays, sigma, key):
     """Exact whatever the samples: opacity 1 - exp(-sigma L), L in world units, to relative accuracy."""
     got = through_fog(key, rays, sigma, 5, np.ones(3))
     length = 4 * np.linalg.norm(np.asarray(rays.directions, np.float64), axis=-1)
-    wanted = -np.expm1(-sigma * length)
-    np.testing.assert_allclose(got.opacity, wanted, rtol=2e-6)
-    color = np.array([0.2, 0.5, 0.9]) * wanted[..., None] + 1 - wanted[..., None]
+    expected = -np.expm1(-sigma * length)
+    np.testing.assert_allclose(got.opacity, expected, rtol=2e-6)
+    color = np.array([0.2, 0.5, 0.9]) * expected[..., None] + 1 - expected[..., None]
     np.testing.assert_allclose(got.rgb, color, atol=2e-6)
     np.testing.assert_allclose(got.weights.sum(axis=-1), got.opacity, rtol=1e-5)
     assert (got.depth >= 2).all() and (got.depth <= 6).all()
@@ -76,22 +77,27 @@ def test_fog_of_constant_density(rays, sigma, key):
 
 
 def test_depth_of_fog_is_second_order(rays):
-    """Expected stopping place of constant density: near + (1 - exp(-s L)) / s, in t; 256 midpoints."""
+    """Expected depth of constant density: near + (1 - exp(-s L)) / s, in t; 256 midpoints."""
     got = through_fog(None, rays, 0.3, 256)
     rate = 0.3 * np.linalg.norm(np.asarray(rays.directions, np.float64), axis=-1)  # per t
     np.testing.assert_allclose(got.depth, 2 - np.expm1(-4 * rate) / rate, rtol=1e-4)
 
 
-def test_length_of_directions_is_a_unit_of_t(rays):
+def test_the_length_of_directions_scales_t(rays):
     longer = dataclasses.replace(rays, directions=2 * rays.directions, near=rays.near / 2, far=rays.far / 2)
-    got, wanted = draw["rays"](None, longer), draw["rays"](None, rays)
-    scaled = dataclasses.replace(wanted, depth=wanted.depth / 2, disparity=wanted.disparity * 2)
+    got, expected = draw["rays"](None, longer), draw["rays"](None, rays)
+    scaled = dataclasses.replace(
+        expected,
+        depth=expected.depth / 2,
+        disparity=expected.disparity * 2,
+        samples=dataclasses.replace(expected.samples, t=expected.samples.t / 2, delta=expected.samples.delta / 2),
+    )
     assert_same(got, scaled, atol=1e-5)
 
 
 @pytest.mark.parametrize("far", [2.0, 6.0, jnp.inf])
 def test_an_empty_ray_shows_the_background_at_far(rays, far):
-    """Of no length at far = near = 2; of no density otherwise."""
+    """The ray has length 0 at far = near = 2, and density 0 otherwise."""
     rays = dataclasses.replace(rays, far=np.full(SHAPE, far, np.float32))
     sigma, background = np.nan if far == 2 else 0.0, np.array([0.1, 0.2, 0.3])
     got = through_fog(None, rays, sigma, 4, background, in_disparity=True)
@@ -102,15 +108,16 @@ def test_an_empty_ray_shows_the_background_at_far(rays, far):
 
 
 @pytest.mark.parametrize("key", [None, jax.random.key(0)], ids=["fixed", "random"])
-def test_a_ray_without_an_end_that_meets_matter(rays, key):
+def test_a_ray_of_infinite_length_that_meets_matter(rays, key):
     endless = dataclasses.replace(rays, far=np.full(SHAPE, np.inf, np.float32))
     got = through_fog(key, endless, 50.0, 5, in_disparity=True)
-    assert all_finite(got)
+    np.testing.assert_array_equal(np.isinf(got.samples.delta), np.arange(5) == np.full((*SHAPE, 1), 4))
+    assert all_finite(dataclasses.replace(got, samples=None))
     np.testing.assert_allclose(got.opacity, 1, rtol=1e-6)
 
 
 def test_a_masked_sample_changes_nothing(rays):
-    """Its place is outside of what the scene knows: the answer there is NaN, and so is its derivative."""
+    """The scene returns NaN at its position, and so does the derivative."""
     t = np.broadcast_to(np.float32([2.5, 3.0, 4.0, 1e9]), (*SHAPE, 4))
     delta = np.broadcast_to(np.float32([0.5, 0.5, 1.0, 0.0]), (*SHAPE, 4))
 
@@ -122,7 +129,7 @@ def test_a_masked_sample_changes_nothing(rays):
 
         samples = Samples(t=t[..., :kept], delta=delta[..., :kept])
         got = render_samples(scene, rays, samples, background=jnp.ones(3))
-        return got.rgb.sum() + got.depth.sum() + got.disparity.sum(), dataclasses.replace(got, weights=None)
+        return got.rgb.sum() + got.depth.sum() + got.disparity.sum(), without_samples(got)
 
     run = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnums=1)
     assert_same(run(1.0, 4), run(1.0, 3))
@@ -133,18 +140,18 @@ def test_a_ray_with_its_own_key_does_not_depend_on_its_batch(rays, keys, name):
     whole = draw[name](keys, rays)
     turned = draw[name](keys[::-1], jax.tree.map(lambda leaf: leaf[::-1], rays))
     assert_same(turned, jax.tree.map(lambda leaf: leaf[::-1], whole))
-    workdir_lock = {"rays": through_ball, "hierarchical": twice_through_ball}[name]
-    assert_same(jax.jit(jax.vmap(jax.vmap(workdir_lock)))(keys, rays), whole)
+    one_ray = {"rays": through_ball, "hierarchical": twice_through_ball}[name]
+    assert_same(jax.jit(jax.vmap(jax.vmap(one_ray)))(keys, rays), whole)
 
 
 @pytest.mark.parametrize("name", draw)
-def test_keys_make_the_samples_and_nothing_else_does(rays, name):
+def test_samples_are_random_only_with_a_key(rays, name):
     fixed, one = draw[name](None, rays), draw[name](jax.random.key(0), rays)
     assert_same(one, draw[name](jax.random.key(0), rays), rtol=0, atol=0)
     assert (jax.tree.leaves(one)[0] != jax.tree.leaves(fixed)[0]).any()
 
 
-def test_the_fine_scene_is_asked_where_the_coarse_one_has_weight(rays):
+def test_fine_samples_lie_where_the_coarse_weights_are(rays):
     first, second = draw["hierarchical"](None, rays)
     assert first.weights.shape == (*SHAPE, 8) and second.weights.shape == (*SHAPE, 16)
     exact = compiled(lambda: render_rays(None, ball, rays, num_samples=1024))()
@@ -184,8 +191,8 @@ def test_an_image_does_not_depend_on_its_chunks(rays, chunk):
         return through_ball(None, rays)
 
     got = render_image(render, rays, chunk=chunk)
-    assert compiled == [(chunk,)] and got.weights is None
-    assert_same(got, dataclasses.replace(draw["rays"](None, rays), weights=None))
+    assert compiled == [(chunk,)] and got.weights is None and got.samples is None
+    assert_same(got, without_samples(draw["rays"](None, rays)))
 
 
 def test_wrong_arguments(rays):

@@ -12,7 +12,7 @@ uniform_edges = compiled(jaxnerf.uniform_edges, "num_segments", "in_disparity")
 samples_from_edges = compiled(jaxnerf.samples_from_edges)
 samples_from_points = compiled(jaxnerf.samples_from_points)
 inverse_cdf = compiled(jaxnerf.inverse_cdf)
-importance_points = compiled(jaxnerf.importance_points, "num_points", "floor")
+importance_points = compiled(jaxnerf.importance_points, "num_points", "padding")
 merge_edges = compiled(jaxnerf.merge_edges)
 
 
@@ -54,7 +54,7 @@ def test_uniform_edges_reach_infinity_in_disparity():
 
 
 @pytest.mark.parametrize("in_disparity", [False, True])
-def test_uniform_edges_of_nothing(in_disparity):
+def test_uniform_edges_of_an_empty_ray(in_disparity):
     same = f32([0.1, 3.3])
     got = uniform_edges(same, same, num_segments=3, in_disparity=in_disparity)
     np.testing.assert_array_equal(got, np.repeat(same[:, None], 4, axis=1))
@@ -69,7 +69,7 @@ def test_midpoints_without_a_key(edges):
 
 @pytest.mark.parametrize("width", [1e-2, 1.0])
 def test_exactly_one_sample_in_each_segment(width):
-    """At t = 1000 a segment of width 1e-2 / 8 holds 20 floats, so that a careless draw rounds out of it."""
+    """At t = 1000 a segment of width 1e-2 / 8 holds 20 floats, so that a plain draw may be rounded out of it."""
     bins = f32(1000 + width * np.broadcast_to(np.linspace(0, 1, 9), (4000, 9)))
     t = samples_from_edges(jax.random.key(5), bins).t
     assert (t >= bins[:, :-1]).all() and (t < bins[:, 1:]).all()
@@ -90,7 +90,7 @@ def test_a_ray_with_its_own_key_does_not_depend_on_its_batch(edges, weights, key
     np.testing.assert_array_equal(part, points[2:4])
 
 
-def test_one_key_draws_anew_for_every_ray(edges, weights):
+def test_one_key_draws_different_numbers_for_every_ray(edges, weights):
     same = np.broadcast_to(edges[0], edges.shape)
     t = samples_from_edges(jax.random.key(7), same).t
     assert len(np.unique(t[:, 0])) == RAYS
@@ -136,15 +136,15 @@ def test_inverse_cdf_gradients_are_finite(edges, weights, scale):
 
 
 @pytest.mark.parametrize("random", [False, True])
-def test_importance_points_take_equal_shares_in_order_without_gradient(edges, weights, keys, random):
+def test_importance_points_split_the_weight_evenly_in_order_without_gradient(edges, weights, keys, random):
     key = keys if random else None
     points = importance_points(key, edges, weights, num_points=POINTS)
     assert (np.diff(points, axis=-1) >= 0).all()
     assert (points >= edges[:, :1]).all() and (points <= edges[:, -1:]).all()
     for row in range(RAYS):
         sums = np.append(0, np.cumsum(np.asarray(weights[row], np.float64)))
-        share = POINTS * np.interp(points[row], edges[row], sums / sums[-1]) - np.arange(POINTS)
-        assert (share > -1e-5).all() and (share < 1 + 1e-5).all()
+        fraction = POINTS * np.interp(points[row], edges[row], sums / sums[-1]) - np.arange(POINTS)
+        assert (fraction > -1e-5).all() and (fraction < 1 + 1e-5).all()
 
     def total(edges, weights):
         return jaxnerf.importance_points(key, edges, weights, num_points=POINTS).sum()
@@ -166,7 +166,7 @@ def test_one_importance_point_is_the_median():
     np.testing.assert_allclose(got, [4 / 3], rtol=1e-6)
 
 
-def test_floor_is_added_to_every_weight(edges, weights):
+def test_padding_is_added_to_every_weight(edges, weights):
     got = importance_points(None, edges, weights, num_points=POINTS, padding=0.5)
     np.testing.assert_allclose(got, importance_points(None, edges, weights + 0.5, num_points=POINTS), rtol=1e-6)
 
@@ -208,7 +208,7 @@ def test_wrong_arguments():
 
 
 @pytest.mark.parametrize("u", [0.0, 0.25, 0.5, 1.0])
-def test_the_slope_of_inverse_cdf_is_whole_at_ties(u):
+def test_the_gradient_of_inverse_cdf_is_not_halved_at_ties(u):
     slope = jax.grad(lambda u: jaxnerf.inverse_cdf(np.arange(5.0), np.ones(4), u[None])[0])(f32(u))
     assert slope == 4
 
@@ -225,7 +225,7 @@ def test_weights_of_half_precision_are_raised_first():
 
 @pytest.mark.parametrize("near, far, count", [(2, 6, 100), (2, 6, 192), (0, 1, 100), (1000, 1000.5, 192)])
 def test_draws_lie_in_the_exact_bins(near, far, count):
-    """Edges are rounded; a draw that meets one would count in the bin before."""
+    """Edges are rounded; a draw equal to one would count for the bin before."""
     edges = uniform_edges(f32(near), f32(far), num_segments=count)
     t = samples_from_edges(jax.random.key(11), np.broadcast_to(edges, (20_000, count + 1))).t
     bins = (np.asarray(t, np.float64) - near) / (far - near) * count

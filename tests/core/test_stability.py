@@ -1,4 +1,4 @@
-"""The hard cases, each within its bar; and that the table can fail."""
+"""The hard cases, each within its bound; and known-bad variants, which must fail."""
 
 import collections
 import functools
@@ -57,8 +57,8 @@ def test_the_closed_formulas_are_the_finite_differences_of_the_exact_values(name
                 sides.append(exact.render(moved))
             for output in compositing.OUTPUTS:
                 slope = (sides[0][output] - sides[1][output]) / (2 * step)
-                wanted = formulas[output][argument][0].flat[entry]
-                np.testing.assert_allclose(np.float64(wanted), np.float64(slope), rtol=1e-7, atol=1e-10)
+                expected = formulas[output][argument][0].flat[entry]
+                np.testing.assert_allclose(np.float64(expected), np.float64(slope), rtol=1e-7, atol=1e-10)
 
 
 def test_nan_and_infinity_fail_a_check():
@@ -69,7 +69,7 @@ def test_nan_and_infinity_fail_a_check():
 
 @pytest.mark.parametrize("name", ["half empty, far 6", "opacity 4e-12", "fog of one colour, depth 20"])
 def test_float64_stays_float64(name):
-    """With float64 rays and answers the digits are those of float64."""
+    """With float64 rays and scene outputs, results have float64 accuracy."""
     given = {key: value.astype(np.float64) for key, value in RAYS[name].items()}
     with jax.enable_x64(True):
         ray = Rays(
@@ -96,20 +96,20 @@ def test_float64_stays_float64(name):
     np.testing.assert_allclose(got.weights[0], np.float64(want["weights"]), rtol=1e-13)
     for field in ("opacity", "depth", "disparity"):
         np.testing.assert_allclose(getattr(got, field)[0], np.float64(want[field]), rtol=1e-13)
-    wanted = np.float64(sum(slopes[c]["density"][0] for c in compositing.COLOURS))
-    assert np.abs(np.asarray(slope)[0] - wanted).max() <= 1e-12 * np.abs(wanted).max()
+    expected = np.float64(sum(slopes[c]["density"][0] for c in compositing.COLOURS))
+    assert np.abs(np.asarray(slope)[0] - expected).max() <= 1e-12 * np.abs(expected).max()
 
 
-def test_bfloat16_answers_render_as_their_float32_values():
-    """The whole cost of bfloat16 is that of the field: what it returns is composited in float32."""
+def test_bfloat16_outputs_render_as_their_float32_values():
+    """Only the field loses accuracy in bfloat16: its outputs are composited in float32."""
     for name in ("half empty, far 6", "1e-09 an interval, 1000 of them", "density 1000"):
         ray = {key: value[None] for key, value in RAYS[name].items()}
         density, rgb = (jnp.asarray(ray[key], jnp.bfloat16) for key in ("density", "rgb"))
         rays = Rays(**{key: ray[key] for key in ("origins", "directions", "viewdirs", "near", "far")})
         samples = Samples(t=ray["t"], delta=ray["delta"])
         low, full = (
-            jax.jit(lambda density, rgb: render_samples(lambda x, v: (density, rgb), rays, samples))(*answers)  # noqa: B023
-            for answers in ((density, rgb), (density.astype(jnp.float32), rgb.astype(jnp.float32)))
+            jax.jit(lambda density, rgb: render_samples(lambda x, v: (density, rgb), rays, samples))(*outputs)  # noqa: B023
+            for outputs in ((density, rgb), (density.astype(jnp.float32), rgb.astype(jnp.float32)))
         )
         for got, want in zip(jax.tree.leaves(low), jax.tree.leaves(full), strict=True):
             assert got.dtype == want.dtype

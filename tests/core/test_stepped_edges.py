@@ -1,4 +1,4 @@
-"""Edges in equal steps: as many as a ray is long, and together exactly the ray."""
+"""Edges in equal steps: their number grows with the length of the ray, and they cover the ray exactly."""
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ samples_from_edges = compiled(jaxnerf.samples_from_edges)
 
 @pytest.fixture(scope="module")
 def ends():
-    """Returns near and far [RAYS]; no way is longer than the segments reach, some are nothing."""
+    """Returns near and far [RAYS]; the segments reach far on every ray, and some rays are empty."""
     rng = np.random.default_rng(0)
     near = np.float32(rng.uniform(0, 3, RAYS))
     way = rng.uniform(0, (SEGMENTS - 1) * STEP, RAYS) * (rng.uniform(size=RAYS) < 0.9)
@@ -27,9 +27,9 @@ def keys():
     return jax.random.split(jax.random.key(1), RAYS)
 
 
-@pytest.fixture(params=["no key", "one key", "a key a ray"])
+@pytest.fixture(params=["no key", "one key", "a key per ray"])
 def edges(request, ends, keys):
-    key = {"no key": None, "one key": jax.random.key(2), "a key a ray": keys}[request.param]
+    key = {"no key": None, "one key": jax.random.key(2), "a key per ray": keys}[request.param]
     return stepped_edges(key, *ends, step_size=STEP, num_segments=SEGMENTS)
 
 
@@ -51,7 +51,7 @@ def test_all_but_the_ends_are_one_step_long(ends, edges):
         np.testing.assert_allclose(length[taken[1:-1]], STEP, atol=2e-6)
 
 
-def test_samples_stand_for_the_whole_way(ends, edges):
+def test_samples_cover_the_whole_ray(ends, edges):
     near, far = ends
     samples = samples_from_edges(None, edges)
     np.testing.assert_allclose(np.float64(samples.delta).sum(-1), np.float64(far) - near, atol=1e-5)
@@ -79,19 +79,21 @@ def test_a_ray_with_its_own_key_does_not_depend_on_its_batch(ends, keys):
     np.testing.assert_array_equal(part, whole[2:4])
 
 
-def test_a_step_a_ray():
+def test_each_ray_can_have_its_step_size():
     near, far = np.float32([1, 1]), np.float32([2, 2])
-    got = stepped_edges(None, near, far, step=np.float32([0.25, 0.5]), num_segments=4)
+    got = stepped_edges(None, near, far, step_size=np.float32([0.25, 0.5]), num_segments=4)
     np.testing.assert_array_equal(got, [[1, 1.25, 1.5, 1.75, 2], [1, 1.5, 2, 2, 2]])
 
 
 def test_where_steps_do_not_reach_far_the_last_is_longer():
-    got = stepped_edges(None, np.float32(1), np.float32(9), step=1.0, num_segments=3)
+    got = stepped_edges(None, np.float32(1), np.float32(9), step_size=1.0, num_segments=3)
     np.testing.assert_array_equal(got, [1, 2, 3, 9])
-    np.testing.assert_array_equal(stepped_edges(None, np.float32(1), np.float32(9), step=1.0, num_segments=1), [1, 9])
+    np.testing.assert_array_equal(
+        stepped_edges(None, np.float32(1), np.float32(9), step_size=1.0, num_segments=1), [1, 9]
+    )
 
 
-def test_nothing_between_near_and_far_is_no_segment(keys):
+def test_an_empty_ray_has_no_segment(keys):
     same = np.float32(np.linspace(0, 9, RAYS))
     for key in (None, keys):
         got = stepped_edges(key, same, same, step_size=STEP, num_segments=SEGMENTS)
@@ -105,11 +107,11 @@ def test_batch_is_vmap_is_jit(ends, keys):
     assert_batch_is_vmap_is_jit(moved, keys, *ends)
 
 
-def test_slopes_are_those_of_near_and_far():
+def test_gradients_are_those_of_near_and_far():
     """Each edge follows near, up to where it is far."""
 
     def total(near, far):
-        return jaxnerf.stepped_edges(None, near, far, step=1.0, num_segments=4).sum()
+        return jaxnerf.stepped_edges(None, near, far, step_size=1.0, num_segments=4).sum()
 
     near, far = (np.float32([value]) for value in (0.5, 2.9))  # 0.5 1.5 2.5 2.9 2.9
     np.testing.assert_array_equal(jax.jit(jax.grad(total, (0, 1)))(near, far), [[3], [2]])
@@ -118,10 +120,10 @@ def test_slopes_are_those_of_near_and_far():
 def test_wrong_arguments(keys):
     ones = np.ones
     for message, call in {
-        "far": lambda: jaxnerf.stepped_edges(None, ones(2), ones(3), step=1.0, num_segments=2),
-        "num_segments is 0": lambda: jaxnerf.stepped_edges(None, ones(2), ones(2), step=1.0, num_segments=0),
-        "key": lambda: jaxnerf.stepped_edges(keys[:3], ones(2), ones(2), step=1.0, num_segments=2),
-        "broadcast": lambda: jaxnerf.stepped_edges(None, ones(2), ones(2), step=ones(3), num_segments=2),
+        "far": lambda: jaxnerf.stepped_edges(None, ones(2), ones(3), step_size=1.0, num_segments=2),
+        "num_segments is 0": lambda: jaxnerf.stepped_edges(None, ones(2), ones(2), step_size=1.0, num_segments=0),
+        "key": lambda: jaxnerf.stepped_edges(keys[:3], ones(2), ones(2), step_size=1.0, num_segments=2),
+        "broadcast": lambda: jaxnerf.stepped_edges(None, ones(2), ones(2), step_size=ones(3), num_segments=2),
     }.items():
         with pytest.raises(ValueError, match=message):
             call()

@@ -36,14 +36,14 @@ def test_splitting_every_segment_changes_nothing():
     np.testing.assert_allclose(split.reshape(6, 9, 2).sum(axis=-1), whole, atol=1e-6)
 
 
-def test_weights_and_transmittance_share_the_light():
+def test_weights_and_transmittance_sum_to_one():
     density, length = random_segments(1)
     total = weights_from_density(density, length).sum(axis=-1) + transmittance(density, length)
     np.testing.assert_allclose(total, 1, atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [jnp.nan, jnp.inf, 1e30])
-def test_a_segment_without_length_is_not_seen(bad):
+def test_a_segment_of_length_zero_is_ignored(bad):
     length = jnp.array([0.5, 0.0, 0.25])
 
     dirty, clean = jnp.array([1.0, bad, 2.0]), jnp.array([1.0, 0.0, 2.0])
@@ -71,13 +71,15 @@ def test_gradients_are_finite_for_every_density(last):
     densities = jnp.array([[a, b, c] for a in SWEEP for b in SWEEP for c in SWEEP], jnp.float32)
 
     def everything(density, length, values):
-        weights, passing = (
+        weights, transmitted = (
             jaxnerf.weights_from_density(density, length),
             jaxnerf.transmittance(density, length),
         )
-        colour = jaxnerf.composite(weights, values, background=jnp.ones(3), transmittance=passing)
-        depth = jaxnerf.expected_depth(weights, t, passing, far=far)
-        return jnp.append(colour, jnp.stack([weights.sum(), depth, jaxnerf.expected_disparity(weights, t), passing]))
+        colour = jaxnerf.composite(weights, values, background=jnp.ones(3), transmittance=transmitted)
+        depth = jaxnerf.expected_depth(weights, t, transmitted, far=far)
+        return jnp.append(
+            colour, jnp.stack([weights.sum(), depth, jaxnerf.expected_disparity(weights, t), transmitted])
+        )
 
     def value_and_slopes(density):
         arguments = density, jnp.array([0.5, 1e-3, last]), jnp.eye(3)
@@ -111,11 +113,11 @@ def test_an_empty_ray_ends_at_far(far):
     assert all_finite(jax.grad(jaxnerf.expected_disparity, argnums=(0, 1))(none, t))
 
 
-def test_a_wall_is_as_deep_as_it_stands_however_far_the_ray_goes():
+def test_the_depth_of_a_wall_does_not_depend_on_far():
     weights, t = jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 2.0, 4.0])
     assert expected_depth(weights, t, jnp.float32(0.0), far=jnp.float32(jnp.inf)) == 2
     assert expected_disparity(weights, t) == 0.5
-    beyond = jnp.array([1.0, 2.0, jnp.inf])  # the last segment of a ray without an end
+    beyond = jnp.array([1.0, 2.0, jnp.inf])  # the last segment of a ray of infinite length
     assert expected_depth(weights, beyond, jnp.float32(0.0), far=jnp.float32(jnp.inf)) == 2
     assert expected_disparity(weights, beyond) == 0.5
 
@@ -125,9 +127,9 @@ def test_batch_is_vmap_is_jit():
     assert_batch_is_vmap_is_jit(jaxnerf.weights_from_density, density, length)
     assert_batch_is_vmap_is_jit(jaxnerf.transmittance, density, length)
     weights, t, values = weights_from_density(density, length), 1 + length, np.ones((6, 9, 3))
-    passing, far = transmittance(density, length), np.full(6, 3.0, np.float32)
+    transmitted, far = transmittance(density, length), np.full(6, 3.0, np.float32)
     assert_batch_is_vmap_is_jit(lambda w, v: jaxnerf.composite(w, v, background=np.ones(3)), weights, values)
-    assert_batch_is_vmap_is_jit(lambda w, t, p, f: jaxnerf.expected_depth(w, t, p, far=f), weights, t, passing, far)
+    assert_batch_is_vmap_is_jit(lambda w, t, p, f: jaxnerf.expected_depth(w, t, p, far=f), weights, t, transmitted, far)
     assert_batch_is_vmap_is_jit(jaxnerf.expected_disparity, weights, t)
 
 
@@ -150,7 +152,7 @@ def test_wrong_shapes():
         jaxnerf.expected_disparity(np.ones((2, 3)), np.ones((2, 4)))
 
 
-def test_slopes_of_disparity_near_the_camera():
+def test_gradients_of_disparity_near_the_camera():
     """1 / t^2 overflows long before w / t^2 does, which is 0 for an empty sample."""
     slope = compiled(jax.grad(jaxnerf.expected_disparity, argnums=1))
     np.testing.assert_allclose(slope(jnp.array([0.0, 0.1]), jnp.array([1e-20, 1.0])), [0, -0.1], rtol=1e-6)

@@ -1,4 +1,4 @@
-"""The generator of captures: what it writes is what it says, or the readers' tests prove nothing."""
+"""The datasets that tests/captures.py writes are correct independently of the readers."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ def shots():
     return captures.shoot(captures.front(6))
 
 
-def test_a_sky_is_behind_the_scene_and_nowhere_before_it(shots):
+def test_a_sky_is_only_behind_the_scene(shots):
     skies = captures.shoot(captures.front(6), sky=True)
     for shot, sky in zip(shots, skies, strict=True):
         alpha = shot.pixels[..., 3]
@@ -21,8 +21,8 @@ def test_a_sky_is_behind_the_scene_and_nowhere_before_it(shots):
         assert sky.pixels[alpha == 0, :3].std() > 5000  # textured
 
 
-def test_points_lie_where_the_shots_that_see_them_see_them(tmp_path, shots):
-    """COLMAP's text gives the marks back by its own convention: y down, z forward, world to camera."""
+def test_points_project_to_their_observations(tmp_path, shots):
+    """Observations are checked in COLMAP's convention: y down, z forward, world to camera."""
     points = captures.write_colmap(tmp_path, shots)
     assert len(points.xyz) > 40 and points.seen.sum(axis=1).min() > 10
     assert (np.abs(points.xyz) < 1.3).all()

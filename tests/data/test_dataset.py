@@ -1,14 +1,18 @@
-"""Views held out of the training set: none of them is lost, and none is in both."""
+"""Views of a split: selection, held-out views, and `load_dataset` for every format, registered ones included."""
 
 import dataclasses
 
 import jax
 import numpy as np
 import pytest
-from jaxnerf.data.subset import held_out, select_views
 
-from jaxnerf import Camera, Views
-from jaxnerf.data.dataset import load_views
+import captures
+from jaxnerf import Camera, Views, load_dataset
+from jaxnerf.configs import capture
+from jaxnerf.data import dataset
+from jaxnerf.data.dataset import held_out, load_split, select_views
+from jaxnerf.data.readers import transforms
+from jaxnerf.registry import READERS, Reader
 from runs import smoke_config
 
 SIZES = [(2, 3), (1, 4), (3, 3), (2, 2)]
@@ -16,7 +20,7 @@ SIZES = [(2, 3), (1, 4), (3, 3), (2, 2)]
 
 @pytest.fixture
 def views():
-    """Four small views of different sizes, in which every number tells its view."""
+    """Returns four small views of different sizes, whose numbers are all different."""
     counts = [height * width for height, width in SIZES]
     view = np.repeat(np.arange(4), counts)
     return Views(
@@ -39,7 +43,7 @@ def views():
 
 
 @pytest.mark.parametrize("indices", [[2], [3, 0], [1, 2, 3], np.arange(4)])
-def test_a_view_keeps_all_that_is_its_own(views, indices):
+def test_a_selected_view_keeps_its_arrays(views, indices):
     got = select_views(views, indices)
     assert got.names == tuple("abcd"[index] for index in indices)
     assert (got.cameras.lens, got.background) == ("fisheye", (1.0, 0.0, 1.0))
@@ -58,21 +62,21 @@ def test_a_view_keeps_all_that_is_its_own(views, indices):
     assert kinds[0] == kinds[1]
 
 
-def test_all_views_in_order_are_the_views(views):
+def test_selecting_all_views_changes_nothing(views):
     for given in (views, dataclasses.replace(views, mask=None, names=())):
         got = select_views(given, range(4))
         assert jax.tree.structure(got) == jax.tree.structure(given)
         jax.tree.map(np.testing.assert_array_equal, got, given)
 
 
-def test_pixels_are_copied(views):
+def test_selecting_copies_pixels(views):
     got = select_views(views, [0, 1])
     got.pixels[:] = 0
     assert views.pixels[1, 2] > 0
 
 
 @pytest.mark.parametrize("count", [2, 3, 7, 60, 100])
-def test_one_view_in_so_many_is_held_out(count):
+def test_held_out_indices_are_equally_spaced(count):
     for every in range(2, count + 1):
         indices = held_out(count, every)
         assert (np.diff(indices) == every).all() and indices[0] < every and indices[-1] < count
@@ -80,31 +84,119 @@ def test_one_view_in_so_many_is_held_out(count):
         assert indices[0] == 3 or every < 4
 
 
-def test_training_and_held_out_views_are_all_and_none_is_in_both():
+def test_training_and_held_out_views_partition_the_split():
     data = smoke_config().data
-    every = load_views(data, "train")
+    every = load_split(data, "train")
     data.hold_out = 7
-    train, held = load_views(data, "train"), load_views(data, "held_out")
+    train, held = load_split(data, "train"), load_split(data, "held_out")
     assert len(held.offset) == 9 and len(train.offset) == 51
     assert held.names[:2] == ("train_003", "train_010")
     assert set(train.names).isdisjoint(held.names) and {*train.names, *held.names} == set(every.names)
     for part in (train, held):
-        wanted = select_views(every, [every.names.index(name) for name in part.names])
-        jax.tree.map(np.testing.assert_array_equal, part, wanted)
-    assert load_views(data, "test").names[0] == "test_000"  # as it was
+        expected = select_views(every, [every.names.index(name) for name in part.names])
+        jax.tree.map(np.testing.assert_array_equal, part, expected)
+    assert load_split(data, "test").names[0] == "test_000"  # not affected
 
 
 @pytest.mark.parametrize("hold_out", [1, -2, 61])
-def test_what_leaves_no_view_on_one_side_is_named(hold_out):
+def test_a_hold_out_that_leaves_no_view_is_an_error(hold_out):
     data = smoke_config().data
     data.hold_out = hold_out
     for split in ("train", "held_out"):
-        with pytest.raises(ValueError, match=f"data.hold_out is {hold_out} of 60 views, wanted 2 to 60"):
-            load_views(data, split)
+        with pytest.raises(ValueError, match=f"data.hold_out is {hold_out} of 60 views, expected 2 to 60"):
+            load_split(data, split)
 
 
-def test_nothing_is_held_out_unasked():
+def test_nothing_is_held_out_by_default():
     data = smoke_config().data
-    assert len(load_views(data, "train").offset) == 60
+    assert len(load_split(data, "train").offset) == 60
     with pytest.raises(ValueError, match="held_out"):
-        load_views(data, "held_out")
+        load_split(data, "held_out")
+
+
+def test_num_views_are_evenly_spread_over_the_views_that_are_not_held_out():
+    data = smoke_config().data
+    data.hold_out = 7
+    train = load_split(data, "train")
+    data.num_views = 17
+    some = load_split(data, "train")
+    assert some.names == train.names[::3]
+    jax.tree.map(np.testing.assert_array_equal, some, select_views(train, np.arange(17) * 3))
+    assert len(load_split(data, "held_out").offset) == 9
+    data.num_views = 52
+    with pytest.raises(ValueError, match="data.num_views is 52 of 51 views, expected 1 to 51"):
+        load_split(data, "train")
+
+
+def test_num_views_of_files_reads_only_those_views(tmp_path):
+    captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
+    data = capture.get_config().data
+    data.update({"dir": str(tmp_path), "num_views": 3, "hold_out": 3})
+    assert load_split(data, "held_out").names == ("003", "006")
+    train = load_split(data, "train")  # of 001, 002, 004, 005, 007
+    assert train.names == ("001", "002", "005") and len(train.pixels) == 3 * 24 * 32
+
+
+FORMATS = {
+    "blender": (captures.write_blender, captures.orbit),
+    "transforms": (captures.write_transforms, captures.orbit),
+    "colmap": (captures.write_colmap, captures.orbit),
+    "llff": (captures.write_llff, captures.front),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_load_dataset_infers_everything_from_the_folder(tmp_path, name):
+    write, stack = FORMATS[name]
+    shots = captures.shoot(stack(8)) if name in ("colmap", "llff") else captures.noise(stack(8))
+    write(tmp_path, shots)
+    views = load_dataset(tmp_path)
+    data = capture.get_config().data
+    data.update({"dir": str(tmp_path), "factor": 1})
+    resolved, _ = dataset.resolve(data)
+    assert resolved.format == name and resolved.world == dict(blender="file", llff="forward").get(name, "around")
+    assert (len(views.offset), views.size.tolist()[0]) == (8 if name == "blender" else 7, [24, 32])
+    assert (views.pixels.shape[-1] == 4) == (name == "blender") == (views.background is not None)
+    jax.tree.map(np.testing.assert_array_equal, views, load_split(resolved, "train"))
+    if name != "blender":
+        assert load_dataset(str(tmp_path), split="test").names == ("000",)
+    else:
+        np.testing.assert_array_equal([views.near, views.far], [[2] * 8, [6] * 8])
+
+
+def test_load_dataset_takes_the_fields_of_the_data_section(tmp_path):
+    captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)), rgba=True)
+    views = load_dataset(tmp_path, factor=2, background="black", world="file", near=2.5, far=6.5)
+    assert views.size.tolist() == [[12, 16]] * 7 and views.background == (0, 0, 0)
+    np.testing.assert_array_equal(views.to_file, np.eye(4))
+    np.testing.assert_allclose([views.near[0], views.far[0]], [2.5, 6.5])
+    with pytest.raises(ValueError, match="load_dataset: scale is no option, expected one of background, dir"):
+        load_dataset(tmp_path, scale=2)
+    with pytest.raises(ValueError, match="split is 'all'"):
+        load_dataset(tmp_path, split="all")
+    with pytest.raises(ValueError, match="data.dir is .*nowhere': no such folder, searched .*nowhere"):
+        load_dataset(tmp_path / "nowhere")
+
+
+def test_a_registered_format_is_detected_resolved_and_split(tmp_path, monkeypatch):
+    captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
+    (tmp_path / "transforms.json").rename(tmp_path / "renamed.json")
+
+    def read(folder):
+        (folder / "renamed.json").rename(folder / "transforms.json")
+        try:
+            return transforms.read_capture(folder)._replace(format="renamed")
+        finally:
+            (folder / "transforms.json").rename(folder / "renamed.json")
+
+    reader = Reader(read, detect=lambda folder: (folder / "renamed.json").is_file())
+    monkeypatch.setattr(READERS, "_parts", dict(READERS._parts))
+    READERS.add("renamed", reader)
+    data = capture.get_config().data
+    data.update({"dir": str(tmp_path), "hold_out": 3})
+    resolved, lines = dataset.resolve(data)
+    assert resolved.format == "renamed" and resolved.fingerprint.startswith("8 images, ")
+    assert "format        renamed" in lines
+    splits = {split: load_split(resolved, split).names for split in ("train", "held_out", "test")}
+    assert splits == {"train": ("001", "002", "004", "005", "007"), "held_out": ("003", "006"), "test": ("000",)}
+    assert load_dataset(tmp_path, split="test").names == ("000",)

@@ -1,7 +1,7 @@
-"""Captures from the folder to the rays: each feature, as written, shows the scene it was made of.
+"""Datasets from the folder to the rays: the scene, rendered along the rays of the Views, has the pixels' colours.
 
-The scene is known in closed form, so a ray of the Views, taken back to the file's world, has to see the
-colour of its pixel: formats, conventions, lenses, sizes, masks and worlds are all in that.
+The scene is a closed form in the file's world, so this checks formats, conventions, lenses, sizes, masks and worlds
+at once.
 """
 
 import functools
@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 
 import captures
-from configs import capture, default
 from jaxnerf import Rays, render_rays
+from jaxnerf.configs import capture, default
 from jaxnerf.data import dataset
-from jaxnerf.data.ray_batches import pixel_colors, unmasked_pixels, view_rays
+from jaxnerf.data.active_pixels import unmasked_pixels
+from jaxnerf.data.ray_batches import pixel_colors, view_rays
 from jaxnerf.fields import still_life
 from jaxnerf.training import workdir
 
-RAYS = 64  # a view
+RAYS = 64  # per view
 
 
 def a_data(folder, **changes):
@@ -38,20 +38,20 @@ def compiled_rays():
 
 
 @jax.jit
-def seen(rays):
+def rendered(rays):
     return render_rays(None, still_life.still_life, rays, num_samples=512, background=jnp.ones(3))
 
 
 def errors(views, *, sky=False):
-    """Returns |colour of the pixel - colour of the scene along its ray| [N, 3] at random live pixels."""
+    """Returns |colour of the pixel - colour of the scene along its ray| [N, 3] at random unmasked pixels."""
     rng, found = np.random.default_rng(0), []
-    live = unmasked_pixels(views)
-    live = np.arange(len(views.pixels)) if live is None else live.all_ids()
+    active = unmasked_pixels(views)
+    active = np.arange(len(views.pixels)) if active is None else active.all_ids()
     back = np.asarray(views.to_file, np.float64)
     unit = np.cbrt(np.linalg.det(back[:3, :3]))
     for index, (height, width) in enumerate(views.size):
         first = views.offset[index]
-        own = live[(live >= first) & (live < first + height * width)]
+        own = active[(active >= first) & (active < first + height * width)]
         ids = rng.choice(own, RAYS)
         place = ids - first
         pixels = np.stack([place % width, place // width], axis=-1) + 0.5
@@ -59,7 +59,7 @@ def errors(views, *, sky=False):
         kept = np.asarray(rays.far > rays.near)
         origins = np.asarray(rays.origins) @ back[:3, :3].T + back[:3, 3]
         viewdirs = np.asarray(rays.viewdirs) @ (back[:3, :3] / unit).T
-        # The scene lies within 1.4 of the origin, and cameras stand 4 from it.
+        # The scene is within 1.4 of the origin, the cameras are 4 away from it.
         nearest = -(origins * viewdirs).sum(axis=-1)
         world = Rays(
             origins=jnp.float32(origins),
@@ -68,7 +68,7 @@ def errors(views, *, sky=False):
             near=jnp.float32(nearest - 1.7),
             far=jnp.float32(nearest + 1.7),
         )
-        image = jax.tree.map(np.asarray, seen(world))
+        image = jax.tree.map(np.asarray, rendered(world))
         behind = captures.sky_colour(origins, viewdirs) if sky else np.ones(3)
         colour = image.rgb + (1 - image.opacity)[:, None] * (behind - 1)
         truth = np.asarray(pixel_colors(jnp.asarray(views.pixels[ids]), views.background))
@@ -77,7 +77,7 @@ def errors(views, *, sky=False):
 
 
 def assert_shows_the_scene(views, tolerance=0.012, **options):
-    """A hundredth in all but a few pixels on edges: bits, JPEG and the sums along rays differ by less."""
+    """Checks that errors are below 0.01 except on edges; quantisation and quadrature errors are smaller."""
     off = errors(views, **options)
     assert np.quantile(off, 0.97) < tolerance and np.mean(off) < tolerance / 3
 
@@ -96,62 +96,61 @@ FEATURES = {
 
 
 @pytest.mark.parametrize("name", FEATURES)
-def test_a_feature_of_transforms(tmp_path, name):
+def test_transforms(tmp_path, name):
     cameras, images, tolerance = FEATURES[name]
     shots = captures.shoot(captures.orbit(8, **cameras))
     captures.write_transforms(tmp_path, shots, **images)
-    data, lines = dataset.settle(a_data(tmp_path))
+    data, lines = dataset.resolve(a_data(tmp_path))
     assert data.format == "transforms" and data.world == "around" and data.ndc is False
-    assert any(line.startswith("format      transforms") for line in lines)
-    views = dataset.load_views(data, "train")
+    assert any(line.startswith("format        transforms") for line in lines)
+    views = dataset.load_split(data, "train")
     assert len(views.offset) == 7 and views.names[0] == "001"
     assert (views.mask is not None) == (name == "masks")
     assert views.pixels.dtype == (np.uint16 if name == "16 bit" else np.uint8)
     assert_shows_the_scene(views, tolerance)
-    assert_shows_the_scene(dataset.load_views(data, "test"), tolerance)
+    assert_shows_the_scene(dataset.load_split(data, "test"), tolerance)
 
 
-def test_what_a_mask_hides_would_be_seen(tmp_path):
-    """The check itself: without its mask the same capture fails it."""
+def test_without_its_masks_the_dataset_fails_the_check(tmp_path):
     captures.write_transforms(tmp_path, captures.shoot(captures.orbit(8)), masks=True)
     content = json.loads((tmp_path / "transforms.json").read_text())
     for frame in content["frames"]:
         del frame["mask_path"]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    assert np.quantile(errors(dataset.load_views(a_data(tmp_path), "train")), 0.97) > 0.1
+    assert np.quantile(errors(dataset.load_split(a_data(tmp_path), "train")), 0.97) > 0.1
 
 
 def test_cameras_and_sizes_may_differ(tmp_path):
     stacks = captures.orbit(4), captures.orbit(4, height=30, width=20, first=4, lens="opencv")
     captures.write_transforms(tmp_path, captures.shoot(*stacks))
-    views = dataset.load_views(a_data(tmp_path), "train")
+    views = dataset.load_split(a_data(tmp_path), "train")
     assert {tuple(size) for size in views.size.tolist()} == {(24, 32), (30, 20)}
     assert views.cameras.height is None
     assert_shows_the_scene(views)
 
 
-def test_alpha_over_a_background(tmp_path):
+def test_alpha_is_composited_over_the_background(tmp_path):
     captures.write_transforms(tmp_path, captures.shoot(captures.orbit(8)), rgba=True)
-    views = dataset.load_views(a_data(tmp_path, background="white"), "train")
+    views = dataset.load_split(a_data(tmp_path, background="white"), "train")
     assert views.pixels.shape[-1] == 4
     assert_shows_the_scene(views)
 
 
-def test_the_files_own_splits_count(tmp_path):
+def test_splits_of_the_file_are_used(tmp_path):
     splits = {"train": [0, 1, 2, 3], "val": [4], "test": [5, 6, 7]}
     captures.write_transforms(tmp_path, captures.shoot(captures.orbit(8)), splits=splits)
-    data, _ = dataset.settle(a_data(tmp_path))
+    data, _ = dataset.resolve(a_data(tmp_path))
     for split, indices in splits.items():
-        assert dataset.load_views(data, split).names == tuple(f"{index:03d}" for index in indices)
+        assert dataset.load_split(data, split).names == tuple(f"{index:03d}" for index in indices)
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "opencv", "fisheye"])
 def test_colmap(tmp_path, lens):
     shots = captures.shoot(captures.orbit(8, lens=lens))
     points = captures.write_colmap(tmp_path, shots)
-    data, _ = dataset.settle(a_data(tmp_path))
+    data, _ = dataset.resolve(a_data(tmp_path))
     assert data.format == "colmap" and data.world == "around"
-    views = dataset.load_views(data, "train")
+    views = dataset.load_split(data, "train")
     assert_shows_the_scene(views)
     scale = np.cbrt(np.linalg.det(np.asarray(views.to_file, np.float64)[:3, :3]))
     for near, far, row, seen in zip(views.near, views.far, points.depth[1:], points.seen[1:], strict=True):
@@ -159,23 +158,23 @@ def test_colmap(tmp_path, lens):
         assert near * scale > 1.5 and far * scale < 9
 
 
-def test_colmap_goes_before_llff_and_format_overrides(tmp_path):
+def test_colmap_precedes_llff_and_format_overrides(tmp_path):
     shots = captures.shoot(captures.front(8))
     points = captures.write_colmap(tmp_path, shots)
     captures.write_llff(tmp_path, shots, points=points)
-    data, lines = dataset.settle(a_data(tmp_path))
+    data, lines = dataset.resolve(a_data(tmp_path))
     assert data.format == "colmap" and "colmap, llff" in lines[0]
-    data, lines = dataset.settle(a_data(tmp_path, format="llff"))
+    data, lines = dataset.resolve(a_data(tmp_path, format="llff"))
     assert data.format == "llff" and not any(line.startswith("format") for line in lines)
 
 
 @pytest.mark.parametrize("write", [captures.write_llff, captures.write_colmap])
-def test_captures_that_look_forward(tmp_path, write):
+def test_forward_facing_datasets(tmp_path, write):
     shots = captures.shoot(captures.front(9))
     write(tmp_path, shots)
-    data, _ = dataset.settle(a_data(tmp_path))
+    data, _ = dataset.resolve(a_data(tmp_path))
     assert data.world == "forward" and data.ndc is True
-    views = dataset.load_views(data, "train")
+    views = dataset.load_split(data, "train")
     assert_shows_the_scene(views)
     assert np.abs(views.cameras.to_world[:, :, :3] - np.eye(3)).max() < 0.3
     assert 1 / 0.75 - 1e-3 < views.near.min() < 2
@@ -183,16 +182,16 @@ def test_captures_that_look_forward(tmp_path, write):
 
 def test_llff_all_around(tmp_path):
     captures.write_llff(tmp_path, captures.shoot(captures.orbit(8)))
-    data, _ = dataset.settle(a_data(tmp_path))
+    data, _ = dataset.resolve(a_data(tmp_path))
     assert data.format == "llff" and data.world == "around" and data.ndc is False
-    assert_shows_the_scene(dataset.load_views(data, "train"))
+    assert_shows_the_scene(dataset.load_split(data, "train"))
 
 
 @pytest.mark.parametrize("world", ["file", "around", "forward"])
-def test_every_world_shows_the_same(tmp_path, world):
+def test_every_world_shows_the_same_scene(tmp_path, world):
     shots = captures.shoot(captures.front(8))
     captures.write_colmap(tmp_path, shots)
-    views = dataset.load_views(a_data(tmp_path, world=world, ndc=False), "train")
+    views = dataset.load_split(a_data(tmp_path, world=world, ndc=False), "train")
     assert_shows_the_scene(views)
     if world == "file":
         np.testing.assert_array_equal(views.to_file, np.eye(4))
@@ -203,37 +202,44 @@ def test_every_world_shows_the_same(tmp_path, world):
         assert 0.5 < np.median(np.linalg.norm(eyes, axis=-1)) < 1.5
 
 
-def test_an_unbounded_capture_and_a_declared_box(tmp_path):
+def test_an_unbounded_dataset_with_a_declared_box(tmp_path):
     shots = captures.shoot(captures.orbit(8), sky=True)
     captures.write_transforms(tmp_path, shots, extra={"aabb_scale": 4})
-    views = dataset.load_views(a_data(tmp_path), "train")
+    views = dataset.load_split(a_data(tmp_path), "train")
     assert_shows_the_scene(views, sky=True)
     scale = np.cbrt(np.linalg.det(np.asarray(views.to_file, np.float64)[:3, :3]))
-    # The cube of side 4 / 0.33 around the file's origin; a turn of the world can only make it larger.
+    # The cube has side 4 / 0.33 around the file's origin; its bounding box in a rotated world is larger.
     sides = (views.box[1] - views.box[0]) * scale
     assert (sides > 4 / 0.33 - 1e-3).all() and (sides < 4 / 0.33 * 1.8).all()
 
 
-def test_a_factor_and_a_width(tmp_path):
+def test_the_factor_is_inferred_from_the_width(tmp_path):
     captures.write_transforms(tmp_path, captures.shoot(captures.orbit(8)))
-    data, lines = dataset.settle(a_data(tmp_path, factor=0, width=15))
-    assert data.factor == 2 and any(line.startswith("factor      2") for line in lines)
-    assert dataset.load_views(data, "train").size.tolist() == [[12, 16]] * 7
+    data, lines = dataset.resolve(a_data(tmp_path, factor="auto", width=15))
+    assert data.factor == 2 and any(line.startswith("factor        2") for line in lines)
+    assert dataset.load_split(data, "train").size.tolist() == [[12, 16]] * 7
 
 
-def test_what_is_settled_stays(tmp_path):
+def test_resolving_again_changes_nothing(tmp_path):
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    data, _ = dataset.settle(a_data(tmp_path))
-    again, lines = dataset.settle(data)
-    assert again.to_dict() == data.to_dict() and not lines and not dataset.is_open(again)
-    synthetic = default.get_config().data
-    assert dataset.settle(synthetic)[0].to_dict() == synthetic.to_dict()
+    data, _ = dataset.resolve(a_data(tmp_path))
+    again, lines = dataset.resolve(data)
+    assert again.to_dict() == data.to_dict() and not lines and "auto" not in again.to_dict().values()
+    synthetic, lines = dataset.resolve(default.get_config().data)
+    assert not lines and "auto" not in synthetic.to_dict().values()
 
 
-def test_a_capture_that_changed_since_training_is_refused(tmp_path):
+def test_a_missing_folder_is_an_error_or_leaves_auto():
+    data = a_data("nowhere")
+    with pytest.raises(ValueError, match="data.dir is 'nowhere': no such folder"):
+        dataset.resolve(data)
+    assert dataset.resolve(data, missing_ok=True)[0].to_dict() == data.to_dict()
+
+
+def test_a_dataset_that_changed_since_training_is_an_error(tmp_path):
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    data, _ = dataset.settle(a_data(tmp_path))
-    assert data.capture.startswith("8 photographs, ") and len(dataset.load_views(data, "train").offset) == 7
+    data, _ = dataset.resolve(a_data(tmp_path))
+    assert data.fingerprint.startswith("8 images, ") and len(dataset.load_split(data, "train").offset) == 7
     file = tmp_path / "transforms.json"
     whole = json.loads(file.read_text())
     moved = json.loads(file.read_text())
@@ -241,13 +247,11 @@ def test_a_capture_that_changed_since_training_is_refused(tmp_path):
     for content, found in (({**whole, "frames": whole["frames"][1:]}, "7"), (moved, "8")):
         file.write_text(json.dumps(content))
         for split in ("train", "test"):
-            with pytest.raises(ValueError, match=f"holds {found} photographs, .* training saw 8 photographs"):
-                dataset.load_views(data, split)
+            with pytest.raises(ValueError, match=f"holds {found} images, .* expected 8 images"):
+                dataset.load_split(data, split)
         workdir.claim(tmp_path / "run", to_config(data))
-        with pytest.raises(ValueError, match="another configuration .*data.capture '8 photographs"):
-            workdir.claim(tmp_path / "run", to_config(dataset.settle(a_data(tmp_path))[0]))
-    del data["capture"]  # of a run from before there was this
-    assert len(dataset.load_views(data, "train").offset) == 7
+        with pytest.raises(ValueError, match="data.fingerprint '8 images"):
+            workdir.claim(tmp_path / "run", to_config(dataset.resolve(a_data(tmp_path))[0]))
 
 
 def to_config(data):
@@ -256,42 +260,42 @@ def to_config(data):
     return config
 
 
-def test_ndc_wants_cameras_that_look_one_way(tmp_path):
+def test_ndc_require_cameras_that_look_in_one_direction(tmp_path):
     captures.write_llff(tmp_path, captures.shoot(captures.orbit(8)))
-    with pytest.raises(ValueError, match="the cameras look all ways"):
-        dataset.load_views(a_data(tmp_path, ndc=True), "train")
-    with pytest.raises(ValueError, match="data.ndc is on in the world 'around'"):
-        dataset.load_views(a_data(tmp_path, ndc=True, world="around"), "train")
+    with pytest.raises(ValueError, match="the cameras look in all directions"):
+        dataset.load_split(a_data(tmp_path, ndc=True), "train")
+    with pytest.raises(ValueError, match="data.ndc is True in the world 'around'"):
+        dataset.load_split(a_data(tmp_path, ndc=True, world="around"), "train")
 
 
-def test_the_background_follows_from_alpha(tmp_path):
-    for name, rgba, wanted in (("a", True, "white"), ("b", False, "none")):
+def test_the_background_is_inferred_from_alpha(tmp_path):
+    for name, rgba, expected in (("a", True, "white"), ("b", False, "none")):
         captures.write_transforms(tmp_path / name, captures.noise(captures.orbit(8)), rgba=rgba)
-        data, lines = dataset.settle(a_data(tmp_path / name))
-        assert data.background == wanted and f"background  {wanted}" in lines
-        assert (dataset.load_views(data, "train").background is None) == (not rgba)
+        data, lines = dataset.resolve(a_data(tmp_path / name))
+        assert data.background == expected and f"background    {expected}" in lines
+        assert (dataset.load_split(data, "train").background is None) == (not rgba)
 
 
-def test_near_and_far_may_be_given_in_the_files_units(tmp_path):
+def test_near_and_far_are_in_the_files_units(tmp_path):
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    views = dataset.load_views(a_data(tmp_path, near=2.5, far=5.5), "train")
+    views = dataset.load_split(a_data(tmp_path, near=2.5, far=5.5), "train")
     scale = np.cbrt(np.linalg.det(np.asarray(views.to_file, np.float64)[:3, :3]))
     np.testing.assert_allclose(views.near * scale, 2.5, rtol=1e-5)
     np.testing.assert_allclose(views.far * scale, 5.5, rtol=1e-5)
-    with pytest.raises(ValueError, match="near 7 and far 5, wanted near < far"):
-        dataset.load_views(a_data(tmp_path, near=7.0, far=5.0), "train")
+    with pytest.raises(ValueError, match="near 7 and far 5, expected near < far"):
+        dataset.load_split(a_data(tmp_path, near=7.0, far=5.0), "train")
 
 
-def test_what_is_wrong_is_said(tmp_path):
-    with pytest.raises(ValueError, match="holds no capture, wanted transforms_train.json"):
-        dataset.settle(a_data(tmp_path))
+def test_errors_of_the_data_section(tmp_path):
+    with pytest.raises(ValueError, match="holds no dataset, expected transforms_train.json"):
+        dataset.resolve(a_data(tmp_path))
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    with pytest.raises(ValueError, match="data.format is 'dslr'"):
-        dataset.load_views(a_data(tmp_path, format="dslr"), "train")
+    with pytest.raises(ValueError, match="there is no dataset format 'dslr'"):
+        dataset.load_split(a_data(tmp_path, format="dslr"), "train")
     with pytest.raises(ValueError, match="data.world is 'flat'"):
-        dataset.load_views(a_data(tmp_path, world="flat"), "train")
+        dataset.load_split(a_data(tmp_path, world="flat"), "train")
     with pytest.raises(ValueError, match="split is 'all'"):
-        dataset.load_views(a_data(tmp_path), "all")
+        dataset.load_split(a_data(tmp_path), "all")
 
 
 @pytest.mark.scenes("fern", "fox", "can", "lego")
@@ -304,17 +308,9 @@ def test_what_is_wrong_is_said(tmp_path):
         ("lego", "blender", "file", False),
     ],
 )
-def test_the_real_ones(scenes_dir, name, format, world, ndc):
-    data, lines = dataset.settle(a_data(scenes_dir / name, factor=0, width=200))
+def test_the_real_datasets(scenes_dir, name, format, world, ndc):
+    data, lines = dataset.resolve(a_data(scenes_dir / name, factor="auto", width=200))
     assert (data.format, data.world, data.ndc) == (format, world, ndc)
     assert data.factor == {"fern": 20, "fox": 5, "can": 4, "lego": 4}[name]
-    missing = [line for line in lines if "left out" in line]
-    assert len(missing) == (1 if name == "fox" else 0)
-
-
-def test_runs_from_before_there_was_a_choice_keep_the_captures_bounds(tmp_path):
-    captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    data = a_data(tmp_path, near=2.5, far=5.5)
-    old = ConfigDict({key: value for key, value in data.to_dict().items() if key != "width"})
-    views = dataset.load_views(old, "train")
-    np.testing.assert_array_equal(views.near, dataset.load_views(a_data(tmp_path), "train").near)
+    skipped = [line for line in lines if line.startswith("skipped")]
+    assert len(skipped) == (1 if name == "fox" else 0)

@@ -1,4 +1,4 @@
-"""Drawn rays show the pixels they say, evenly, however a batch is split."""
+"""Drawn rays have the colours of their pixels, uniformly over pixels, and do not depend on how a batch is split."""
 
 import functools
 
@@ -10,6 +10,7 @@ import pytest
 from helpers import assert_same
 from jaxnerf import Camera, Views
 from jaxnerf.data import ray_batches
+from jaxnerf.data.active_pixels import unmasked_pixels
 
 SIZES = np.int32([[3, 4], [5, 2], [4, 4]])  # height, width
 OFFSET = np.int32([0, 12, 22])
@@ -18,7 +19,7 @@ WHITE = (1.0, 0.5, 0.25)
 
 
 def views(channels=4, mask=None, background=WHITE):
-    """Three views of random pixels from three places, all looking along -z."""
+    """Returns three views of random pixels from three positions, all looking along -z."""
     rng = np.random.default_rng(0)
     pose = np.tile(np.eye(3, 4, dtype=np.float32), (3, 1, 1))
     pose[:, 0, 3] = [0, 1, 2]
@@ -36,8 +37,8 @@ def views(channels=4, mask=None, background=WHITE):
 
 
 @functools.partial(jax.jit, static_argnames=("batching", "pixel_offset"))
-def draw(step, positions, views, live=None, *, batching="all_images", pixel_offset=0.5):
-    return ray_batches.draw_batch(7, step, positions, views, live, batching=batching, pixel_offset=pixel_offset)
+def draw(step, positions, views, active=None, *, batching="all_images", pixel_offset=0.5):
+    return ray_batches.draw_batch(7, step, positions, views, active, batching=batching, pixel_offset=pixel_offset)
 
 
 def pixel_ids(rays, pixel_offset=0.5):
@@ -54,7 +55,7 @@ def pixel_ids(rays, pixel_offset=0.5):
 
 @pytest.mark.parametrize("batching", ray_batches.BATCHINGS)
 @pytest.mark.parametrize("pixel_offset", [0.0, 0.5])
-def test_colours_are_those_of_the_pixels_under_the_rays(batching, pixel_offset):
+def test_colours_are_those_of_the_rays_pixels(batching, pixel_offset):
     scene = views()
     _, batch = draw(3, jnp.arange(64), scene, batching=batching, pixel_offset=pixel_offset)
     view, index = pixel_ids(batch.rays, pixel_offset)
@@ -75,7 +76,7 @@ def test_a_batch_does_not_depend_on_how_it_is_split(batching):
         assert_same(part_batch, jax.tree.map(lambda leaf, part=part: leaf[part], batch))
 
 
-def test_keys_and_rays_differ_from_ray_to_ray_and_step_to_step():
+def test_keys_and_rays_differ_between_rays_and_steps():
     scene = views()
     (keys, first), (later, second) = draw(0, jnp.arange(50), scene), draw(1, jnp.arange(50), scene)
     data = np.concatenate([jax.random.key_data(keys), jax.random.key_data(later)])
@@ -89,7 +90,7 @@ def test_every_pixel_is_drawn_equally_often():
     assert ((counts - 500) ** 2 / 500).sum() < 80  # chi squared of 37 degrees: 1 in 20,000 exceeds it
 
 
-def test_a_single_image_is_one_a_step_and_each_in_turn():
+def test_single_image_batches_draw_from_one_random_view_per_step():
     seen = []
     for step in range(60):
         view, _ = pixel_ids(draw(step, jnp.arange(8), views(), batching="single_image")[1].rays)
@@ -104,25 +105,25 @@ def test_a_single_image_is_one_a_step_and_each_in_turn():
 
 
 @pytest.mark.parametrize("batching", ray_batches.BATCHINGS)
-def test_masked_pixels_are_not_drawn_and_all_others_are(batching):
+def test_exactly_the_unmasked_pixels_are_drawn(batching):
     mask = np.arange(38) % 3 != 0
     scene = views(mask=mask)
-    live = ray_batches.unmasked_pixels(scene)
-    live_ids = live.all_ids()
-    np.testing.assert_array_equal(live_ids, np.flatnonzero(mask))
-    drawn = [pixel_ids(draw(step, jnp.arange(500), scene, live, batching=batching)[1].rays)[1] for step in range(12)]
-    assert set(np.concatenate(drawn)) == set(live_ids)
+    active = unmasked_pixels(scene)
+    active_ids = active.all_ids()
+    np.testing.assert_array_equal(active_ids, np.flatnonzero(mask))
+    drawn = [pixel_ids(draw(step, jnp.arange(500), scene, active, batching=batching)[1].rays)[1] for step in range(12)]
+    assert set(np.concatenate(drawn)) == set(active_ids)
 
 
-def test_a_view_without_a_live_pixel_is_named():
-    assert ray_batches.unmasked_pixels(views()) is None
+def test_a_view_without_an_unmasked_pixel_is_an_error():
+    assert unmasked_pixels(views()) is None
     mask = np.arange(38) < 22
-    with pytest.raises(ValueError, match="view c: its mask leaves no pixel"):
-        ray_batches.unmasked_pixels(views(mask=mask))
+    with pytest.raises(ValueError, match="view c: its mask excludes all pixels"):
+        unmasked_pixels(views(mask=mask))
 
 
-def test_an_unknown_batching_is_named():
-    with pytest.raises(ValueError, match="batching is 'all', wanted one of"):
+def test_an_unknown_batching_is_an_error():
+    with pytest.raises(ValueError, match="batching is 'all', expected one of"):
         ray_batches.draw_batch(0, 0, jnp.arange(2), views(), batching="all")
 
 
@@ -130,24 +131,24 @@ def test_an_unknown_batching_is_named():
 def test_alpha_is_composited_over_the_background(dtype):
     top = np.iinfo(dtype).max
     pixels = np.array([[top, 0, 0, top], [top, 0, 0, 0], [0, top, 0, top // 5]], dtype)
-    share = (top // 5) / top
-    over = np.array([[1, 0, 0], WHITE, share * np.array([0, 1, 0]) + (1 - share) * np.array(WHITE)])
+    alpha = (top // 5) / top
+    over = np.array([[1, 0, 0], WHITE, alpha * np.array([0, 1, 0]) + (1 - alpha) * np.array(WHITE)])
     np.testing.assert_allclose(ray_batches.pixel_colors(pixels, WHITE), over, atol=1e-6)
-    np.testing.assert_allclose(ray_batches.pixel_colors(pixels, None), [[1, 0, 0], [0, 0, 0], [0, share, 0]], atol=1e-6)
+    np.testing.assert_allclose(ray_batches.pixel_colors(pixels, None), [[1, 0, 0], [0, 0, 0], [0, alpha, 0]], atol=1e-6)
     np.testing.assert_allclose(ray_batches.pixel_colors(pixels[:, :3], WHITE), pixels[:, :3] / top, atol=1e-6)
 
 
 @pytest.mark.parametrize("ndc", [False, True])
-def test_world_depth_is_the_distance_to_the_point_in_the_files_units(ndc):
+def test_world_depth_is_the_distance_in_the_files_units(ndc):
     scene, pixels = views(), np.float32([[0.5, 1.5], [3.5, 3.5]])
     axis = np.float32([2.0, 8.0])  # along the camera's axis
     t = 1 - 1 / axis if ndc else axis  # Eq. 25 for a camera at the origin looking along -z
     place = np.stack([(pixels[:, 0] - 2) / FOCAL, (2 - pixels[:, 1]) / FOCAL, [-1, -1]], axis=-1)
-    wanted = np.linalg.norm(place * axis[:, None], axis=-1)
-    # The depth in normalised coordinates needs height and width, which views of one size have.
+    expected = np.linalg.norm(place * axis[:, None], axis=-1)
+    # NDC need the cameras' height and width, which views of one size have.
     alike = Views(**{**vars(scene), "cameras": Camera(**{**vars(scene.cameras), "height": 4, "width": 4})})
-    np.testing.assert_allclose(ray_batches.world_depth(alike, 2, pixels, t, ndc=ndc), wanted, rtol=1e-5)
+    np.testing.assert_allclose(ray_batches.world_depth(alike, 2, pixels, t, ndc=ndc), expected, rtol=1e-5)
     turn = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     file = np.block([[0.01 * turn, np.full((3, 1), 7.0)], [np.zeros((1, 3)), 1.0]])
     scaled = Views(**{**vars(alike), "to_file": file})
-    np.testing.assert_allclose(ray_batches.world_depth(scaled, 2, pixels, t, ndc=ndc), 0.01 * wanted, rtol=1e-5)
+    np.testing.assert_allclose(ray_batches.world_depth(scaled, 2, pixels, t, ndc=ndc), 0.01 * expected, rtol=1e-5)

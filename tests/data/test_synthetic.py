@@ -1,4 +1,4 @@
-"""The built-in scene: hard enough to mean something, rendered exactly, cached without risk."""
+"""The embedded dataset: its difficulty, its accuracy and its cache."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="session")
 def test_images(cache):
     """[8, 100, 100, 3] float64, over white."""
-    return _over_white(synthetic.load_views(split="test", cache=cache).pixels).reshape(8, 100, 100, 3)
+    return _over_white(synthetic.load_synthetic(split="test", cache=cache).pixels).reshape(8, 100, 100, 3)
 
 
 def _over_white(pixels):
@@ -31,12 +31,12 @@ def _mean_psnr(images, others):
     return np.mean(-10 * np.log10(((images - others) ** 2).mean(axis=(1, 2, 3))))
 
 
-def test_white_scores_at_most_12_db(test_images):
+def test_white_images_score_at_most_12_db(test_images):
     assert _mean_psnr(test_images, 1.0) <= 12
 
 
 @pytest.mark.parametrize("method", ["NEAREST", "BILINEAR", "BICUBIC"])
-def test_a_quarter_of_the_resolution_scores_at_most_26_db(test_images, method):
+def test_images_upscaled_from_a_quarter_score_at_most_26_db(test_images, method):
     small = test_images.reshape(8, 25, 4, 25, 4, 3).mean((2, 4)).astype(np.float32)
 
     def enlarge(channel):
@@ -52,9 +52,9 @@ def test_doubling_the_segments_changes_less_than_a_thousandth():
     assert np.abs(once - twice).max() < 1e-3
 
 
-def test_nothing_is_lost_outside_the_cylinder_and_the_depth_range(cache):
-    """An ordinary render from near to far, as a model's, agrees with the stored pixels."""
-    views = synthetic.load_views(split="test", size=20, cache=cache)
+def test_all_matter_is_in_the_cylinder_and_between_near_and_far(cache):
+    """A rendering from near to far, as a model's, agrees with the stored pixels."""
+    views = synthetic.load_synthetic(split="test", size=20, cache=cache)
     camera = jax.tree.map(lambda leaf: leaf[3], views.cameras)
     rays = cameras.rays_from_pixels(
         camera, cameras.pixel_grid(20, 20), near=views.near[3].item(), far=views.far[3].item()
@@ -66,10 +66,10 @@ def test_nothing_is_lost_outside_the_cylinder_and_the_depth_range(cache):
     np.testing.assert_allclose(result.rgb, stored[..., :3] * stored[..., 3:], atol=1e-3)
 
 
-def test_views_are_complete_and_no_pose_comes_twice(cache):
+def test_splits_are_complete_and_all_poses_differ(cache):
     backs = []
     for split, count in (("train", 60), ("val", 8), ("test", 8)):
-        views = synthetic.load_views(split=split, size=2, cache=cache)
+        views = synthetic.load_synthetic(split=split, size=2, cache=cache)
         assert views.pixels.shape == (count * 4, 4) and views.pixels.dtype == np.uint16
         np.testing.assert_array_equal(views.offset, 4 * np.arange(count))
         assert len(views.names) == count and views.background == (1.0, 1.0, 1.0)
@@ -81,52 +81,52 @@ def test_views_are_complete_and_no_pose_comes_twice(cache):
     assert angles.min() > 2
 
 
-def test_the_frame_holds_the_whole_scene(test_images):
+def test_images_show_the_whole_scene(test_images):
     border = np.concatenate([test_images[:, [0, -1]], test_images[:, :, [0, -1]].swapaxes(1, 2)])
     assert np.abs(1 - border).max() < 0.02
 
 
-def test_cache_returns_the_same_bits_without_rendering(tmp_path, monkeypatch):
-    first = synthetic.load_views(split="val", size=8, cache=tmp_path).pixels
+def test_the_cache_returns_the_same_bits_without_rendering(tmp_path, monkeypatch):
+    first = synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels
     (path,) = tmp_path.iterdir()
     monkeypatch.setattr(synthetic, "render_views", lambda *_: pytest.fail("rendered again"))
-    np.testing.assert_array_equal(synthetic.load_views(split="val", size=8, cache=tmp_path).pixels, first)
-    # A changed source has another name, and so have another size and split.
+    np.testing.assert_array_equal(synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels, first)
+    # Source code, size, split and finish are part of the file's name.
     monkeypatch.setattr(synthetic, "render_views", lambda stack, scene: np.zeros((8 * stack.height**2, 4), np.uint16))
     for change in ({"size": 9}, {"split": "test"}, {"finish": "matt"}):
-        synthetic.load_views(**{"split": "val", "size": 8, **change}, cache=tmp_path)
+        synthetic.load_synthetic(**{"split": "val", "size": 8, **change}, cache=tmp_path)
     monkeypatch.setattr(synthetic, "_fingerprint", lambda: "changed")
-    assert not synthetic.load_views(split="val", size=8, cache=tmp_path).pixels.any()
+    assert not synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels.any()
     assert len(list(tmp_path.iterdir())) == 5 and path.exists()
 
 
-def test_broken_cache_is_rendered_again(tmp_path, caplog):
-    first = synthetic.load_views(split="val", size=8, cache=tmp_path).pixels
+def test_a_damaged_cache_file_is_replaced(tmp_path, caplog):
+    first = synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 255
-    for body in (b"", b"nothing", whole[: len(whole) // 2], bytes(flipped)):
+    for body in (b"", b"garbage", whole[: len(whole) // 2], bytes(flipped)):
         path.write_bytes(body)
-        again = synthetic.load_views(split="val", size=8, cache=tmp_path).pixels
+        again = synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels
         np.testing.assert_array_equal(again, first)
         np.testing.assert_array_equal(np.load(path)["pixels"], first)
     np.savez(path, pixels=first[:5])
-    np.testing.assert_array_equal(synthetic.load_views(split="val", size=8, cache=tmp_path).pixels, first)
+    np.testing.assert_array_equal(synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels, first)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     assert len(caplog.records) >= 5
 
 
-def test_a_folder_that_cannot_be_written_only_warns(tmp_path, caplog, monkeypatch):
+def test_an_unwritable_cache_folder_only_warns(tmp_path, caplog, monkeypatch):
     (tmp_path / "file").write_text("in the way")
-    views = synthetic.load_views(split="val", size=4, cache=tmp_path / "file")
+    views = synthetic.load_synthetic(split="val", size=4, cache=tmp_path / "file")
     assert views.pixels.shape == (128, 4) and "cannot be written" in caplog.text
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    synthetic.load_views(split="val", size=4)
+    synthetic.load_synthetic(split="val", size=4)
     assert len(list((tmp_path / "home" / "jaxnerf").iterdir())) == 1
 
 
-def test_only_the_ball_depends_on_the_direction():
+def test_only_the_balls_colour_depends_on_the_direction():
     centers = {"ball": (-0.38, -0.38, -0.18), "pillar": (-0.40, 0.46, 0.3), "glass": (0.42, -0.42, -0.29)}
     offset = 0.43 * jnp.array([0.48, -0.36, 0.80])  # towards the light, just inside the ball
     x = jnp.array([centers["ball"], centers["pillar"], centers["glass"]]) + offset[None, :] * jnp.eye(3)[:, :1]
@@ -137,19 +137,19 @@ def test_only_the_ball_depends_on_the_direction():
     np.testing.assert_array_equal(density, same)
     changed = np.abs(bright - dark).max(axis=(1, 2))
     assert changed[0] > 0.3 and (changed[1:] < 1e-6).all() and (density > 1).all()
-    matt = jax.jit(still_life.matt_scene)
+    matt = jax.jit(still_life.matt_still_life)
     (matt_density, matt_bright), (_, matt_dark) = matt(x, down), matt(x, -down)
     np.testing.assert_array_equal(matt_density, density)
     np.testing.assert_array_equal(matt_bright, matt_dark)
     np.testing.assert_allclose(matt_bright[1:], bright[1:], atol=1e-6)
 
 
-def test_in_the_shiny_scene_all_that_is_round_and_opaque_has_highlights():
+def test_round_opaque_objects_of_the_shiny_scene_have_highlights():
     centers = {"pillar": (-0.40, 0.46, -0.02), "ring": (0.48, 0.36, -0.04), "ball": (-0.38, -0.38, -0.18)}
     light = jnp.array([0.48, -0.36, 0.80])
     around = jax.random.uniform(jax.random.key(0), (3, 8000, 3), minval=-0.9, maxval=0.9)
     x = around + jnp.array(list(centers.values()))[:, None, :]
-    scenes = [jax.jit(scene) for scene in (still_life.shiny_scene, still_life.matt_scene)]
+    scenes = [jax.jit(scene) for scene in (still_life.shiny_still_life, still_life.matt_still_life)]
     (density, shiny), (same, matt) = (scene(x, jnp.broadcast_to(-light, (3, 1, 3))) for scene in scenes)
     np.testing.assert_array_equal(density, same)
     assert (jnp.where(density[..., None] > 25, shiny - matt, 0).max(axis=(1, 2)) > 0.4).all()
@@ -158,7 +158,7 @@ def test_in_the_shiny_scene_all_that_is_round_and_opaque_has_highlights():
 
 def test_field_is_bounded_with_finite_gradients():
     x = jax.random.uniform(jax.random.key(0), (500, 4, 3), minval=-2.0, maxval=2.0)
-    special = jnp.array([0.0, -0.38, -0.71, 0.22, 1e3, -0.40, 0.46, 0.42])  # centres, and far away
+    special = jnp.array([0.0, -0.38, -0.71, 0.22, 1e3, -0.40, 0.46, 0.42])  # centres of objects, and far away
     axes = jnp.broadcast_to(special[:, None, None], (8, 4, 3))
     x = jnp.concatenate([x, axes])
     viewdirs = jnp.zeros((508, 1, 3)).at[..., 2].set(-1.0)
@@ -173,13 +173,13 @@ def test_field_is_bounded_with_finite_gradients():
     np.testing.assert_allclose(each[1], rgb, atol=1e-5)
 
 
-def test_bad_arguments_are_named():
+def test_invalid_arguments_are_errors():
     with pytest.raises(ValueError, match="split is 'all', .*train, val, test"):
-        synthetic.load_views(split="all")
-    with pytest.raises(ValueError, match="finish is 'wet', wanted one of .*correct data.finish"):
-        synthetic.load_views(finish="wet")
+        synthetic.load_synthetic(split="all")
+    with pytest.raises(ValueError, match="finish is 'wet', expected one of .*correct data.finish"):
+        synthetic.load_synthetic(finish="wet")
     for size in (0, 2.5, True):
         with pytest.raises(ValueError, match="size is"):
-            synthetic.load_views(size=size)
+            synthetic.load_synthetic(size=size)
     with pytest.raises(ValueError, match="viewdirs"):
         still_life.still_life(jnp.zeros((2, 4, 3)), jnp.zeros((2, 3, 3)))

@@ -1,4 +1,4 @@
-"""Scores: what is written, that it is true, and that it is written once."""
+"""Evaluation: the files that it writes, their content, and that nothing is overwritten."""
 
 import json
 import os
@@ -12,13 +12,12 @@ import pytest
 
 import oracle
 from jaxnerf import load_scene, pixel_grid, render_image
-from jaxnerf.evaluation import evaluate as evaluation
 from jaxnerf.evaluation import external
-from jaxnerf.evaluation.evaluate import evaluate
+from jaxnerf.evaluation.evaluate import evaluate, reference, score_run
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.evaluation.watch import watch
-from jaxnerf.runtime.chunking import image_renderer
-from jaxnerf.training.build import build
+from jaxnerf.runtime.memory import image_renderer
+from jaxnerf.training import build
 from runs import smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
@@ -42,7 +41,7 @@ def images(folder):
     return [np.asarray(iio.imread(path)) for path in sorted(folder.glob("*"))]
 
 
-def test_results_say_all_that_a_score_needs(scored):
+def test_results_hold_the_metrics_and_the_protocol(scored):
     results, folder = scored
     assert json.loads((folder / "results.json").read_text()) == results
     assert results["views"] == len(results["images"]) == 8
@@ -61,7 +60,7 @@ def test_results_say_all_that_a_score_needs(scored):
     assert [row["name"] for row in results["images"]] == [f"test_{index:03d}" for index in range(8)]
 
 
-def test_scores_are_those_of_the_images_on_disk(scored):
+def test_metrics_are_those_of_the_images_on_disk(scored):
     results, folder = scored
     for row, color, truth in zip(results["images"], images(folder / "color"), images(folder / "gt-color"), strict=True):
         assert color.dtype == truth.dtype == np.uint8 and color.shape == truth.shape == (24, 24, 3)
@@ -71,10 +70,10 @@ def test_scores_are_those_of_the_images_on_disk(scored):
         assert 0 < abs(row["psnr_truncated"] - row["psnr_float"]) < 0.3
 
 
-def test_pictures_show_the_model_and_its_depth(scored, run):
+def test_images_show_the_model_and_its_depth(scored, run):
     _, folder = scored
     opened = restore_run(run)
-    views = opened.experiment.load_views("test")
+    views = opened.experiment.load_split("test")
     rays = opened.experiment.view_rays(views, 0, pixel_grid(24, 24))
     image = render_image(load_scene(run)[1], rays, chunk=250)
     assert np.abs(images(folder / "color")[0] - 255 * np.asarray(image.rgb)).max() <= 0.5 + 1e-3
@@ -83,29 +82,29 @@ def test_pictures_show_the_model_and_its_depth(scored, run):
     assert all(path.suffix == ".tiff" for path in (folder / "depth").iterdir())
     distance = np.asarray(image.depth) * np.linalg.norm(rays.directions, axis=-1)
     np.testing.assert_allclose(depths[0], distance, rtol=1e-5)
-    sheet = iio.imread(folder / "sheet.png")
+    sheet = iio.imread(folder / "contact_sheet.png")
     assert sheet.shape == (4 * 24, 5 * 24, 3)
     np.testing.assert_array_equal(sheet[:24, :24], images(folder / "gt-color")[0])
 
 
-def test_nothing_is_overwritten_unasked(scored, run):
+def test_nothing_is_overwritten_without_the_flag(scored, run):
     results, folder = scored
     before = (folder / "results.json").stat().st_mtime_ns
-    with pytest.raises(ValueError, match="eval/20: is there already; give --overwrite"):
+    with pytest.raises(ValueError, match="eval/20: exists already; give --overwrite"):
         evaluate(run)
     with pytest.raises(ValueError, match=r"no checkpoint of step 7, only \[10, 15, 20\]"):
         evaluate(run, step=7)
     assert (folder / "results.json").stat().st_mtime_ns == before
 
 
-def test_another_split_and_another_step_go_elsewhere_and_the_chunk_is_no_matter(scored, run):
+def test_other_splits_and_steps_have_folders_of_their_own_and_the_chunk_changes_no_metric(scored, run):
     results, _ = scored
     val = evaluate(run, split="val")
     assert val["conventions"]["split"] == "val" and val["images"][0]["name"] == "val_000"
     assert abs(val["psnr"] - results["psnr"]) > 1e-6
     evaluate(run, step=15)
     assert {path.name for path in (run / "eval").iterdir()} == {"15", "20", "20-val"}
-    again = evaluate(run, chunk=577, overwrite=True)  # more than an image
+    again = evaluate(run, settings={"chunk": 577}, overwrite=True)  # more than an image
     for row, other in zip(again["images"], results["images"], strict=True):
         assert row["psnr_float"] == pytest.approx(other["psnr_float"], abs=1e-5)
 
@@ -113,15 +112,14 @@ def test_another_split_and_another_step_go_elsewhere_and_the_chunk_is_no_matter(
 def test_a_last_smaller_chunk_and_other_views_compile_nothing(run):
     opened, sizes = restore_run(run), []
     render = opened.render
-    counted = lambda params, rays: sizes.append(rays.near.shape) or render(params, rays)  # noqa: E731
+    counted = lambda variables, rays: sizes.append(rays.near.shape) or render(variables, rays)  # noqa: E731
     counted.lower = render.lower
-    image = image_renderer(counted, 4096)
-    evaluation.score_run(opened._replace(image=image), run, step=10, chunk=250)
+    score_run(opened._replace(render_image=image_renderer(counted, 250)), run, step=10)
     assert sizes == [(250,)] * (3 * 8)  # 576 rays a view
     assert render._cache_size() == 1
 
 
-def test_predictions_made_elsewhere_score_the_same(scored, tmp_path):
+def test_predictions_have_the_metrics_of_the_evaluation_that_wrote_them(scored, tmp_path):
     results, folder = scored
     for source, config in ((folder, None), (folder / "color", smoke_config())):
         target = shutil.copytree(source, tmp_path / source.name, ignore=shutil.ignore_patterns("results.json"))
@@ -131,20 +129,20 @@ def test_predictions_made_elsewhere_score_the_same(scored, tmp_path):
         assert found["ssim"] == pytest.approx(results["ssim"], abs=1e-5)
         assert found["psnr_truncated"] == found["psnr"]  # of 8 bits already
         assert found["conventions"]["size"] == [24, 24] and len(found["comparable_with"]) == 5
-        with pytest.raises(ValueError, match="is there already"):
+        with pytest.raises(ValueError, match="exists already"):
             external.score_folder(target, config=config)
     os.remove(tmp_path / "20" / "color" / "003.png")
-    with pytest.raises(ValueError, match="color: has 7 images, the reference 8"):
+    with pytest.raises(ValueError, match="color: holds 7 images, expected 8"):
         external.score_folder(tmp_path / "20", overwrite=True)
 
 
-def test_watching_waits_scores_and_ends(trained, tmp_path):
-    """As one process would do it beside a training: nothing, then a checkpoint, then the last."""
+def test_watching_waits_scores_each_checkpoint_and_ends(trained, tmp_path):
+    """Watches an empty folder, then one checkpoint, then the last two."""
     folder = tmp_path / "run"
     process = start("eval", f"--workdir={folder}", "--watch", "--poll_seconds=0.1")
     killer = threading.Timer(100, process.kill)
     killer.start()
-    assert "looking again every 0.1 s" in process.stderr.readline()
+    assert "checking again every 0.1 s" in process.stderr.readline()
     shutil.copytree(trained, folder, ignore=lambda path, names: {"15", "20"} & set(names))
     assert process.stdout.readline().startswith("step 10: PSNR ")
     time.sleep(0.5)
@@ -156,11 +154,11 @@ def test_watching_waits_scores_and_ends(trained, tmp_path):
     killer.cancel()
     assert process.returncode == 0, err
     assert [line.split(":")[0] for line in out.splitlines()] == ["step 15", "step 20"]
-    assert 1 <= err.count("no new checkpoint") <= 2  # said once a wait, not once a look
+    assert 1 <= err.count("no new checkpoint") <= 2  # once for each wait, not for each search
     assert json.loads((folder / "eval" / "20" / "results.json").read_text())["step"] == 20
 
 
-def test_watching_a_training_that_ended_by_its_clock_ends_too(trained, tmp_path):
+def test_watching_ends_where_training_ended_by_max_seconds(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
     text = (folder / "config.json").read_text()
     (folder / "config.json").write_text(
@@ -174,8 +172,8 @@ def test_watching_a_training_that_ended_by_its_clock_ends_too(trained, tmp_path)
     assert not thread.is_alive()
 
 
-def test_the_reference_is_the_photograph_over_its_background():
-    views = build(smoke_config()).load_views("test")
+def test_the_reference_is_the_datasets_image_over_its_background():
+    views = build.load_split(smoke_config(), "test")[0]
     pixels = views.pixels[576 : 2 * 576].reshape(24, 24, 4) / 65535
-    wanted = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
-    np.testing.assert_allclose(evaluation.reference(views, 1), wanted, atol=1e-6)
+    expected = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
+    np.testing.assert_allclose(reference(views, 1), expected, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Camera paths: every pose rigid and where its closed form says; files of paths, right and wrong."""
+"""Camera paths: every pose is rigid and where its closed form says; path files, right and wrong."""
 
 import dataclasses
 import json
@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from helpers import compiled
 from jaxnerf import Camera, Views, pixel_grid
 from jaxnerf.core import poses as poses_module
+from jaxnerf.data.geometry.poses import up_of
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.evaluation.paths import camera_path as camera_paths
-from jaxnerf.evaluation.paths.from_views import up_of
 from jaxnerf.evaluation.paths.path_files import read_path_file
 
 UP = np.float32([0, 0, 1])
@@ -102,7 +102,7 @@ def test_an_ellipse_has_its_half_axes():
 
 
 def test_a_spiral_is_the_llff_codes():
-    """Against render_path_spiral, written out anew, from a pose that is no identity."""
+    """Against render_path_spiral, written out again, from a pose that is no identity."""
     middle, radii = pose(turn([1, 2, 3], 40), [1.0, 2.0, 3.0]), np.array([0.5, 0.3, 0.1])
     poses = np.asarray(poses_module.spiral(120, pose=middle, radii=radii, focus=4.0))
     assert_rigid(poses)
@@ -130,8 +130,8 @@ def test_interpolation_is_even_between_two_poses_and_on_a_line():
     start, end = pose(np.eye(3), [0, 0, 0]), pose(turn([1, 1, 0], 80), [4, 0, 8])
     path = interpolate(5, poses=np.float32([start, end]))
     for part, found in zip(np.linspace(0, 1, 5), path, strict=True):
-        wanted = pose(turn([1, 1, 0], 80 * part), [4 * part, 0, 8 * part])
-        np.testing.assert_allclose(found, wanted, atol=2e-6)
+        expected = pose(turn([1, 1, 0], 80 * part), [4 * part, 0, 8 * part])
+        np.testing.assert_allclose(found, expected, atol=2e-6)
     line = np.stack([pose(np.eye(3), [k, 2 * k, 0]) for k in range(4)])
     path = interpolate(13, poses=np.float32(line))
     np.testing.assert_allclose(path[:, :, 3], np.linspace(0, 3, 13)[:, None] * [1, 2, 0], atol=1e-5)
@@ -159,7 +159,7 @@ def test_the_mean_of_a_pose_and_its_mirror_image_lies_between():
     np.testing.assert_allclose(poses_module.mean_pose([left, right]), pose(np.eye(3), [0, 0, 5]), atol=1e-6)
 
 
-def test_the_path_suits_the_views():
+def test_the_default_kind_depends_on_where_cameras_look():
     assert camera_paths.default_kind(views_of(ring(12))) == "turntable"
     forward = np.stack([pose(turn([0, 1, 0], angle), [angle / 10, 0, 0]) for angle in (-30, 0, 30)])
     assert camera_paths.default_kind(views_of(forward)) == "spiral"
@@ -186,7 +186,7 @@ def test_up_is_across_the_horizons_of_an_arc_and_the_mean_of_views_that_look_one
     np.testing.assert_allclose(up_of(forward), tilt[:, 1], atol=1e-6)
 
 
-def test_a_spiral_sways_as_the_cameras_do():
+def test_a_spiral_has_the_amplitudes_of_the_cameras():
     offsets = np.random.default_rng(0).normal(size=(20, 3)) * [1.0, 0.5, 0.1]
     cameras = np.stack([pose(np.eye(3), offset) for offset in offsets - offsets.mean(0)])
     path = camera_paths.make_path("spiral", views_of(cameras, near=2.0, far=8.0))
@@ -199,7 +199,7 @@ def test_a_spiral_sways_as_the_cameras_do():
     assert_looks_at(path.poses, [0, 0, -focus])
 
 
-def test_views_are_met_in_the_order_of_their_names_with_their_focal_lengths():
+def test_interpolation_visits_views_in_the_order_of_their_names_with_their_focal_lengths():
     cameras = ring(3)
     views = views_of(cameras, focal=[100.0, 200.0, 300.0], names=("a_10", "a_2", "b_1"))
     path = camera_paths.make_path("interpolate", views)
@@ -210,7 +210,7 @@ def test_views_are_met_in_the_order_of_their_names_with_their_focal_lengths():
     np.testing.assert_allclose(closed.focal[[0, 6, 12, 15], 1], [200, 100, 300, 250], rtol=1e-5)
 
 
-def test_another_size_shows_the_same():
+def test_another_size_keeps_the_field_of_view():
     path = camera_paths.make_path("turntable", views_of(ring(4)), num_frames=16)
 
     def corners(path):
@@ -228,7 +228,7 @@ def test_another_size_shows_the_same():
 
 @pytest.mark.parametrize("ndc", [False, True])
 def test_rays_of_a_frame_are_those_of_its_own_camera(ndc):
-    """And in NDC they lie in the space that the first view's lens drew in training, whatever their own."""
+    """In NDC they lie in the space of the first view's lens, as in training, whatever their own lens is."""
     views = views_of([pose(np.eye(3), [0, 0, 0])] * 2)
     path = camera_paths.CameraPath(
         "p",
@@ -267,22 +267,22 @@ SIMILARITY = np.block([[0.02 * turn([3, 1, 2], 100), np.array([[5.0], [-7.0], [9
 
 
 @pytest.mark.parametrize("to_file", [None, SIMILARITY])
-def test_a_files_poses_are_in_the_captures_world(tmp_path, to_file):
-    wanted = ring(3)
-    in_file = wanted
+def test_the_poses_of_a_file_are_in_the_datasets_world(tmp_path, to_file):
+    expected = ring(3)
+    in_file = expected
     if to_file is not None:
-        eyes = wanted[:, :, 3] @ to_file[:3, :3].T + to_file[:3, 3]
-        in_file = np.concatenate([to_file[:3, :3] / 0.02 @ wanted[:, :, :3], eyes[:, :, None]], axis=-1)
+        eyes = expected[:, :, 3] @ to_file[:3, :3].T + to_file[:3, 3]
+        in_file = np.concatenate([to_file[:3, :3] / 0.02 @ expected[:, :, :3], eyes[:, :, None]], axis=-1)
     frames = [{"transform_matrix": matrix(each)} for each in in_file]
     views = views_of(ring(5), to_file=to_file)
     path = camera_paths.make_path(str(written(tmp_path, {"frames": frames})), views)
-    np.testing.assert_allclose(path.poses, wanted, atol=1e-6)
+    np.testing.assert_allclose(path.poses, expected, atol=1e-6)
     assert_rigid(path.poses)
     assert (path.name, path.width, path.height, path.fps) == ("my path", 64, 48, None)
     assert (path.focal == 100).all() and (path.center == [31, 25]).all(), "the first view's lens"
 
 
-def test_a_file_may_state_its_own_lens(tmp_path):
+def test_a_file_may_state_its_own_intrinsics(tmp_path):
     bare = {"transform_matrix": matrix(ring(1)[0])}
     frames = [bare, {**bare, "fl_x": 70, "cx": 3}, {**bare, "fl_x": 80, "fl_y": 90}]
     content = {"frames": frames, "w": 200, "h": 100, "camera_angle_x": math.pi / 2, "fps": 12, "cy": 40}
@@ -317,24 +317,24 @@ def test_a_path_of_nerfstudios_viewer(tmp_path):
 
 GOOD = matrix(ring(1)[0])
 WRONG = {
-    "has w, wanted frames or camera_path": {"w": 3},
+    "has w, expected frames or camera_path": {"w": 3},
     "frames is not a list": {"frames": {}},
     "frames is not a list of 1": {"frames": []},
-    r"frames\[1\]: is no object": {"frames": [{"transform_matrix": GOOD}, 3]},
-    r"frames\[0\]: has fl_x, wanted transform_matrix": {"frames": [{"fl_x": 3}]},
+    r"frames\[1\]: is 3, expected an object": {"frames": [{"transform_matrix": GOOD}, 3]},
+    r"frames\[0\]: has fl_x, expected transform_matrix": {"frames": [{"fl_x": 3}]},
     r"frames\[0\]: the camera-to-world matrix has shape \(2,\)": {"frames": [{"transform_matrix": [1, 2]}]},
     r"frames\[0\]: .* determinant -1": {"frames": [{"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}]},
-    r"frames\[0\]: fl_x is -1, wanted a number above 0": {"frames": [{"transform_matrix": GOOD, "fl_x": -1}]},
+    r"frames\[0\]: fl_x is -1, expected a number above 0": {"frames": [{"transform_matrix": GOOD, "fl_x": -1}]},
     r"frames\[0\]: has fl_y but no fl_x": {"frames": [{"transform_matrix": GOOD, "fl_y": 1}]},
-    "w is 0.5, wanted 1 to 16384": {"frames": [{"transform_matrix": GOOD}], "w": 0.5},
+    "w is 0.5, expected 1 to 16384": {"frames": [{"transform_matrix": GOOD}], "w": 0.5},
     "camera_angle_x but no w": {"frames": [{"transform_matrix": GOOD}], "camera_angle_x": 1},
-    "fps is 'fast', wanted a number": {"frames": [{"transform_matrix": GOOD}], "fps": "fast"},
-    "wanted render_height too": {"camera_path": [{"camera_to_world": GOOD, "fov": 50}]},
+    "fps is 'fast', expected a number": {"frames": [{"transform_matrix": GOOD}], "fps": "fast"},
+    "expected render_height, too": {"camera_path": [{"camera_to_world": GOOD, "fov": 50}]},
     r"camera_path\[0\]: fov is 180": {
         "render_height": 9,
         "camera_path": [{"camera_to_world": GOOD, "fov": 180}],
     },
-    r"camera_path\[0\]: has fov, wanted camera_to_world": {"render_height": 9, "camera_path": [{"fov": 50}]},
+    r"camera_path\[0\]: has fov, expected camera_to_world": {"render_height": 9, "camera_path": [{"fov": 50}]},
     "camera_type is 'fisheye'": {
         "render_height": 9,
         "camera_type": "fisheye",
@@ -352,11 +352,11 @@ def test_a_wrong_file_is_an_error_that_names_file_and_entry(tmp_path, message):
 
 def test_a_wrong_kind_is_an_error(tmp_path):
     views = views_of(ring(3))
-    with pytest.raises(ValueError, match="path is 'circle', wanted one of turntable, spiral, ellipse, inter"):
+    with pytest.raises(ValueError, match="path is 'circle', expected one of turntable, spiral, ellipse, inter"):
         camera_paths.make_path("circle", views)
     with pytest.raises(ValueError, match="No such file"):
         camera_paths.make_path(tmp_path / "none.json", views)
-    with pytest.raises(ValueError, match="wanted no --frames"):
+    with pytest.raises(ValueError, match="expected no --frames"):
         camera_paths.make_path(written(tmp_path, {"frames": [{"transform_matrix": GOOD}]}), views, num_frames=3)
 
 
@@ -369,7 +369,7 @@ FUZZED_WITH = views_of(ring(2))
 
 @settings(max_examples=150, deadline=None)
 @given(st.booleans(), st.sampled_from(KEYS), VALUES)
-def test_whatever_stands_in_a_field_it_is_read_or_a_clear_error(tmp_path_factory, own, key, value):
+def test_any_value_of_a_field_is_read_or_a_clear_error(tmp_path_factory, own, key, value):
     frame = {"transform_matrix": GOOD, "camera_to_world": GOOD, "fov": 50, "fl_x": 30}
     content = {"w": 30, "h": 20, "render_height": 9}
     content["frames" if own else "camera_path"] = [{**frame, key: value}, frame]

@@ -1,43 +1,46 @@
-"""The card says what a figure was taken of, and beside which published tables that lets it stand."""
-
-import types
+"""The protocol of an evaluation, and the published tables that it is comparable with."""
 
 import numpy as np
 import pytest
 
 import oracle
-from configs import lego_small
+from jaxnerf import Views
+from jaxnerf.configs import lego_small
 from jaxnerf.evaluation import protocol
-from jaxnerf.evaluation.evaluate import scores
-from jaxnerf.training.build import build
+from jaxnerf.evaluation.metrics import image_metrics
+from jaxnerf.training import build
 
 _PART = "trained without some of the training views"
 READ = {"format": "blender", "background": "white", "pixel_offset": 0.5, "factor": 1, "hold_out": 0}
 
 
-def card_of(count, size, *, split="test", names=None, **read):
-    """Returns the card of `count` views of one size, read as given."""
+def protocol_of(count, size, *, split="test", names=None, **read):
+    """Returns the protocol of `count` views of one size, read as given."""
     names = tuple(f"r_{index}" for index in range(count)) if names is None else names
-    views = types.SimpleNamespace(size=np.tile(np.int32([size]), (count, 1)), names=names)
-    return protocol.metric_card(READ | read, views, split=split)
+    return protocol.of_views(READ | read, views_of(np.tile(np.int32([size]), (count, 1)), names), split=split)
 
 
-def beside(found):
+def views_of(size, names):
+    """Returns Views of which only sizes and names are known."""
+    return Views(pixels=None, offset=None, size=size, cameras=None, near=None, far=None, names=names)
+
+
+def comparable(found):
     return [row["table"] for row in found["comparable_with"] if row["comparable"]]
 
 
-def test_the_papers_images_stand_beside_its_tables_and_say_what_differs():
-    found = card_of(200, (800, 800))
-    assert [table.split()[0] for table in beside(found)] == ["NeRF", "JaxNeRF,", "nerfbaselines,"]
+def test_the_papers_images_are_comparable_with_its_tables_and_differences_are_reported():
+    found = protocol_of(200, (800, 800))
+    assert [table.split()[0] for table in comparable(found)] == ["NeRF", "JaxNeRF,", "nerfbaselines,"]
     paper, jaxnerf, other = ("; ".join(row["why"]) for row in found["comparable_with"][:3])
     assert "psnr_truncated" in paper and "0.22 dB" in paper and "pixel_offset 0, here 0.5" in paper
     assert "psnr_float" in jaxnerf and "about 1 dB" in jaxnerf
     assert "pixel_offset" not in other
-    assert "pixel_offset" not in str(card_of(200, (800, 800), pixel_offset=0.0)["comparable_with"][:3])
+    assert "pixel_offset" not in str(protocol_of(200, (800, 800), pixel_offset=0.0)["comparable_with"][:3])
 
 
 @pytest.mark.parametrize(
-    "count, size, options, wanted",
+    "count, size, options, expected",
     [
         (25, (100, 100), {"factor": 8}, ("views is 25, there 200", "size is [100, 100], there [800, 800]")),
         (25, (800, 800), {}, ("views is 25, there 200",)),
@@ -49,56 +52,60 @@ def test_the_papers_images_stand_beside_its_tables_and_say_what_differs():
         (8, (100, 100), {"format": "synthetic"}, ("format is synthetic, there blender",)),
     ],
 )
-def test_other_images_stand_beside_none_and_why(count, size, options, wanted):
-    found = card_of(count, size, **options)
-    assert beside(found) == []
-    assert set(wanted) <= set(found["comparable_with"][0]["why"])
+def test_other_images_are_comparable_with_no_table_and_the_reason_is_given(count, size, options, expected):
+    found = protocol_of(count, size, **options)
+    assert comparable(found) == []
+    assert set(expected) <= set(found["comparable_with"][0]["why"])
 
 
-def test_forward_facing_photographs_stand_beside_those_tables():
-    found = card_of(3, (756, 1008), format="llff", factor=4)
-    assert [table.split(", ")[-1] for table in beside(found)] == ["forward-facing scenes"] * 2
-    assert "of unknown worth" in str(found["comparable_with"][3]["why"])
-    assert beside(card_of(3, (378, 504), format="llff", factor=8)) == []
+def test_forward_facing_images_are_comparable_with_the_forward_facing_tables():
+    found = protocol_of(3, (756, 1008), format="llff", factor=4)
+    assert [table.split(", ")[-1] for table in comparable(found)] == ["forward-facing scenes"] * 2
+    assert "of unknown effect" in str(found["comparable_with"][3]["why"])
+    assert comparable(protocol_of(3, (378, 504), format="llff", factor=8)) == []
 
 
-def test_images_of_an_unknown_source_stand_beside_none():
-    found = protocol.card_of({"reference": "gt-color"}, [(800, 800)] * 200)
-    assert beside(found) == [] and found["conventions"]["views"] == 200
+def test_images_of_an_unknown_source_are_comparable_with_no_table():
+    found = protocol.of_images({"reference": "gt-color"}, [(800, 800)] * 200)
+    assert comparable(found) == [] and found["conventions"]["views"] == 200
     assert "format is not known, there blender" in found["comparable_with"][0]["why"]
 
 
-def test_it_says_which_views_and_what_of_them():
-    of = lambda *args, **options: card_of(*args, **options)["conventions"]  # noqa: E731
-    every_8th = of(3, (9, 9), names=("r_0", "r_8", "r_16"))["skip"]
+def test_the_conventions_say_which_views_were_scored_and_how():
+    of = lambda *args, **options: protocol_of(*args, **options)["conventions"]  # noqa: E731
+    every_8th = of(3, (9, 9), names=("r_0", "r_8", "r_16"))["selection"]
     assert every_8th == "all that transforms_test.json lists; the numbers in the names go up by 8"
-    assert of(3, (9, 9), names=("a", "b", "c"), format="llff")["skip"] == "every 8th by name, from the first"
-    assert of(2, (9, 9), split="held_out", hold_out=8)["skip"].startswith("one in 8 of the training views")
-    views = types.SimpleNamespace(size=np.int32([[9, 12], [12, 9], [9, 12]]), names=())
-    mixed = protocol.metric_card(READ, views, split="test")["conventions"]
+    assert of(3, (9, 9), names=("a", "b", "c"), format="llff")["selection"] == "every 8th by name, from the first"
+    assert of(2, (9, 9), split="held_out", hold_out=8)["selection"].startswith("one in 8 of the training views")
+    assert of(2, (9, 9), split="val")["selection"].startswith("all of 'val'")
+    assert of(3, (9, 9), names=("a", "b", "c"), format="registered")["selection"].startswith(
+        "all that the dataset's own"
+    )
+    views = views_of(np.int32([[9, 12], [12, 9], [9, 12]]), ())
+    mixed = protocol.of_views(READ, views, split="test")["conventions"]
     assert (mixed["views"], mixed["size"]) == (3, [[9, 12], [12, 9]])
     assert {"rounding", "ssim", "data_range", "pixels", "mean", "lpips", *READ} < mixed.keys()
 
 
 @pytest.mark.scenes("lego")
-def test_lego_at_100_pixels_stands_beside_none(scenes_dir):
-    experiment = build(lego_small.get_config())
-    found = protocol.metric_card(experiment.conventions, experiment.load_views("test"), split="test")
-    assert beside(found) == []
+def test_lego_at_100_pixels_is_comparable_with_no_table(scenes_dir):
+    views, split, conventions = build.load_split(lego_small.get_config(), "test")
+    found = protocol.of_views(conventions, views, split=split)
+    assert comparable(found) == []
     about = found["conventions"]
     assert (about["format"], about["factor"], about["views"], about["size"]) == ("blender", 8, 25, [100, 100])
-    assert about["skip"].endswith("go up by 8")
+    assert about["selection"].endswith("go up by 8")
 
 
-def test_truncation_leaves_8_bits_alone_and_else_costs_what_the_card_says():
+def test_truncation_keeps_8_bit_colours_and_otherwise_costs_what_the_protocol_says():
     levels = np.resize(np.arange(256) / 255, (16, 32, 3)).astype(np.float32)
-    found = scores(levels, 1 - levels)
+    found = image_metrics(levels, 1 - levels)
     assert found["psnr_truncated"] == found["psnr"]
     rng = np.random.default_rng(0)
     truth = (rng.integers(80, 176, size=(128, 128, 3)) / 255).astype(np.float32)
     for decibels, rounding, truncation in ((30, 0.006, 0.02), (35, 0.018, 0.07), (40, 0.055, 0.22)):
         image = truth + np.float32(10 ** (-decibels / 20)) * rng.normal(size=truth.shape).astype(np.float32)
-        found = scores(image, truth)
+        found = image_metrics(image, truth)
         assert found["psnr_float"] == pytest.approx(decibels, abs=0.1)
         assert found["psnr_float"] - found["psnr"] == pytest.approx(rounding, abs=0.006)
         assert found["psnr_float"] - found["psnr_truncated"] == pytest.approx(truncation, abs=0.012)

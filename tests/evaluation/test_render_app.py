@@ -1,4 +1,4 @@
-"""python -m jaxnerf.render: what it writes, that it is true, and that it goes on where it stopped."""
+"""python -m jaxnerf.render: the files that it writes, their content, and how it resumes."""
 
 import importlib.util
 import json
@@ -11,10 +11,10 @@ import pytest
 
 from jaxnerf import Camera, load_scene, rays_from_pixels, render_image
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.evaluation import pictures
+from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import video
 from jaxnerf.evaluation.paths.render_path import render_path
-from jaxnerf.runtime import chunking
+from jaxnerf.runtime import memory
 from runs import run as run_program
 
 pytest_plugins = ["run_fixtures"]
@@ -31,7 +31,7 @@ def run(trained, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def path_file(tmp_path_factory):
-    """A file of one's own: two frames with another lens, 25 x 17."""
+    """A path file: two frames of 25 x 17 px with another lens than the views'."""
     content = {"frames": [{"transform_matrix": POSE.tolist()}] * 2, "w": 25, "h": 17, "fl_x": 30}
     file = tmp_path_factory.mktemp("path") / "mine.json"
     file.write_text(json.dumps(content))
@@ -40,11 +40,11 @@ def path_file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rendered(run, path_file):
-    """What a call wrote, colour and depth and RGBA."""
-    return render_path(run, path=str(path_file), rgba=True, depth=True, kind="gif", chunk=100)
+    """What a call wrote: colour, depth and RGBA."""
+    return render_path(run, path=str(path_file), rgba=True, depth=True, kind="gif", settings={"chunk": 100})
 
 
-def test_what_is_written_and_where(rendered, run):
+def test_frames_videos_and_the_path_are_written_where_the_docstring_says(rendered, run):
     folder, *videos = rendered
     assert folder == run / "renders" / "mine-20"
     assert [file.name for file in videos] == ["mine-20.gif", "mine-20-depth.gif"]
@@ -57,7 +57,7 @@ def test_what_is_written_and_where(rendered, run):
         assert iio.imread(file, index=...).shape[-3:] == (17, 25, 3)
 
 
-def test_frames_show_the_model_and_its_depth_through_the_files_lens(rendered, run):
+def test_frames_show_the_model_and_its_depth_through_the_lens_of_the_path_file(rendered, run):
     camera = Camera(to_world=np.float32(POSE[:3]), focal=np.float32([30, 30]), center=np.float32([12.5, 8.5]))
     rays = rays_from_pixels(camera, pixel_grid(17, 25), near=2.6, far=5.4)
     image = render_image(load_scene(run)[1], rays, chunk=100)
@@ -66,11 +66,11 @@ def test_frames_show_the_model_and_its_depth_through_the_files_lens(rendered, ru
     assert np.abs(color - 255 * np.asarray(image.rgb)).max() <= 0.5 + 1e-2
     depth = iio.imread(rendered[0] / "depth" / "0001.tiff")
     assert depth.dtype == np.float32
-    wanted = np.asarray(image.depth) * np.linalg.norm(rays.directions, axis=-1)
-    np.testing.assert_allclose(depth, wanted, rtol=1e-4)
-    picture = iio.imread(rendered[0] / "depth" / "0001.png")
-    assert picture.dtype == np.uint8 and picture.shape == (17, 25)
-    assert (np.diff(picture.ravel()[np.argsort(depth.ravel())].astype(int)) <= 0).all(), "near is bright"
+    expected = np.asarray(image.depth) * np.linalg.norm(rays.directions, axis=-1)
+    np.testing.assert_allclose(depth, expected, rtol=1e-4)
+    shades = iio.imread(rendered[0] / "depth" / "0001.png")
+    assert shades.dtype == np.uint8 and shades.shape == (17, 25)
+    assert (np.diff(shades.ravel()[np.argsort(depth.ravel())].astype(int)) <= 0).all(), "near is bright"
 
 
 def test_rgba_over_the_background_is_the_colour(rendered):
@@ -81,44 +81,23 @@ def test_rgba_over_the_background_is_the_colour(rendered):
     np.testing.assert_allclose(rgba[..., :3] * alpha + (1 - alpha), color, atol=1.01 / 255)
 
 
-def test_straight_alpha_of_what_is_known():
-    opacity = np.array([[0.0, 0.5, 1.0, 1e-4]])
-    own = np.array([0.2, 0.4, 0.6])
-    for background in (None, (1.0, 0.5, 0.0)):
-        behind = np.zeros(3) if background is None else np.array(background)
-        rgb = opacity[..., None] * own + (1 - opacity[..., None]) * behind
-        found = pictures.cut_out(rgb, opacity, background)[0]
-        np.testing.assert_array_equal(found[[0, 3]], 0)
-        np.testing.assert_allclose(found[1], [51, 102, 153, 128], atol=1.01)
-        np.testing.assert_array_equal(found[2], [51, 102, 153, 255])
-
-
-def test_depth_pictures_know_infinity():
-    depth = np.array([[1.0, 2.0, np.inf], [4.0, 0.0, 1e30]])
-    assert pictures.depth_picture(depth, 1.0, 4.0).tolist() == [[255, 85, 0], [0, 255, 0]]
-    assert pictures.depth_range([np.full((9, 9), np.inf)]) == (1.0, 2.0)
-    near, far = pictures.depth_range([np.repeat(np.linspace(2, 4, 1001), 17)] * 2)
-    assert (near, far) == pytest.approx((2.02, 3.98), abs=1e-3)
-    assert pictures.depth_picture(np.full((2, 2), 3.0), 3.0, 3.0).tolist() == [[0, 0], [0, 0]]
-
-
-def test_only_what_is_missing_is_rendered(rendered, run, path_file, monkeypatch):
+def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch):
     folder = rendered[0]
     before = {file: file.stat().st_mtime_ns for file in folder.rglob("*") if "depth" not in str(file)}
     pixels = (folder / "color" / "0001.png").read_bytes()
     os.remove(folder / "color" / "0001.png")
     (folder / "color" / "0001.png.tmp").write_bytes(pixels[:40])  # as a kill leaves it
-    asked = []
-    render_image = chunking.render_image
-    monkeypatch.setattr(chunking, "render_image", lambda *a, **k: asked.append(1) or render_image(*a, **k))
-    options = {"path": str(path_file), "rgba": True, "kind": "none", "chunk": 100}
+    calls = []
+    render_image = memory.render_image
+    monkeypatch.setattr(memory, "render_image", lambda *a, **k: calls.append(1) or render_image(*a, **k))
+    options = {"path": str(path_file), "rgba": True, "kind": "none", "settings": {"chunk": 100}}
     assert render_path(run, **options) == [folder]
-    assert len(asked) == 1 and (folder / "color" / "0001.png").read_bytes() == pixels
+    assert len(calls) == 1 and (folder / "color" / "0001.png").read_bytes() == pixels
     assert not list(folder.rglob("*.tmp"))
     for name in ("color/0000.png", "rgba/0000.png"):
         assert (folder / name).stat().st_mtime_ns == before[folder / name]
     render_path(run, **options)
-    assert len(asked) == 1, "all are there"
+    assert len(calls) == 1, "all frames exist"
 
 
 def test_frames_of_other_settings_are_not_mixed(rendered, run, path_file, tmp_path):
@@ -130,34 +109,36 @@ def test_frames_of_other_settings_are_not_mixed(rendered, run, path_file, tmp_pa
     with pytest.raises(ValueError, match="rendered with path '.*, or another --name"):
         render_path(run, path=str(other), kind="none")
     assert (rendered[0] / "color" / "0000.png").read_bytes() == kept
-    (folder,) = render_path(run, path=str(other), size=(6, 4), name="other", kind="none", chunk=100)
+    (folder,) = render_path(run, path=str(other), size=(6, 4), name="other", kind="none", settings={"chunk": 100})
     assert folder.name == "other-20" and iio.imread(folder / "color" / "0000.png").shape == (4, 6, 3)
-    (folder,) = render_path(run, path=str(other), size=(4, 6), name="other", kind="none", chunk=100, overwrite=True)
+    (folder,) = render_path(
+        run, path=str(other), size=(4, 6), name="other", kind="none", settings={"chunk": 100}, overwrite=True
+    )
     assert iio.imread(folder / "color" / "0001.png").shape == (6, 4, 3)
     (folder / "path.json").write_text("{")
     with pytest.raises(ValueError, match="path.json: cannot be read"):
         render_path(run, path=str(other), size=(4, 6), name="other", kind="none")
 
 
-def test_wrong_wishes_are_errors(run, monkeypatch):
+def test_wrong_arguments_are_errors(run, monkeypatch):
     for name in ("a/b", "..", ".x", "/x"):
-        with pytest.raises(ValueError, match="wanted a plain file name"):
+        with pytest.raises(ValueError, match="expected a plain file name"):
             render_path(run, name=name)
-    with pytest.raises(ValueError, match="video is 'avi', wanted one of auto, mp4"):
+    with pytest.raises(ValueError, match="video is 'avi', expected one of auto, mp4"):
         render_path(run, kind="avi")
     monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
     assert video.video_suffix("auto") == ".gif"
-    with pytest.raises(ValueError, match=r"no ffmpeg; pip install 'jaxnerf\[video\]'"):
+    with pytest.raises(ValueError, match="no ffmpeg; pip install imageio-ffmpeg"):
         video.video_suffix("mp4")
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")  # of reading it again
-@pytest.mark.skipif(not importlib.util.find_spec("imageio_ffmpeg"), reason="needs the video extra")
-def test_mp4_of_odd_sides_loses_its_last_row_and_column(tmp_path):
+@pytest.mark.skipif(not importlib.util.find_spec("imageio_ffmpeg"), reason="needs imageio-ffmpeg")
+def test_an_mp4_of_odd_sides_is_cropped_by_one_row_and_column(tmp_path):
     for index in range(4):
         frame = np.full((17, 25, 3), 60 * index, np.uint8)
         frame[-1], frame[:, -1] = 255, 255
-        pictures.write_whole(tmp_path / f"{index}.png", frame)
+        output_images.write_image(tmp_path / f"{index}.png", frame)
     target = tmp_path / "a.b.mp4"
     video.write_video(target, sorted(tmp_path.glob("*.png")), 10)
     found = iio.imread(target)
@@ -166,8 +147,8 @@ def test_mp4_of_odd_sides_loses_its_last_row_and_column(tmp_path):
     assert not list(tmp_path.glob("*.tmp*"))
 
 
-def test_the_program_chooses_a_path_and_says_so(run):
-    """As make demo calls it, but for the frames and the video."""
+def test_the_program_selects_a_path_and_reports_it(run):
+    """As `make demo` calls it, with fewer frames and a GIF."""
     flags = (
         f"--workdir={run}",
         "--overwrite",
@@ -181,5 +162,5 @@ def test_the_program_chooses_a_path_and_says_so(run):
     assert code == 0, err
     target = run / "renders" / "turntable-20"
     assert out.split() == [str(target), f"{target}.gif"]
-    assert "path: turntable, as the cameras look from all around; --path takes another" in err
+    assert "path: turntable, as the cameras look from all around; --path selects another" in err
     assert iio.imread(f"{target}.gif", index=...).shape == (2, 10, 10, 3)

@@ -1,4 +1,4 @@
-"""Each variant of the ablation lacks what its name says and nothing else, and what is off is not there."""
+"""Each variant of the ablation lacks the named part and nothing else, and finished runs are not repeated."""
 
 import functools
 import json
@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 
 from jaxnerf import Rays
-from jaxnerf.data.dataset import load_views
-from jaxnerf.training import workdir
-from jaxnerf.training.build import build
+from jaxnerf.data.dataset import load_split
+from jaxnerf.training.build import build_model
 from runs import smoke_config
-from studies import study
+from studies import common, study
 
-ablation_report, paired_runs = study("ablation_report"), study("paired_runs")
-reproducibility, ablation_variants = study("reproducibility"), study("ablation_variants")
-COMPLETE, variants = ablation_variants.COMPLETE, ablation_variants.variants
-BASE = paired_runs.configuration("ablation")
+ablation, reproducibility = study("ablation/ablation"), study("stability/reproducibility")
+COMPLETE, variants = ablation.COMPLETE, ablation.variants
+BASE = common.configuration("ablation")
 VARIANTS = variants(BASE, 100)
 RAYS = Rays(
     origins=jnp.zeros((2, 3)),
@@ -32,8 +30,8 @@ RAYS = Rays(
 @functools.cache
 def params(name):
     """Returns {"network/layer": shape of its kernel}."""
-    config = paired_runs.configuration("ablation", VARIANTS[name])
-    tree = jax.eval_shape(build(config).model.init, jax.random.key(0))
+    config = common.configuration("ablation", VARIANTS[name])
+    tree = jax.eval_shape(build_model(config).init, jax.random.key(0))
     return {
         f"{network}/{layer}": leaves["kernel"].shape
         for network, layers in tree.items()
@@ -43,15 +41,15 @@ def params(name):
 
 @functools.cache
 def traced(name, **fields):
-    """Returns the text of what a training step asks of the model; fields are more of the section sampling."""
+    """Returns the jaxpr of a rendering in training; fields are further ones of the section `sampling`."""
     more = {f"sampling.{field}": value for field, value in fields.items()}
-    one = build(paired_runs.configuration("ablation", VARIANTS[name] | more)).model
-    params = jax.eval_shape(one.init, jax.random.key(0))
+    model = build_model(common.configuration("ablation", VARIANTS[name] | more))
+    params = jax.eval_shape(model.init, jax.random.key(0))
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 2))
-    return str(jax.make_jaxpr(one.render)(keys, params, None, RAYS, 0))
+    return str(jax.make_jaxpr(model.render)(keys, params, None, RAYS, 0))
 
 
-def test_a_variant_changes_fields_that_are_there_and_all_of_them():
+def test_every_variant_changes_existing_fields_to_other_values():
     assert list(VARIANTS)[0] == COMPLETE and VARIANTS[COMPLETE] == {}
     flat = BASE.to_dict()
     for name, changes in VARIANTS.items():
@@ -61,7 +59,7 @@ def test_a_variant_changes_fields_that_are_there_and_all_of_them():
     assert len({json.dumps(changes, sort_keys=True) for changes in VARIANTS.values()}) == len(VARIANTS)
 
 
-def test_without_encoding_the_networks_get_three_numbers():
+def test_without_encoding_the_networks_take_three_numbers():
     whole, plain = params(COMPLETE), params("no positional encoding")
     assert {name for name in whole if whole[name] != plain[name]} == {
         f"{network}/{layer}" for network in ("coarse", "fine") for layer in ("trunk_0", "trunk_3", "view")
@@ -71,67 +69,46 @@ def test_without_encoding_the_networks_get_three_numbers():
     assert "scan[" in traced(COMPLETE) and "scan[" not in traced("no positional encoding")  # over octaves
 
 
-def test_without_view_dependence_there_are_no_layers_for_it():
+def test_without_view_dependence_its_layers_are_absent():
     gone = set(params(COMPLETE)) - set(params("no view dependence"))
     assert gone == {f"{network}/{layer}" for network in ("coarse", "fine") for layer in ("bottleneck", "view")}
 
 
-def test_without_hierarchy_one_network_is_asked_as_often_as_both():
+def test_without_hierarchy_one_network_is_evaluated_as_often_as_both():
     sampling = BASE.sampling
     both = 2 * sampling.num_coarse + sampling.num_fine
     assert VARIANTS["no hierarchy"]["sampling.num_coarse"] == both
     assert all(name.startswith("fine/") for name in params("no hierarchy"))
-    asked = {2 * sampling.num_coarse: COMPLETE, 2 * both - 2 * sampling.num_coarse: COMPLETE}
-    asked[2 * both] = "no hierarchy"
-    for count, name in asked.items():
+    evaluations = {2 * sampling.num_coarse: COMPLETE, 2 * both - 2 * sampling.num_coarse: COMPLETE}
+    evaluations[2 * both] = "no hierarchy"
+    for count, name in evaluations.items():
         found = [which for which in (COMPLETE, "no hierarchy") if f"f32[3,{count}]" in traced(which)]
         assert found == [name]  # the planes of x, y and z of two rays
 
 
-def test_without_stratification_nothing_is_drawn_along_rays():
+def test_without_stratification_no_random_numbers_are_drawn_along_rays():
     assert "random_bits" in traced(COMPLETE) and "random_bits" not in traced("no stratification")
     assert params("no stratification") == params(COMPLETE)
     assert "random_bits" in traced("no stratification", density_noise=1.0)
-    config = smoke_config()
-    config.sampling.stratified, config.occupancy.skip_empty = False, True
-    with pytest.raises(ValueError, match="sampling.stratified is False with space.skip_empty"):
-        build(config)
 
 
-def test_fewer_views_are_spread_over_all_and_others_stay():
+def test_fewer_views_are_evenly_spread_and_other_splits_stay():
     data = smoke_config().data
-    every = load_views(data, "train")
+    every = load_split(data, "train")
     data.num_views = 15
-    some = load_views(data, "train")
-    assert some.names == every.names[::4] and len(load_views(data, "test").names) == 8
+    some = load_split(data, "train")
+    assert some.names == every.names[::4] and len(load_split(data, "test").names) == 8
     data.hold_out = 6  # comes first
-    held = load_views(data, "held_out")
-    assert len(held.names) == 10 and not set(held.names) & set(load_views(data, "train").names)
+    held = load_split(data, "held_out")
+    assert len(held.names) == 10 and not set(held.names) & set(load_split(data, "train").names)
     for wrong in (-1, 51):
         data.num_views = wrong
-        with pytest.raises(ValueError, match=f"data.num_views is {wrong} of 50 views, wanted 1 to 50"):
-            load_views(data, "train")
+        with pytest.raises(ValueError, match=f"data.num_views is {wrong} of 50 views"):
+            load_split(data, "train")
 
 
-def test_a_run_from_before_there_was_a_choice_goes_on(tmp_path):
-    config = smoke_config()
-    workdir.claim(tmp_path, config)
-    old = json.loads((tmp_path / "config.json").read_text())
-    for section, field in (("data", "num_views"), ("sampling", "stratified")):
-        del old[section][field]
-    del old["coarse"]["encode"], old["fine"]["encode"]
-    (tmp_path / "config.json").write_text(json.dumps(old))
-    shapes = [jax.eval_shape(build(c).model.init, jax.random.key(0)) for c in (workdir.read_config(tmp_path), config)]
-    assert shapes[0] == shapes[1]
-    workdir.claim(tmp_path, config)
-    config.fine.encode = False
-    with pytest.raises(ValueError, match="fine.encode True -> False"):
-        workdir.claim(tmp_path, config)
-
-
-def test_a_finished_run_is_not_done_again_and_no_other_taken_for_it(tmp_path, monkeypatch):
+def test_a_finished_run_is_not_repeated_and_not_taken_for_another(tmp_path, monkeypatch):
     from jaxnerf.evaluation import evaluate, restore
-    from jaxnerf.training import loop
 
     trained = []
 
@@ -139,23 +116,23 @@ def test_a_finished_run_is_not_done_again_and_no_other_taken_for_it(tmp_path, mo
         trained.append(views.names[0])
         return len(trained) > 1
 
-    monkeypatch.setattr(loop, "train_and_evaluate", train)
-    monkeypatch.setattr(restore, "open_run", lambda folder: None)
+    monkeypatch.setattr(evaluate, "train_and_evaluate", train)
+    monkeypatch.setattr(restore, "restore_run", lambda folder: None)
     monkeypatch.setattr(evaluate, "score_run", lambda *given, views, **options: {"psnr": 20.0, "of": views.names[0]})
     monkeypatch.setattr(jax, "clear_caches", lambda: None)
     config = smoke_config()
-    assert paired_runs.run(config, tmp_path) is None  # stopped
+    assert common.run(config, tmp_path) is None  # stopped
     done = {"psnr": 20.0, "of": "test_000"}
-    assert [paired_runs.run(config, tmp_path) for _ in range(2)] == [done, done]
+    assert [common.run(config, tmp_path) for _ in range(2)] == [done, done]
     assert trained == ["train_000"] * 2
-    config.data.dir = "elsewhere"  # where the data lies is not what it is
-    assert paired_runs.finished(config, tmp_path) == done
+    config.data.dir = "elsewhere"  # the place of a dataset does not change a run
+    assert common.finished(config, tmp_path) == done
     config.train.lr_init = 1.0
-    with pytest.raises(ValueError, match="finished run with config.train.lr_init 0.0005, wanted 1.0"):
-        paired_runs.run(config, tmp_path)
+    with pytest.raises(ValueError, match="finished run with config.train.lr_init 0.0005, expected 1.0"):
+        common.run(config, tmp_path)
 
 
-def test_the_table_pairs_seeds_and_says_what_they_agree_on():
+def test_the_table_pairs_seeds_and_reports_what_they_agree_on():
     def run(psnr):
         return {"psnr": psnr, "ssim": 0.5, "parameters": 1234, "views": 8}
 
@@ -166,7 +143,7 @@ def test_the_table_pairs_seeds_and_says_what_they_agree_on():
         "15 octaves": {"2": run(30.0)},
     }
     cost = {COMPLETE: {"flops": 2e6, "time": 1.0, "ms": 3.0}}
-    lines = ablation_report.report({"steps": 1000, "cost": cost, "scenes": {"lego": {"views": 100, "runs": runs}}})
+    lines = ablation.report({"steps": 1000, "cost": cost, "scenes": {"lego": {"views": 100, "runs": runs}}})
     assert "1,000 steps" in lines[0] and "seeds 0, 1, 2, 10" in lines[0]
     assert "| complete | 21.00 +- 1.00 | - |  | 0.500 +- 0.000 | 1,234 | 2,000 | 1.00 |" in lines
     assert "| no hierarchy | 19.75 +- 1.06 | -1.00, -0.50 | worse | 0.500 +- 0.000 | 1,234 | - | - |" in lines
@@ -174,7 +151,7 @@ def test_the_table_pairs_seeds_and_says_what_they_agree_on():
     assert "| 30.00 | - | - | 0.500 |" in lines[7]
     assert lines[-1].endswith("Here worse: no hierarchy; undecided: 5 octaves.")
     verdicts = {(-1.0,): "worse (one seed)", (0.1, 0.2): "better", (0.0, 0.0): "undecided", (): "-"}
-    assert {differences: ablation_report.verdict(differences) for differences in verdicts} == verdicts
+    assert {differences: ablation.verdict(differences) for differences in verdicts} == verdicts
 
 
 @pytest.mark.parametrize(
@@ -184,7 +161,7 @@ def test_the_table_pairs_seeds_and_says_what_they_agree_on():
         (3, 25.0, "3 of 200 parameters differ, by up to 2.0e", "OUTSIDE"),
     ],
 )
-def test_the_lines_on_reproducibility_say_what_was_found(moved, four, same, where):
+def test_the_lines_on_reproducibility_report_the_differences(moved, four, same, where):
     one, other = np.zeros(200, np.float32), np.zeros(200, np.float32)
     other[:moved] = 2.0
     again = reproducibility.difference(one, other)

@@ -1,4 +1,4 @@
-"""The launch files for clusters: as far as they can be tried without one."""
+"""The launch files for clusters, as far as they can be tested without a cluster."""
 
 import os
 import re
@@ -13,7 +13,9 @@ FILES = ROOT / "experiments" / "cluster"
 
 
 def flags_of(program):
-    return set(re.findall(r'DEFINE_\w+\(\s*"(\w+)"', (ROOT / "jaxnerf" / f"{program}.py").read_text()))
+    """Returns the names of a program's flags."""
+    source = (ROOT / "jaxnerf" / f"{program}.py").read_text()
+    return {*re.findall(r'(?:DEFINE|define)_\w+\(\s*"(\w+)"', source), *re.findall(r"cli\.define_(config)\(", source)}
 
 
 def calls(text):
@@ -23,7 +25,7 @@ def calls(text):
 
 
 @pytest.mark.parametrize("name", ["train.sbatch", "eval.sbatch"])
-def test_batch_scripts_are_shell_and_know_the_flags(name):
+def test_batch_scripts_are_valid_shell_with_existing_flags(name):
     path = FILES / name
     subprocess.run(["bash", "-n", path], check=True)
     assert path.read_text().startswith("#!/usr/bin/env bash\n")
@@ -33,8 +35,8 @@ def test_batch_scripts_are_shell_and_know_the_flags(name):
         assert names and names <= flags_of(program), names - flags_of(program)
 
 
-def said(path, tmp_path, *arguments, **environment):
-    """Returns what a script would have called, srun and python being such that only say it."""
+def commands_of(path, tmp_path, *arguments, **environment):
+    """Returns the commands that a script runs: srun and python are replaced by scripts that print them."""
     for name in ("srun", "python"):
         (tmp_path / name).write_text(f'#!/bin/sh\necho {name} "$@"\n')
         (tmp_path / name).chmod(0o755)
@@ -44,16 +46,16 @@ def said(path, tmp_path, *arguments, **environment):
     return done.stdout.splitlines()
 
 
-def test_what_the_batch_scripts_call(tmp_path):
-    assert said(FILES / "train.sbatch", tmp_path, "c.py", "/a scene", "/run") == [
+def test_the_batch_scripts_run_the_expected_commands(tmp_path):
+    assert commands_of(FILES / "train.sbatch", tmp_path, "c.py", "/a scene", "/run") == [
         "srun --kill-on-bad-exit=1 python -m jaxnerf.train --config=c.py --data_dir=/a scene --workdir=/run --multihost"
     ]
     array = {"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "16"}
-    assert said(FILES / "eval.sbatch", tmp_path, "/run", **array) == [
+    assert commands_of(FILES / "eval.sbatch", tmp_path, "/run", **array) == [
         "python -m jaxnerf.eval --workdir=/run --shard=3/16",
         "python -m jaxnerf.render --workdir=/run --shard=3/16",
     ]
-    assert "--array=0-15" in (FILES / "eval.sbatch").read_text(), "from 0, as shards count"
+    assert "--array=0-15" in (FILES / "eval.sbatch").read_text(), "shards are numbered from 0"
 
 
 def job(name):
@@ -66,7 +68,7 @@ def job(name):
     return found, flags
 
 
-def test_kubernetes_trains_together_and_finds_the_first():
+def test_kubernetes_processes_start_together_and_find_the_first():
     found, flags = job("train.yaml")
     (service,) = [part for part in yaml.safe_load_all((FILES / "train.yaml").read_text()) if part["kind"] == "Service"]
     spec, name = found["spec"], found["metadata"]["name"]
@@ -77,7 +79,7 @@ def test_kubernetes_trains_together_and_finds_the_first():
     assert service["spec"]["selector"] == {"job-name": name}
     assert flags["coordinator"].split(":")[0] == f"{name}-0.{subdomain}", "a pod's name in an indexed job"
     assert (ROOT / flags["config"]).exists()
-    assert flags["stopped_code"] != "0", "a pod that was told to stop is not finished"
+    assert flags["stopped_code"] != "0", "an interrupted pod has not succeeded"
 
 
 def test_kubernetes_scores_in_shards():

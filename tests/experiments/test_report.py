@@ -1,4 +1,4 @@
-"""The results page holds what the workdirs do, and no workdir is passed over in silence."""
+"""The results page has every run, and reports every workdir that cannot be read."""
 
 import json
 import os
@@ -15,11 +15,11 @@ from runs import ROOT
 
 def fake(folder, seconds, psnr, side):
     """Writes the workdir of a run that was scored twice, on four views of one grey each."""
-    for share in (0.5, 1.0):
-        scored = folder / "eval" / str(int(100 * share))
-        results = {"step": int(100 * share), "training_seconds": share * seconds, "compile_seconds": 3.0}
-        results |= {"psnr": share * psnr, "ssim": 0.9, "views": 4, "parameters": 1234}
-        results |= protocol.card_of({"format": "blender", "split": "test"}, [(side, 2 * side)] * 4)
+    for fraction in (0.5, 1.0):
+        scored = folder / "eval" / str(int(100 * fraction))
+        results = {"step": int(100 * fraction), "training_seconds": fraction * seconds, "compile_seconds": 3.0}
+        results |= {"psnr": fraction * psnr, "ssim": 0.9, "views": 4, "parameters": 1234}
+        results |= protocol.of_images({"format": "blender", "split": "test"}, [(side, 2 * side)] * 4)
         for kind, level in (("gt-color", 0), ("color", 1)):
             (scored / kind).mkdir(parents=True)
             for view in range(4):
@@ -34,7 +34,7 @@ def fake(folder, seconds, psnr, side):
 
 def report(*arguments, **environment):
     """Returns (exit code, stderr) of the program."""
-    command = [sys.executable, ROOT / "experiments" / "report.py", *arguments]
+    command = [sys.executable, ROOT / "experiments" / "results" / "report.py", *arguments]
     path = os.pathsep.join([*environment.pop("first", []), str(ROOT)])
     ended = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
     return ended.returncode, ended.stderr
@@ -53,17 +53,17 @@ def runs(tmp_path_factory):
     ]
 
 
-def test_the_page_has_every_run_and_names_what_it_could_not_read(runs, tmp_path):
+def test_the_page_has_every_run_and_names_unreadable_workdirs(runs, tmp_path):
     code, errors = report(*runs, f"--out={tmp_path / 'page'}")
     assert code == 0, errors
-    assert f"left out {runs[1]}: lacks 'training_seconds'" in errors
+    assert f"skipped {runs[1]}: lacks 'training_seconds'" in errors
     page = (tmp_path / "page" / "report.md").read_text()
     assert "| two | 100 | 1.5 min | 3 s | 33.00 dB | 0.900 | 4 | 1,234 |" in page
     assert [line.split()[1] for line in page.splitlines() if " dB |" in line] == ["one"] * 2 + ["two"] * 2
     assert "- one: format blender, split test, views 4, size [8, 16]" in page
-    assert "set them beside: none" in page
-    rays_dropped = page.split("## Left out")[1]
-    assert f"{runs[1]}: lacks" in rays_dropped and f"{runs[3]}: has no eval/*/results.json" in rays_dropped
+    assert "Comparable with published tables: none" in page
+    skipped = page.split("## Skipped")[1]
+    assert f"{runs[1]}: lacks" in skipped and f"{runs[3]}: has no eval/*/results.json" in skipped
     sheet = iio.imread(tmp_path / "page" / "pictures.png")
     assert sheet.shape == (2 * 128, 6 * 256, 3)
     assert sheet[64, 128::256, 0].tolist() == [0, 1, 50, 51, 150, 151]  # views 0, 1 and 3 of four
@@ -72,14 +72,14 @@ def test_the_page_has_every_run_and_names_what_it_could_not_read(runs, tmp_path)
     assert ("psnr.png" in names) == ("![PSNR over time](psnr.png)" in page)
 
 
-def test_without_matplotlib_it_says_so_and_a_page_is_replaced_only_when_asked(runs, tmp_path):
+def test_missing_matplotlib_is_reported_and_a_page_is_replaced_only_with_overwrite(runs, tmp_path):
     (tmp_path / "matplotlib.py").write_text("raise ImportError")
     code, errors = report(runs[0], f"--out={tmp_path}", first=[str(tmp_path)])
-    assert code == 0 and "No plot, which needs matplotlib: pip install 'jaxnerf[experiments]'" in errors
+    assert code == 0 and "No plot, which needs matplotlib: pip install matplotlib" in errors
     page = (tmp_path / "report.md").read_text()
     assert "No plot, which needs matplotlib." in page and "psnr.png" not in page
     code, errors = report(runs[2], f"--out={tmp_path}")
-    assert code == 1 and "report.md: is there already; give --overwrite" in errors
+    assert code == 1 and "report.md: exists already; give --overwrite" in errors
     assert (tmp_path / "report.md").read_text() == page
     code, errors = report(runs[2], f"--out={tmp_path}", "--overwrite")
     assert code == 0 and "| two |" in (tmp_path / "report.md").read_text()

@@ -1,4 +1,4 @@
-"""The search for what a scene needs, on trials whose scores are made up."""
+"""The search for what a scene needs, on trials with invented scores."""
 
 import ast
 import importlib
@@ -7,11 +7,10 @@ import pathlib
 
 import pytest
 
-from configs import capture, lego_small, quickstart
-from studies import study
+from jaxnerf.configs import capture, lego_small, quickstart
+from studies import common, study
 
-needs_report, scene_needs = study("needs_report"), study("scene_needs")
-scene_parts = study("scene_parts")
+scene_needs = study("scene_needs/scene_needs")
 PRICE = {"use_viewdirs": 0.01, "width": 0.06, "num_freqs": 0.9, "depth": 0.05}  # dB of each field's change
 
 
@@ -44,8 +43,8 @@ def test_what_costs_less_than_the_loss_is_left_off_together(found):
     names, cost, passed = found.tried[-1]
     assert all(cost.mean + cost.margin <= 0.2 for _, cost, kept in found.tried if kept)
     assert not all(kept for _, _, kept in found.tried), "the search ended before anything was too much"
-    assert needs_report.verdict(found.parts["frequencies"][1], 0.2) == "needed"
-    assert needs_report.verdict(found.parts["view_dependence"][1], 0.2) == "not needed"
+    assert scene_needs.verdict(found.parts["frequencies"][1], 0.2) == "needed"
+    assert scene_needs.verdict(found.parts["view_dependence"][1], 0.2) == "not needed"
 
 
 def test_the_interval_is_student_s_over_the_seeds():
@@ -60,52 +59,42 @@ def test_the_interval_is_student_s_over_the_seeds():
 def test_what_is_written_can_be_trained_and_read(found, tmp_path, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()
+    settings = {"loss": 0.2, "steps": 800, "seeds": [0, 1, 2]}
+    lines = scene_needs.write(out, quickstart.get_config(), found, settings)
     readme = tmp_path / "README.md"
     readme.write_text("a\n<!-- needs -->\n<!-- end of needs -->\nb\n")
-    needs_report.write(
-        out,
-        quickstart.get_config(),
-        found,
-        {"loss": 0.2, "steps": 800, "seeds": [0, 1, 2]},
-        readme=str(readme),
-    )
+    common.replace(readme, lines, "needs")
     monkeypatch.syspath_prepend(str(out))
     config = importlib.import_module("needed").get_config()
-    expected = scene_parts.changed(quickstart.get_config(), found.overrides)
+    expected = common.changed(quickstart.get_config(), found.overrides)
     assert config.to_dict() == expected.to_dict()
     assert "| frequencies:" in readme.read_text() and readme.read_text().endswith("b\n")
     assert json.loads((out / "needs.json").read_text())["overrides"] == found.overrides
 
 
 @pytest.mark.parametrize("base", [lego_small, capture])
-def test_each_part_changes_what_it_says_until_nothing_is_left(base):
+def test_each_part_can_be_reduced_a_few_times_and_every_change_differs(base):
     config = base.get_config()
-    config.hash_grid.resolutions, config.occupancy.step_size, config.occupancy.outside = (
-        (16, 32, 64),
-        0.1,
-        "contracted",
-    )
-    config.fine.num_freqs = config.fine.num_freqs or 8
-    for name in scene_parts.PARTS:
+    config.hash_grid.resolutions, config.occupancy.step_size = (16, 32, 64), 0.1
+    config.occupancy.contracted = True
+    for name, part in scene_needs.PARTS.items():
         current = config
         for _ in range(8):
-            change = scene_parts.without(name, current, alpha=False)
-            if name != "samples" or not current.occupancy.skip_empty:
-                if not change:
-                    break
+            change = part(current, False)
+            if not change:
+                break
             for key, value in change.items():
                 section, field = key.split(".")
-                assert current[section][field] != value and (
-                    value is False or value not in (0, ()) or field == "num_fine"
-                )
-            current = scene_parts.changed(current, change)
+                assert current[section][field] != value and (value is False or value or field == "num_fine")
+            current = common.changed(current, change)
         else:
             assert name == "samples", f"{name} never ends"
-    assert scene_parts.without("background", lego_small.get_config(), alpha=True) == {}
+    assert scene_needs.background(lego_small.get_config(), alpha=True) == {}
 
 
-def test_every_part_says_what_it_leaves_off():
-    tree = ast.parse(pathlib.Path(scene_parts.__file__).read_text())
-    public = {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name[0] != "_"}
-    assert public - {"without", "changed"} == set(scene_parts.PARTS)
-    assert all(part.__doc__ for part in scene_parts.PARTS.values())
+def test_the_docstring_of_every_part_describes_its_removal():
+    tree = ast.parse(pathlib.Path(scene_needs.__file__).read_text())
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    parts = {node.name for node in functions if [arg.arg for arg in node.args.args] == ["config", "alpha"]}
+    assert parts == set(scene_needs.PARTS)
+    assert all(part.__doc__ for part in scene_needs.PARTS.values())

@@ -1,4 +1,4 @@
-"""The study of starts: what it takes from a training's lines, and a training that never takes a step."""
+"""The study of startup times: parsing of the output of training, and a training that takes no step."""
 
 import sys
 
@@ -6,34 +6,38 @@ import pytest
 
 from studies import study
 
-startup = study("startup")
-LINES = """
-precision   parameters float32; compiled in 1.5 s
-steps       0 of 1 taken, 64 rays each
+startup = study("speed/startup")
+LINES = "steps         0 of 1 taken, 64 rays each"
+ROW = '{"step": 1, "seconds": 0.1, "compile_seconds": 1.5}'
+PROGRAM = """#!/bin/sh
+sleep 0.2
+for flag; do case $flag in --workdir=*) mkdir -p ${flag#*=}; echo '%s' > ${flag#*=}/metrics.jsonl;; esac; done
+echo '%s'
+exit %d
 """
 
 
 @pytest.fixture
 def training(tmp_path, monkeypatch):
-    """Makes trainings say some lines and end with a code."""
+    """Replaces training by a program that writes a row of metrics, prints some lines and exits with a code."""
 
-    def says(text, code):
+    def prints(text, code):
         fake = tmp_path / "python"
-        fake.write_text(f"#!/bin/sh\nsleep 0.2\ncat <<EOF\n{text}\nEOF\nexit {code}\n")
+        fake.write_text(PROGRAM % (ROW, text, code))
         fake.chmod(0o755)
         monkeypatch.setattr(sys, "executable", str(fake))
 
-    return says
+    return prints
 
 
 def test_seconds_until_the_first_step(training, tmp_path):
-    training(f"{LINES}1/1  8.80 dB  1,375 rays/s  0:00 done, 0:00 left", 0)
+    training(f"{LINES}\n1/1  8.80 dB  1,375 rays/s  0:00 elapsed, 0:00 left", 0)
     seconds, compiling = startup.start("smoke", tmp_path, 0)
     assert 0.2 <= seconds < 60 and compiling == 1.5
 
 
-@pytest.mark.parametrize("text, code", [(LINES, 0), (f"{LINES}1/1  8.80 dB\nerror: no room", 1)])
+@pytest.mark.parametrize("text, code", [(LINES, 0), (f"{LINES}\n1/1  8.80 dB\nerror: no room", 1)])
 def test_a_training_without_a_first_step_is_named(training, tmp_path, text, code):
     training(text, code)
-    with pytest.raises(ValueError, match="smoke: training did not come to its first step"):
+    with pytest.raises(ValueError, match="smoke: training did not reach its first step"):
         startup.start("smoke", tmp_path, 0)

@@ -74,7 +74,7 @@ def exact_of(name):
 
 
 @functools.cache
-def asked(name):
+def evaluated(name):
     """Returns (density, x [N, 3]) -> (density [N], rgb [N, 3]) of the scene, compiled once."""
     run = jax.jit(lambda density, x: MEDIA[name](density).scene(x, x[:1]))
     return lambda density, x: [np.asarray(part) for part in run(density, x)]
@@ -91,19 +91,19 @@ def edges_on(name, origin, direction):
 
 def reference(name, density, origin, direction, near, far):
     """Returns rgb, opacity, transmittance and depth by nested quadrature of the scene along one ray."""
-    places, shares = np.polynomial.legendre.leggauss(16)
+    places, gauss_weights = np.polynomial.legendre.leggauss(16)
     panels = 8
     places = ((np.arange(panels)[:, None] + 0.5 + places / 2) / panels).reshape(-1)
-    shares = np.tile(shares, panels) / (2 * panels)
+    gauss_weights = np.tile(gauss_weights, panels) / (2 * panels)
     size = np.linalg.norm(direction)
     cuts = [t for t in edges_on(name, origin, direction) if near < t < far]
     cuts = np.array(sorted([*cuts, *np.linspace(near, far, 5)]))
 
     def optical_depth(start, t):
-        """Returns that of [start, t], which holds no edge, and the scene's answer at t."""
+        """Returns that of [start, t], which holds no edge, and the scene's values at t."""
         at = np.append(start + places * (t - start), t)
-        sigma, rgb = asked(name)(density, origin + at[:, None] * direction)
-        return size * (t - start) * (shares @ sigma[:-1]), sigma[-1], rgb[-1]
+        sigma, rgb = evaluated(name)(density, origin + at[:, None] * direction)
+        return size * (t - start) * (gauss_weights @ sigma[:-1]), sigma[-1], rgb[-1]
 
     inner = [optical_depth(a, np.nextafter(b, a))[0] for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
     before = np.concatenate([[0.0], np.cumsum(inner)])
@@ -116,8 +116,8 @@ def reference(name, density, origin, direction, near, far):
                 return sigma * size * np.exp(-above - tau) * np.array([*rgb, 1.0, t])
 
             total += scipy.integrate.quad_vec(stopping, start, end, epsabs=1e-12, epsrel=1e-11)[0]
-    passing = np.exp(-before[-1])
-    return total[:3], total[3], passing, total[4] + passing * far
+    transmitted = np.exp(-before[-1])
+    return total[:3], total[3], transmitted, total[4] + transmitted * far
 
 
 @pytest.mark.parametrize("density", [1e-9, 3.0])
@@ -126,11 +126,11 @@ def test_exact_is_the_integral_of_the_scene(name, density):
     rays = make_rays()
     got = exact_of(name)(density, rays)
     for i, ray in enumerate(RAYS):
-        wanted = reference(name, density, *(part[i] for part in one_ray_each(rays)))
-        for part, value in zip(got._fields, wanted, strict=True):
+        expected = reference(name, density, *(part[i] for part in one_ray_each(rays)))
+        for part, value in zip(got._fields, expected, strict=True):
             np.testing.assert_allclose(getattr(got, part)[i], value, rtol=1e-9, atol=1e-9, err_msg=ray)
         # Also in thin fog to its own digits.
-        np.testing.assert_allclose(got.opacity[i], wanted[1], rtol=1e-9, atol=1e-30, err_msg=ray)
+        np.testing.assert_allclose(got.opacity[i], expected[1], rtol=1e-9, atol=1e-30, err_msg=ray)
     assert (got.opacity >= 0).all() and (got.opacity <= 1).all()
     np.testing.assert_allclose(got.opacity + got.transmittance, 1, atol=1e-15)
 
@@ -151,14 +151,14 @@ def test_a_medium_without_density_is_empty(name):
 
 @pytest.mark.parametrize("name", SHARP)
 def test_homogeneous_media_are_exact_however_thick(name):
-    """The light stops one mean free path behind where the fog begins."""
+    """The expected depth is one mean free path behind the start of the fog."""
     rays = make_rays(["starts inside"])
     density = 1e9
     got = exact_of(name)(density, rays)
     np.testing.assert_array_equal(got.opacity, 1)
     free_path = 1 / (density * np.linalg.norm(rays.directions[0]))
     np.testing.assert_allclose(got.depth - rays.near, free_path, rtol=1e-9)
-    colour = asked(name)(density, rays.origins)[1]
+    colour = evaluated(name)(density, rays.origins)[1]
     np.testing.assert_allclose(got.rgb, colour, atol=1e-9)
 
 
@@ -188,17 +188,17 @@ def test_the_depth_of_a_linear_medium_is_an_error_function(rate):
     np.testing.assert_allclose(got.depth, below + free, rtol=1e-12)
 
 
-def test_a_blob_lets_through_what_error_functions_say():
+def test_the_transmittance_of_a_blob_is_that_of_error_functions():
     density, deviation, far = 2.0, 0.4, 6.0
 
-    def passing(t):
+    def transmitted(t):
         unit = np.sqrt(2) * deviation
         erf = scipy.special.erf
         return np.exp(-density * deviation * np.sqrt(np.pi / 2) * (erf((t - 3) / unit) + erf(3 / unit)))
 
     got = compiled(analytic.blob(density, deviation=deviation).exact)(upward(-3.0, 0.0, far))
-    np.testing.assert_allclose(got.transmittance, passing(far), rtol=1e-12)
-    np.testing.assert_allclose(got.depth, scipy.integrate.quad(passing, 0, far)[0], rtol=1e-9)
+    np.testing.assert_allclose(got.transmittance, transmitted(far), rtol=1e-12)
+    np.testing.assert_allclose(got.depth, scipy.integrate.quad(transmitted, 0, far)[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", [*SHARP, "atmosphere"])
@@ -209,7 +209,7 @@ def test_a_batch_is_its_rays(name):
 
 
 @pytest.mark.parametrize("name", MEDIA)
-def test_the_scene_answers_in_the_shapes_of_a_scene(name):
+def test_the_outputs_have_the_shapes_of_a_scene(name):
     scene = MEDIA[name](0.7).scene
     for lead in [(5,), (2, 5), (2, 3, 5)]:
         for dtype in (jnp.float32, jnp.float64):
@@ -239,7 +239,7 @@ def slopes(name):
 
 @pytest.mark.parametrize("name", MEDIA)
 def test_gradients_are_finite_and_those_of_central_differences(name):
-    """Everywhere finite; equal where there is one: not along a tangent, or on an edge."""
+    """Finite everywhere; equal where a derivative exists: not along a tangent, or on an edge."""
     rays, step = make_rays(), 1e-5
     at = np.array([0.0, 1e-9, 0.7, 12.0])[:, None] * np.eye(7)[0]
     backward, numbers = slopes(name)
@@ -248,5 +248,5 @@ def test_gradients_are_finite_and_those_of_central_differences(name):
     edgeless = name not in SHARP and name != "linear"
     kept = [i for i, ray in enumerate(RAYS) if edgeless or not ("level" in ray or ray == "grazes")]
     for i, move in enumerate(step * np.eye(7)):
-        wanted = (numbers(at + move, rays) - numbers(at - move, rays)) / (2 * step)
-        np.testing.assert_allclose(got[..., i][:, kept], wanted[:, kept], rtol=1e-6, atol=1e-6)
+        expected = (numbers(at + move, rays) - numbers(at - move, rays)) / (2 * step)
+        np.testing.assert_allclose(got[..., i][:, kept], expected[:, kept], rtol=1e-6, atol=1e-6)

@@ -1,4 +1,4 @@
-"""The fast field: what its grids interpolate, what its harmonics are, and what it costs."""
+"""The hash grid: interpolation of its levels, spherical harmonics, gradients and cost."""
 
 import jax
 import jax.numpy as jnp
@@ -16,18 +16,18 @@ fast_harmonics = compiled(harmonics)
 
 @compiled
 def dense(table, place):
-    """What a level that begins at row 7 gives."""
+    """Returns the features of a level that begins at row 7."""
     return interpolate(table, list(place), SIZE, rows=range(7, 7 + COUNT))
 
 
 @compiled
 def shared(table, place):
-    """What a level of 9 x 9 x 9 vertices in 64 rows from row 5 on gives."""
+    """Returns the features of a level of 9 x 9 x 9 vertices in 64 rows from row 5 on."""
     return interpolate(table, list(place), (9, 9, 9), rows=range(5, 69))
 
 
 def level(values):
-    """Returns a table with the values [COUNT, F] from row 7 on, and rows that nothing may read around."""
+    """Returns a table with the values [COUNT, F] from row 7 on, between rows that must not be read."""
     return np.pad(np.float32(values), ((7, 4), (0, 0)), constant_values=np.nan)
 
 
@@ -50,7 +50,7 @@ def inside(shape, seed=2):
 def field():
     """A small field with a dense level and one that shares rows, parameters, and its compiled functions."""
     # A list, as JSON gives it.
-    field = hash_grid_field(**BOX, resolutions=[4, 9], table_size=100, features=2, view_width=8)
+    field = hash_grid_field(**BOX, resolutions=[4, 9], table_size=100, features_per_level=2, view_width=8)
     init = compiled(field.init)
     rng = np.random.default_rng(3)
     params = jax.tree.map(
@@ -80,8 +80,8 @@ def test_at_its_vertices_a_dense_level_is_its_table():
 
 
 @pytest.mark.parametrize("at", [dense, shared], ids=["dense", "shared"])
-def test_places_that_try_to_leave_the_table_stay_in_it(at):
-    """All around are NaN rows: at 0, at 1, one float beside them, outside, and far outside."""
+def test_places_outside_the_box_read_no_rows_outside_the_level(at):
+    """Rows around the level are NaN. Places are 0, 1, their neighbouring floats, outside, and far outside."""
     table = level(np.ones((COUNT, 2))) if at is dense else np.pad(np.ones((64, 2), "f"), ((5, 3), (0, 0)))
     if at is shared:
         table[:5] = table[-3:] = np.nan
@@ -90,13 +90,13 @@ def test_places_that_try_to_leave_the_table_stay_in_it(at):
     np.testing.assert_allclose(at(table, grid), np.ones((grid.shape[1], 2)), rtol=1e-6)
 
 
-def test_outside_the_answer_is_that_of_the_nearest_place_inside():
+def test_outside_the_features_are_those_of_the_nearest_place_inside():
     table = level(np.random.default_rng(6).normal(size=(COUNT, 2)))
     points = places(100, low=-1.0, high=2.0)
     np.testing.assert_array_equal(dense(table, points), dense(table, np.clip(points, 0, 1)))
 
 
-def test_a_place_that_is_nan_shows_and_harms_nothing_else():
+def test_a_nan_place_shows_and_affects_no_other():
     table = np.random.default_rng(7).normal(size=(100, 2)).astype(np.float32)
     points = places(10)
     wrong = points.copy()
@@ -108,7 +108,7 @@ def test_a_place_that_is_nan_shows_and_harms_nothing_else():
         np.testing.assert_array_equal(got[whole], want[whole])
 
 
-def test_a_level_with_more_vertices_than_rows_shares_them_all():
+def test_a_level_with_more_vertices_than_rows_uses_every_row():
     """Every one of the 64 rows is read by some vertex, and about as often as any other."""
     corners = np.stack(np.meshgrid(*[np.float32(np.arange(9) / 8)] * 3, indexing="ij")).reshape(3, -1)
     rows = np.pad(np.eye(64, dtype=np.float32), ((5, 0), (0, 0)))
@@ -118,7 +118,7 @@ def test_a_level_with_more_vertices_than_rows_shares_them_all():
     assert counts.sum() == 729 and counts.min() >= 1 and counts.max() < 40
 
 
-def test_slopes_are_those_of_the_linear_pieces():
+def test_gradients_are_those_of_the_linear_pieces():
     table, points = level(np.random.default_rng(8).normal(size=(COUNT, 2))), places(6, low=0.02, high=0.23)
 
     def first(place):
@@ -132,7 +132,7 @@ def test_slopes_are_those_of_the_linear_pieces():
         np.testing.assert_allclose(slopes[axis], (dense(table, moved) - dense(table, points))[:, 0] / step, atol=1e-3)
 
 
-def test_vertices_are_as_many_as_sides_are_long():
+def test_the_number_of_vertices_is_proportional_to_the_sides():
     assert vertices([2, 2, 2], 16) == (16, 16, 16)
     assert vertices([2, 3, 1], 13) == (9, 13, 5)
     assert vertices([1e-6, 1, 1e3], 5) == (2, 2, 5)  # two at least: a cell
@@ -157,7 +157,7 @@ def test_harmonics_are_orthonormal():
 def test_harmonics_are_their_closed_forms():
     x, y, z = np.float64(directions((4, 5))).transpose(2, 0, 1)
     root = lambda value: np.sqrt(value / np.pi)  # noqa: E731
-    wanted = [
+    expected = [
         root(1) / 2 + 0 * x,
         *(root(3 / 4) * value for value in (y, z, x)),
         *(root(15) / 2 * value for value in (x * y, y * z, x * z)),
@@ -166,10 +166,10 @@ def test_harmonics_are_their_closed_forms():
     ]
     got = fast_harmonics(directions((4, 5)))
     assert got.shape == (4, 5, 9)
-    np.testing.assert_allclose(got, np.stack(wanted, -1), atol=1e-6)
+    np.testing.assert_allclose(got, np.stack(expected, -1), atol=1e-6)
 
 
-def test_a_direction_a_ray_is_a_direction_a_sample(field):
+def test_one_direction_per_ray_equals_one_per_sample(field):
     _, params, apply, _ = field
     x, viewdirs = inside((6, 4)), directions((6, 1))
     density, rgb = apply(params, x, viewdirs)
@@ -197,7 +197,7 @@ def test_outside_the_box_the_field_is_that_of_the_nearest_point(field):
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1.0, 1e4, 1e30])
-def test_whatever_the_features_answers_and_slopes_are_finite(field, size, finite={}):  # noqa: B006
+def test_outputs_and_gradients_are_finite_for_features_of_any_size(field, size, finite={}):  # noqa: B006
     plain, params, _, _ = field
 
     def total(params, x, viewdirs):
@@ -211,7 +211,7 @@ def test_whatever_the_features_answers_and_slopes_are_finite(field, size, finite
     assert density.max() <= np.exp(15) * 1.001 and (density >= 0).all()
 
 
-def test_what_is_drawn_at_first_depends_on_the_key_alone(field):
+def test_the_initial_parameters_depend_on_the_key_alone(field):
     init, apply = field[3], field[2]
     first, again, other = (init(jax.random.key(seed)) for seed in (0, 0, 1))
     assert_same(first, again, rtol=0, atol=0)
@@ -222,7 +222,7 @@ def test_what_is_drawn_at_first_depends_on_the_key_alone(field):
     np.testing.assert_allclose(density, 1, atol=0.5)  # thin fog to begin with
 
 
-def test_without_view_directions_there_is_nothing_for_them():
+def test_without_view_directions_their_parameters_and_operations_are_absent():
     flops, rows = {}, {}
     x, viewdirs = inside((32, 16)), directions((32, 1))
     for use_viewdirs in (True, False):
@@ -232,28 +232,28 @@ def test_without_view_directions_there_is_nothing_for_them():
         apply = jax.jit(plain.apply).lower(params, x, viewdirs).compile()
         flops[use_viewdirs] = apply.cost_analysis()["flops"]
     assert rows == {True: 15 + 9, False: 15}
-    # At least the hidden layer's product with 9 harmonics a sample.
+    # At least the hidden layer's product with 9 harmonics of each sample.
     assert flops[True] - flops[False] >= 2 * 9 * 128 * 32 * 16
     params = jax.tree.map(lambda leaf: np.ones(leaf.shape, leaf.dtype), params)
     assert_same(apply(params, x, viewdirs), apply(params, x, -viewdirs), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
-    "options, wanted",
+    "options, message",
     [
-        ({"lower": (0, 0, 0), "upper": (1, 0, 1)}, "the box is .* wanted lower < upper"),
+        ({"lower": (0, 0, 0), "upper": (1, 0, 1)}, "the box is .* expected lower < upper"),
         ({"lower": (0, 0), "upper": (1, 1)}, "the box is"),
         ({"lower": (), "upper": ()}, "the box is"),
         ({"lower": (0,) * 3, "upper": (float("nan"),) * 3}, "the box is"),
-        ({**BOX, "resolutions": ()}, r"resolutions are \(\), wanted one, of at least 2"),
+        ({**BOX, "resolutions": ()}, r"resolutions are \(\), expected at least one, each at least 2"),
         ({**BOX, "resolutions": (8, 1)}, r"resolutions are \(8, 1\)"),
     ],
 )
-def test_what_cannot_be_a_grid_is_named(options, wanted):
-    with pytest.raises(ValueError, match=f"grid_field: {wanted}"):
+def test_wrong_options_are_named(options, message):
+    with pytest.raises(ValueError, match=f"hash_grid_field: {message}"):
         hash_grid_field(**options)
 
 
-def test_a_table_without_rows_of_features_is_named():
+def test_a_table_of_another_shape_is_named():
     with pytest.raises(ValueError, match="interpolate: table"):
         interpolate(jnp.ones(8), [jnp.zeros(3)] * 3, (2, 2, 2), rows=range(8))

@@ -65,15 +65,15 @@ def test_it_is_the_papers_network(paper):
     x, viewdirs = inputs()
     density, rgb = apply(params, x, viewdirs)
     assert density.shape == (6, 4) and rgb.shape == (6, 4, 3)
-    wanted = [[plain_forward(params, point, viewdirs[i, 0]) for point in x[i]] for i in range(6)]
-    wanted_density = np.array([[pair[0] for pair in row] for row in wanted])
-    wanted_rgb = np.array([[pair[1] for pair in row] for row in wanted])
-    assert 0 < (wanted_density > 0).mean() < 1, "the test's inputs prove nothing"
-    np.testing.assert_allclose(density, wanted_density, atol=1e-5)
-    np.testing.assert_allclose(rgb, wanted_rgb, atol=1e-5)
+    expected = [[plain_forward(params, point, viewdirs[i, 0]) for point in x[i]] for i in range(6)]
+    expected_density = np.array([[pair[0] for pair in row] for row in expected])
+    expected_rgb = np.array([[pair[1] for pair in row] for row in expected])
+    assert 0 < (expected_density > 0).mean() < 1, "the test's inputs prove nothing"
+    np.testing.assert_allclose(density, expected_density, atol=1e-5)
+    np.testing.assert_allclose(rgb, expected_rgb, atol=1e-5)
 
 
-def test_density_is_of_position_alone_and_colour_is_not(paper):
+def test_density_depends_on_position_alone_and_colour_does_not(paper):
     _, _, params, apply = paper
     x, viewdirs = inputs()
     density, rgb = apply(params, x, viewdirs)
@@ -82,7 +82,7 @@ def test_density_is_of_position_alone_and_colour_is_not(paper):
     assert (np.abs(rgb - other_rgb).max(axis=-1) > 1e-4).all()
 
 
-def test_a_direction_a_sample_is_a_direction_a_ray(paper):
+def test_one_direction_per_ray_equals_one_per_sample(paper):
     _, _, params, apply = paper
     x, viewdirs = inputs()
     each = np.broadcast_to(viewdirs, x.shape)
@@ -100,7 +100,7 @@ def test_it_starts_with_glorot_and_no_bias(paper):
             np.testing.assert_allclose(kernel.std(), bound / np.sqrt(3), rtol=0.05, err_msg=name)
 
 
-def test_without_view_directions_there_is_nothing_for_them():
+def test_without_view_directions_their_parameters_are_absent():
     field = mlp_field(use_viewdirs=False)
     params = jax.eval_shape(field.init, jax.random.key(0))
     assert not {"bottleneck", "view"} & set(params)
@@ -112,7 +112,7 @@ def test_without_view_directions_there_is_nothing_for_them():
         np.testing.assert_array_equal(a, b)
 
 
-def test_layers_with_no_activation_between_them_cost_no_sample_two_products():
+def test_layers_without_an_activation_between_them_cost_one_product_per_sample():
     width, view_width, samples = 64, 32, 2**12
     field = mlp_field(depth=2, width=width, view_width=view_width, num_freqs=1, num_view_freqs=1)
     params = jax.eval_shape(field.init, jax.random.key(0))
@@ -125,11 +125,11 @@ def test_layers_with_no_activation_between_them_cost_no_sample_two_products():
 
 
 @pytest.mark.parametrize("options", [{}, {"key": True}, {"density_noise": 1.0}])
-def test_noise_that_is_off_is_absent(options):
+def test_without_noise_no_random_numbers_are_drawn(options):
     assert "random_bits" not in _jaxpr(**options)
 
 
-def test_noise_that_is_on_is_one_normal_number_a_sample():
+def test_noise_is_one_normal_number_per_sample():
     assert "random_bits" in _jaxpr(key=True, density_noise=1.0)
     field = mlp_field(depth=1, width=4, density_activation="softplus")
     params = jax.jit(field.init)(jax.random.key(0))
@@ -151,51 +151,51 @@ def _jaxpr(key=None, density_noise=0.0):
     )
 
 
-def test_bfloat16_is_for_the_layers_alone():
+def test_bfloat16_concerns_the_layers_alone():
     options = {"depth": 2, "width": 16, "num_freqs": 4}
     exact, rough = mlp_field(**options), mlp_field(**options, compute_dtype=jnp.bfloat16)
     params, points = jax.jit(rough.init)(jax.random.key(0)), inputs()
     assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
-    answers = [jax.jit(field.apply)(params, *points) for field in (rough, exact)]
-    for a, b in zip(*answers, strict=True):
+    outputs = [jax.jit(field.apply)(params, *points) for field in (rough, exact)]
+    for a, b in zip(*outputs, strict=True):
         assert a.dtype == b.dtype == jnp.float32
         assert 0 < np.abs(a - b).max() < 0.05
 
 
 def test_an_unknown_activation_is_named():
-    with pytest.raises(ValueError, match="density_activation is 'tanh', wanted one of .*relu"):
+    with pytest.raises(ValueError, match="density_activation is 'tanh', expected one of .*relu"):
         mlp_field(density_activation="tanh")
 
 
 FIELDS = {
     "mlp": mlp_field(depth=2, width=16, view_width=8, num_freqs=3),
-    "grid": hash_grid_field(lower=(-1, -1, -1), upper=(1, 1, 1), resolutions=(8,), width=16, view_width=8),
+    "hash_grid": hash_grid_field(lower=(-1, -1, -1), upper=(1, 1, 1), resolutions=(8,), width=16, view_width=8),
 }
 
 
 @pytest.mark.parametrize(
     "name, rays, samples, directions",
-    [("mlp", 16, 64, 1), ("mlp", 16, 64, 64), ("mlp", 512, 1, 1), ("mlp", 2, 512, 1), ("grid", 2, 512, 1)],
+    [("mlp", 16, 64, 1), ("mlp", 16, 64, 64), ("mlp", 512, 1, 1), ("mlp", 2, 512, 1), ("hash_grid", 2, 512, 1)],
 )
-def test_rows_that_collide_in_the_cache_are_parted_and_none_can_tell(name, rays, samples, directions):
-    """Answers and slopes for 512 samples or 1024 are those of the first ray and of the others."""
+def test_padding_for_the_cache_changes_no_output(name, rays, samples, directions):
+    """Outputs and gradients for 512 or 1024 samples are those of the first ray and of the others."""
     field, rng = FIELDS[name], np.random.default_rng(0)
     x, pull = rng.uniform(-1, 1, (2, rays, samples, 3)).astype(np.float32)
     viewdirs = rng.normal(size=(rays, directions, 3)).astype(np.float32)
     params = jax.jit(field.init)(jax.random.key(0))
 
     @jax.jit
-    def ask(params, x, viewdirs, pull):
+    def evaluate(params, x, viewdirs, pull):
         def total(params, x):
             density, rgb = field.apply(params, x, viewdirs)
             return (pull * (density[..., None] + rgb)).sum(), (density, rgb)
 
         return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(params, x)
 
-    (_, answers), (slopes, moves) = ask(params, x, viewdirs, pull)
+    (_, outputs), (slopes, moves) = evaluate(params, x, viewdirs, pull)
     first, rest = ([value[rows] for value in (x, viewdirs, pull)] for rows in (slice(1), slice(1, None)))
-    parts = [ask(params, *part) for part in (first, rest)]
+    parts = [evaluate(params, *part) for part in (first, rest)]
     close = {"rtol": 1e-5, "atol": 1e-5}
-    assert_same(answers, jax.tree.map(lambda *some: jnp.concatenate(some), *(part[0][1] for part in parts)))
+    assert_same(outputs, jax.tree.map(lambda *some: jnp.concatenate(some), *(part[0][1] for part in parts)))
     assert_same(moves, jnp.concatenate([part[1][1] for part in parts]), **close)
     assert_same(slopes, jax.tree.map(jnp.add, *(part[1][0] for part in parts)), **close)

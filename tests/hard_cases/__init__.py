@@ -1,10 +1,10 @@
-"""The hard cases: what goes wrong in released systems, what each case measures, and how large that may be.
+"""Hard cases: numerical errors known from released systems, each with a measurement and its bound.
 
     from hard_cases import ALL
     for case in ALL: print(case, *case.run(), sep="\\n    ")
 
-A family is a file with cases(...), which takes the function under test, so that the same cases can be
-put to another form of it (naive.py has the released codes'). Inputs are float32; oracles are
+A family is a file with cases(...), which takes the function under test, so that the same cases can test
+another implementation (naive.py has those of the released codes). Inputs are float32; oracles are
 float64 or longer, independent of jaxnerf: exact.py for compositing, formulas in the families' own files,
 tests/oracle.py for SSIM.
 """

@@ -33,7 +33,7 @@ def cases():
 
 
 def forward():
-    """Returns {name: (origins [COUNT, 3], directions [COUNT, 3])} of rays that NDC is asked for."""
+    """Returns {name: (origins [COUNT, 3], directions [COUNT, 3])} of rays to convert to NDC."""
     rng = np.random.default_rng(0)
     origins, lateral = 0.3 * rng.normal(size=(COUNT, 3)), rng.normal(size=(COUNT, 2))
 

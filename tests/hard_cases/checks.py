@@ -1,4 +1,4 @@
-"""What a case is and what it measures, and how errors are counted."""
+"""Cases, their checks, and how errors are measured."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,9 +10,9 @@ TINY = 1.2e-38  # below the smallest normal float32, which is 0 on many devices:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """One figure beside the largest it may be."""
+    """A measured error and its bound."""
 
-    what: str  # as "weights", or "gradient of colour by density"
+    what: str  # for example "weights", or "gradient of colour by density"
     error: float
     bar: float
     kind: str = "value"  # "value", "gradient", "finite", or "chance" for what draws decide
@@ -27,7 +27,7 @@ class Check:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One thing that goes wrong elsewhere."""
+    """One numerical problem of other implementations."""
 
     family: str
     name: str

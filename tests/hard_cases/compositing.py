@@ -8,7 +8,7 @@ import numpy as np
 
 from hard_cases import exact
 from hard_cases.checks import TINY, Case, Check, absolute, count, not_finite, of_largest, relative
-from hard_cases.rays import RAYS, UNSEEN
+from hard_cases.rays import MASKED_NAN, RAYS
 from jaxnerf import Rays, Samples, render_samples
 
 COLOURS = ("red", "green", "blue")
@@ -17,7 +17,7 @@ ARGUMENTS = ("density", "rgb", "t", "delta", "origins", "directions")
 
 
 def cases(render=render_samples, outputs="float32", sizes=None):
-    """Returns the cases; outputs is the type of the scene's answers, sizes are the numbers of samples."""
+    """Returns the cases; outputs is the type of the scene's outputs, sizes are the numbers of samples."""
     family = "compositing" if outputs == "float32" else f"compositing, {outputs}"
     return [
         Case(family, name, functools.partial(checks, name, render=render, outputs=outputs))
@@ -35,7 +35,7 @@ def checks(name, *, render=render_samples, outputs="float32"):
     seen = [got["values"][OUTPUTS.index(output)] for output in ("opacity", "depth", "disparity")]
     opacity, depth, disparity = seen
     weights, total = got["weights"], got["weights"].astype(np.float64).sum()
-    wanted = np.array([want[output] for output in OUTPUTS], np.float64)
+    expected = np.array([want[output] for output in OUTPUTS], np.float64)
     found = [
         Check("weights, beyond 1e-9", relative(weights, want["weights"], beyond=1e-9), 2e-5),
         Check("weights below 0", count(~(weights >= 0)), 0),
@@ -46,9 +46,9 @@ def checks(name, *, render=render_samples, outputs="float32"):
         Check("weights + transmittance", absolute(got["whole"], 1), 1e-6),
         Check("depth", relative(depth, want["depth"]), 1e-5),
         Check("disparity", relative(disparity, want["disparity"]), 1e-5),
-        Check("outputs not finite", not_finite(weights, got["values"][np.isfinite(wanted)]), 0, "finite"),
+        Check("outputs not finite", not_finite(weights, got["values"][np.isfinite(expected)]), 0, "finite"),
     ]
-    if name in UNSEEN:
+    if name in MASKED_NAN:
         pairs = zip(jax.tree.leaves(got), jax.tree.leaves(clean), strict=True)
         changed = sum(count(a.view(np.uint32) != b.view(np.uint32)) for a, b in pairs)
         found.append(Check("bits that unseen samples change", changed, 0))
@@ -56,7 +56,7 @@ def checks(name, *, render=render_samples, outputs="float32"):
 
 
 def rounded(ray, outputs):
-    """Returns the ray in float64 with the scene's answers rounded to a type."""
+    """Returns the ray in float64 with the scene's outputs rounded to a type."""
     fields = {key: np.asarray(jnp.asarray(ray[key]).astype(outputs), np.float64) for key in ("density", "rgb")}
     return {key: np.asarray(value, np.float64) for key, value in ray.items()} | fields
 
@@ -72,9 +72,9 @@ def _slopes(got, want, outputs):
             slope, what = got[argument][rows], f"gradient of {group} by {argument}"
             found.append(Check(f"{what} not finite", not_finite(slope), 0, "finite"))
             if group in ("colour", "opacity"):
-                wanted = np.stack([want[name][argument][0] for name in names])
+                expected = np.stack([want[name][argument][0] for name in names])
                 allowed = own * np.stack([want[name][argument][1] for name in names]) + TINY
-                found.append(Check(what, of_largest(slope, wanted, beyond=allowed), 1e-5, "gradient"))
+                found.append(Check(what, of_largest(slope, expected, beyond=allowed), 1e-5, "gradient"))
     return found
 
 
@@ -86,8 +86,8 @@ def _rendered(render, outputs, size):
     run = jax.jit(functools.partial(_measure, render, jnp.dtype(outputs)))
     # Rounded out here, as a compiler may leave out what it sees of a rounding.
     batch |= {key: batch[key].astype(outputs) for key in ("density", "rgb")}
-    answers = [run(batch), run({key: np.where(np.isnan(x), x.dtype.type(0), x) for key, x in batch.items()})]
-    dirty, clean = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), answers)
+    renderings = [run(batch), run({key: np.where(np.isnan(x), x.dtype.type(0), x) for key, x in batch.items()})]
+    dirty, clean = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), renderings)
     return {name: tuple(_row(tree, i) for tree in (dirty, clean)) for i, name in enumerate(names)}
 
 

@@ -9,24 +9,24 @@ v being the colour, 1, t or 1 / t, and v_behind the background, 0, far or 0. As 
     dY / dtau_i = sum_{k >= i} T_{k+1} (v_k - v_{k+1}),    v_S = v_behind,
 
 which subtracts values before it sums, so that fog of one colour loses no digits. What is infinite (far
-where light passes, 1 / t at t = 0) has gradient 0 by convention. A sample whose delta is not positive is
+where T > 0, 1 / t at t = 0) has gradient 0 by convention. A sample whose delta is not positive is
 absent.
 """
 
 import numpy as np
 
 OPAQUE = 1e4  # exp(-1e4) is 0 in float64 too: nothing comes from behind, nor does a gradient
-NOTHING = 1e-46  # what passes is 0 in float32, so that also an infinitely far background is not seen
+INVISIBLE = 1e-46  # a transmittance that is 0 in float32, which hides even an infinitely far background
 
 
 def render(ray):
     """Returns the outputs of a ray, a dict of arrays in any precision: see compositing.ray."""
-    light, weights = _light(ray)
+    transmittance, weights = _transmittance(ray)
     outputs = {"weights": weights, "opacity": -np.expm1(-_depths(ray)[1].sum())}
     for name, (values, behind) in _values(ray).items():
-        passing = 0 if light[-1] < NOTHING else light[-1] * behind
+        beyond = 0 if transmittance[-1] < INVISIBLE else transmittance[-1] * behind
         seen = np.where(weights > 0, values, 0)
-        outputs[name] = (weights * seen).sum() + passing
+        outputs[name] = (weights * seen).sum() + beyond
     return outputs
 
 
@@ -36,14 +36,14 @@ def gradients(ray):
     Outputs are red, green, blue, opacity, depth and disparity; arguments density, rgb, t, delta,
     origins and directions. The scene's density is density + slope . (x - x0) at x0 = x, likewise its rgb.
     """
-    light, weights = _light(ray)
+    transmittance, weights = _transmittance(ray)
     size, optical = _depths(ray)
     kept = ray["delta"] > 0
     result = {}
     for index, (name, (values, behind)) in enumerate(_values(ray).items()):
         values = np.append(np.where(np.isinf(values) | ~kept, 0, values), 0 if np.isinf(behind) else behind)
         following = _next_kept(values, kept)
-        steps = np.where(kept, light[1:] * (values[:-1] - following), 0)
+        steps = np.where(kept, transmittance[1:] * (values[:-1] - following), 0)
         by_depth = np.where(kept & (optical < OPAQUE), np.cumsum(steps[::-1])[::-1], 0)
         some = (by_depth != 0) & (size > 0)
         density, delta = (np.where(some, ray[key], 0) for key in ("density", "delta"))
@@ -86,11 +86,11 @@ def _depths(ray):
     return size, np.where(kept, ray["density"], 0) * np.where(kept, ray["delta"], 0) * size
 
 
-def _light(ray):
+def _transmittance(ray):
     """Returns T_i [S + 1] and the weights [S]."""
     optical = _depths(ray)[1]
-    light = np.exp(-np.concatenate([[0], np.cumsum(optical)]))
-    return light, light[:-1] * -np.expm1(-optical)
+    transmittance = np.exp(-np.concatenate([[0], np.cumsum(optical)]))
+    return transmittance, transmittance[:-1] * -np.expm1(-optical)
 
 
 def _values(ray):

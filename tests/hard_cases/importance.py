@@ -2,7 +2,7 @@
 
 A point p is right where F(p - one ulp) - 1e-6 <= u <= F(p + one ulp) + 1e-6, F being the float64 running
 sum of the float32 weights over its last entry, linear between the edges. Weights below the smallest normal
-float count as 0, and where all do F is that of equal shares.
+float count as 0, and if all do, F is that of equal weights.
 """
 
 import functools
@@ -15,7 +15,7 @@ from jaxnerf import importance_points, inverse_cdf
 
 SEGMENTS, DRAWS, OPACITY = 64, 100000, 1e-3
 LARGEST = np.float32(1 - 2.0**-24)  # the largest u that a draw may give
-FLOOR = 1e-5  # the released codes' padding
+PADDING = 1e-5  # the released codes' padding
 
 
 def cases(invert=inverse_cdf):
@@ -30,7 +30,7 @@ def cases(invert=inverse_cdf):
         found += [
             Case("importance", "statistics at opacity 1e-3", _statistics),
             Case("importance", "one point is the median", _median),
-            Case("importance", f"bias of a floor of {FLOOR:g}", _bias),
+            Case("importance", f"bias of a padding of {PADDING:g}", _bias),
         ]
     return found
 
@@ -82,18 +82,18 @@ def exact_cdf(weights, edges, points):
         near = np.nextafter(points, np.float32(where)).astype(np.float64)
         index = np.clip(np.searchsorted(edges, near, side=side) - 1, 0, len(weights) - 1)
         width = edges[index + 1] - edges[index]
-        share = np.where(width > 0, (near - edges[index]) / np.where(width > 0, width, 1), side == "right")
-        bounds.append(sums[index] + np.clip(share, 0, 1) * (sums[index + 1] - sums[index]))
+        fraction = np.where(width > 0, (near - edges[index]) / np.where(width > 0, width, 1), side == "right")
+        bounds.append(sums[index] + np.clip(fraction, 0, 1) * (sums[index + 1] - sums[index]))
     return bounds
 
 
-def floor_bias(floor):
-    """Returns the share of draws outside the one segment of weight, and what weight and floor predict."""
+def padding_bias(padding):
+    """Returns the fraction of draws outside the one segment of weight, and what weight and padding predict."""
     weights = np.where(np.arange(SEGMENTS) == 40, OPACITY, 0).astype(np.float32)
     edges = _edges(SEGMENTS)
-    points = _draw(weights, edges, 1, floor)
+    points = _draw(weights, edges, 1, padding)
     outside = np.mean((points < edges[40]) | (points > edges[41]))
-    return outside, (SEGMENTS - 1) * floor / (OPACITY + SEGMENTS * floor)
+    return outside, (SEGMENTS - 1) * padding / (OPACITY + SEGMENTS * padding)
 
 
 def _quantiles(invert, weights, edges):
@@ -123,17 +123,17 @@ def _scaled(invert):
 
 
 def _statistics():
-    """Chi-square of draws at opacity 1e-3: one a ray must be as scattered as chance has it, 64 at most."""
+    """Chi-square of draws at opacity 1e-3: one per ray must match independent draws, 64 may fit better."""
     weights, edges = weight_rows()["opacity 1e-3"]
     found = []
-    for points_a_ray in (1, 50):
-        points = _draw(weights, edges, points_a_ray, 0.0)
+    for points_per_ray in (1, 50):
+        points = _draw(weights, edges, points_per_ray, 0.0)
         counts = np.histogram(points, bins=edges.astype(np.float64))[0]
         expected = DRAWS * weights.astype(np.float64) / weights.sum(dtype=np.float64)
         found.append(Check("draws outside the edges", float(DRAWS - counts.sum()), 0))
         square = float(((counts - expected) ** 2 / expected).sum())
-        found.append(Check(f"chi-square, {points_a_ray} a ray", square, _chi_square(SEGMENTS - 1, 3.72), "chance"))
-        if points_a_ray == 1:
+        found.append(Check(f"chi-square, {points_per_ray} per ray", square, _chi_square(SEGMENTS - 1, 3.72), "chance"))
+        if points_per_ray == 1:
             found.append(Check("chi-square too small for chance", _chi_square(SEGMENTS - 1, -3.72), square, "chance"))
     return found
 
@@ -150,21 +150,21 @@ def _median():
 
 def _bias():
     found = []
-    for floor in (0.0, FLOOR):
-        measured, predicted = floor_bias(floor)
+    for padding in (0.0, PADDING):
+        measured, predicted = padding_bias(padding)
         deviation = 5 * np.sqrt(predicted * (1 - predicted) / DRAWS)  # of the draws
-        what = f"share of samples outside the weight, {100 * measured:.1f} %, beside that of the floor"
+        what = f"fraction of samples outside the weight, {100 * measured:.1f} %, beside that of the padding"
         found.append(Check(what, float(abs(measured - predicted)), deviation, "chance"))
     return found
 
 
-def _draw(weights, edges, points_a_ray, floor):
+def _draw(weights, edges, points_per_ray, padding):
     run = jax.jit(
-        functools.partial(importance_points, num_points=points_a_ray, floor=floor),
+        functools.partial(importance_points, num_points=points_per_ray, padding=padding),
     )
-    rays = DRAWS // points_a_ray
+    rays = DRAWS // points_per_ray
     tiled = [np.broadcast_to(x, (rays, len(x))) for x in (edges, weights)]
-    return np.asarray(run(jax.random.key(points_a_ray), *tiled))
+    return np.asarray(run(jax.random.key(points_per_ray), *tiled))
 
 
 def _miss(weights, edges, points, u):

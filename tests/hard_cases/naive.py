@@ -15,8 +15,8 @@ def render_samples(scene, rays, samples, *, background=None):
 def composite(density, rgb, t, length, *, background=None):
     """Returns the Rendering of arrays [..., S], [..., S, 3], [..., S] and [..., S]."""
     alpha = 1.0 - jnp.exp(-density * length)
-    light = jnp.cumprod(1.0 - alpha[..., :-1] + 1e-10, axis=-1)
-    weights = alpha * jnp.concatenate([jnp.ones_like(alpha[..., :1]), light], axis=-1)
+    transmittance = jnp.cumprod(1.0 - alpha[..., :-1] + 1e-10, axis=-1)
+    weights = alpha * jnp.concatenate([jnp.ones_like(alpha[..., :1]), transmittance], axis=-1)
     colour, opacity = (weights[..., None] * rgb).sum(axis=-2), weights.sum(axis=-1)
     depth = (weights * t).sum(axis=-1)
     disparity = 1.0 / jnp.maximum(1e-10, depth / opacity)
@@ -34,7 +34,7 @@ def composite(density, rgb, t, length, *, background=None):
 
 
 def inverse_cdf(edges, weights, u):
-    """Returns what inverse_cdf of jaxnerf does, as the 2020 code looks it up."""
+    """Inverts the CDF as the 2020 code does."""
     weights = weights + 1e-5
     cdf = jnp.cumsum(weights / weights.sum(axis=-1, keepdims=True), axis=-1)
     cdf = jnp.concatenate([jnp.zeros_like(cdf[..., :1]), cdf], axis=-1)

@@ -1,14 +1,14 @@
 """The rays of the hard cases of compositing: RAYS, by name, each a dict of float32 arrays.
 
 density [S], rgb [S, 3], t and delta [S], origins, directions, viewdirs and background [3], near, far;
-slope [S, 3] and rgb_slope [S, 3, 3], how the scene's answers change with the position.
+slope [S, 3] and rgb_slope [S, 3, 3], derivatives of density and rgb with respect to the position.
 """
 
 import numpy as np
 
 SIZE = 64
 RAYS = {}
-UNSEEN = []  # names of rays that hold NaN where delta is 0
+MASKED_NAN = []  # names of rays that hold NaN where delta is 0
 
 
 def ray(name, density, *, t=None, delta=None, near=2.0, far=6.0, length=1.3, size=SIZE, **given):
@@ -22,7 +22,7 @@ def ray(name, density, *, t=None, delta=None, near=2.0, far=6.0, length=1.3, siz
         delta = np.diff(edges) if delta is None else delta
     density = np.broadcast_to(np.asarray(density, np.float64), np.shape(t))
     usual = density[np.isfinite(density) & (density > 0)]
-    place = length * np.max(t) or 1.0  # how far the ray goes, so that slopes change its answers by their size
+    place = length * np.max(t) or 1.0  # the length of the ray, so that slopes change density and rgb by their own size
     slope = np.clip((np.median(usual) if len(usual) else 1) / place, 1e-30, 1e20)
     unit = rng.normal(size=3)
     unit /= np.linalg.norm(unit)
@@ -98,8 +98,8 @@ for name, density in (
     ("empty space", np.zeros(SIZE)),
 ):
     ray(f"NaN in zero widths of {name}", density, **widths())
-    UNSEEN.append(f"NaN in zero widths of {name}")
-for name in UNSEEN:
+    MASKED_NAN.append(f"NaN in zero widths of {name}")
+for name in MASKED_NAN:
     for key in ("density", "rgb", "t", "slope", "rgb_slope"):
         RAYS[name][key][RAYS[name]["delta"] == 0] = np.nan
 
@@ -129,7 +129,7 @@ ray("direction of length 1e20", spread(2.0) / 1e20, length=1e20)
 ray("direction 0", spread(2.0), length=0.0)
 ray("direction 0, infinite density", np.inf, length=0.0)
 
-# Depth of what lets light through.
+# Depth of rays that are not opaque.
 for far in (6.0, 1e6, np.inf):
     inside = {"t": 2 + (np.arange(SIZE) + 0.5) / 16, "delta": np.full(SIZE, 1 / 16), "far": far}
     ray(f"empty, far {far:g}", 0.0, **inside)

@@ -96,9 +96,9 @@ def _wrong(edges):
 def _even(edges, samples):
     run, _ = _compiled(edges, samples, False)
     got, (t, _), _ = run(jax.random.key(1), np.full(RAYS, 2, np.float32), np.full(RAYS, 6, np.float32))
-    share = (t.astype(np.float64) - got[:, :-1]) / np.diff(got.astype(np.float64))
-    counts = np.histogram(share, bins=20, range=(0, 1))[0]
-    expected = share.size / 20
+    fraction = (t.astype(np.float64) - got[:, :-1]) / np.diff(got.astype(np.float64))
+    counts = np.histogram(fraction, bins=20, range=(0, 1))[0]
+    expected = fraction.size / 20
     square = float(((counts - expected) ** 2 / expected).sum())
     return [Check("chi-square of 20 parts of the bins", square, 50.8, "chance")]  # leaves 1e-4 out
 

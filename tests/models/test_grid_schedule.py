@@ -1,4 +1,4 @@
-"""The box of a scene: when its cells are looked at, and samples through it."""
+"""The occupancy grid's schedule: when which cells are updated; and ray marching through its box."""
 
 import dataclasses
 import functools
@@ -15,26 +15,26 @@ from jaxnerf.core.occupancy import ray_marching
 from jaxnerf.core.occupancy.from_scene import crop_grid
 from jaxnerf.core.occupancy.grid import clip_rays_to_box, is_occupied
 from jaxnerf.fields.base import Field
-from jaxnerf.models import grid_schedule as spaces
+from jaxnerf.models.grid_schedule import make_grid_schedule
 
 BOX = (-1.5, -1.5, -1.0), (1.5, 1.5, 1.3)  # holds the embedded scene
 KEY = jax.random.key(0)
-FOUND = 1e4  # the density of everywhere
+DENSITY = 1e4  # everywhere
 
 
-def a_space(density=FOUND, box=BOX, **options):
+def a_schedule(density=DENSITY, box=BOX, **options):
     field = Field(None, lambda params, x, viewdirs: (jnp.full(x.shape[:-1], density), x))
-    given = {"resolution": 8, "step": 0.1, "threshold": 0.01, "update_every": 16, "look_at_once": 2**18}
-    return spaces.make_grid_schedule(*box, field=field, **{**given, **options})
+    given = {"resolution": 8, "step_size": 0.1, "threshold": 0.01, "update_every": 16, "cells_per_update": 2**18}
+    return make_grid_schedule(*box, field=field, **{**given, **options})
 
 
 @functools.cache
-def looks_at_cells(num_steps, num_cells, **options):
-    """Returns [num_steps, num_cells], how often some cells were looked at up to each step; and the others.
+def updates_of_cells(num_steps, num_cells, **options):
+    """Returns [num_steps, num_cells], how often each of some cells was updated up to each step; and the others.
 
-    Each look takes the running mean a fifth of the way to what is everywhere.
+    Each update moves the running mean a fifth of the way to the density.
     """
-    schedule = a_space(**options)
+    schedule = a_schedule(**options)
     cells = np.random.default_rng(0).permutation(np.prod(schedule.shape))[:num_cells].astype(np.int32)
 
     def step(grid, index):
@@ -43,29 +43,29 @@ def looks_at_cells(num_steps, num_cells, **options):
 
     first = schedule.create(np.ones(schedule.shape, bool))
     mean = jax.jit(lambda grid: jax.lax.scan(step, grid, jnp.arange(num_steps)))(first)[1]
-    counts = np.log1p(-np.minimum(np.float64(mean) / FOUND, 1 - 1e-6)) / np.log(0.8)
+    counts = np.log1p(-np.minimum(np.float64(mean) / DENSITY, 1 - 1e-6)) / np.log(0.8)
     return counts.round().astype(int)[:, cells], np.delete(counts, cells, axis=1)
 
 
 def test_cells_are_cubes_along_all_sides():
-    schedule = a_space(resolution=20)
+    schedule = a_schedule(resolution=20)
     assert schedule.shape == (20, 20, 15) and schedule.cell == pytest.approx((0.15, 0.15, 2.3 / 15))
-    assert a_space(box=((0, 0, 0), (1e-3, 1, 1))).shape == (1, 8, 8)
+    assert a_schedule(box=((0, 0, 0), (1e-3, 1, 1))).shape == (1, 8, 8)
 
 
-def test_an_empty_cell_is_left_out_after_half_a_dozen_looks():
-    schedule = a_space(density=0.0)
+def test_half_a_dozen_updates_empty_a_cell_without_density():
+    schedule = a_schedule(density=0.0)
     grid, cells = schedule.create(np.ones(schedule.shape, bool)), np.arange(np.prod(schedule.shape))
     assert grid.occupied.all()
-    update, shares = jax.jit(schedule.update), []
-    for look in range(6):
-        grid = update(KEY, 16 * look + 15, {"fine": None}, grid, cells)
-        shares.append(float(grid.occupied.mean()))
-    assert shares[3] == 1 and shares[5] == 0
+    update, fractions = jax.jit(schedule.update), []
+    for index in range(6):
+        grid = update(KEY, 16 * index + 15, {"fine": None}, grid, cells)
+        fractions.append(float(grid.occupied.mean()))
+    assert fractions[3] == 1 and fractions[5] == 0
 
 
-def test_what_is_not_possible_stays_empty():
-    schedule = a_space()
+def test_cells_that_are_not_valid_stay_empty():
+    schedule = a_schedule()
     valid = np.random.default_rng(1).uniform(size=schedule.shape) < 0.1
     grid = schedule.create(valid)
     np.testing.assert_array_equal(grid.occupied, valid)
@@ -74,29 +74,29 @@ def test_what_is_not_possible_stays_empty():
     assert schedule.update(KEY, 15, {"fine": None}, grid, np.zeros(0, np.int32)) is grid
 
 
-def test_where_one_look_sees_all_each_cell_is_looked_at_once_an_interval():
-    counts, others = looks_at_cells(50, 300)
+def test_if_an_update_covers_all_cells_each_is_updated_once_per_interval():
+    counts, others = updates_of_cells(50, 300)
     assert not others.any()
-    wanted = (np.arange(50) + 1) // 16  # at steps 15, 31, 47
-    np.testing.assert_array_equal(counts, np.broadcast_to(wanted[:, None], counts.shape))
+    expected = (np.arange(50) + 1) // 16  # at steps 15, 31, 47
+    np.testing.assert_array_equal(counts, np.broadcast_to(expected[:, None], counts.shape))
 
 
-def test_with_more_cells_looks_come_more_often_at_first():
+def test_with_more_cells_updates_come_more_often_at_first():
     """A quarter of the cells at once: every 4 steps for 8 times 16 steps, then every 16."""
-    counts, _ = looks_at_cells(200, 384, cells_per_update=96)
-    looked = np.flatnonzero(np.diff(counts.sum(1), prepend=0))
-    np.testing.assert_array_equal(looked, [*range(3, 128, 4), 143, 159, 175, 191])
-    assert (np.diff(counts.sum(1), prepend=0)[looked] == 96).all()
+    counts, _ = updates_of_cells(200, 384, cells_per_update=96)
+    updated = np.flatnonzero(np.diff(counts.sum(1), prepend=0))
+    np.testing.assert_array_equal(updated, [*range(3, 128, 4), 143, 159, 175, 191])
+    assert (np.diff(counts.sum(1), prepend=0)[updated] == 96).all()
     for step in range(15, 128, 16):
         assert (counts[step] == (step + 1) // 16).all()  # 8 times from the start, each cell as often
     assert (counts[191] == 9).all()  # and once more in four intervals
 
 
-@pytest.mark.parametrize("num_cells, look_at_once, update_every", [(300, 70, 16), (301, 300, 16), (300, 9, 4)])
-def test_every_cell_is_looked_at(num_cells, cells_per_update, update_every):
-    """Where numbers divide badly too, also where looks at every step are too few for an interval."""
-    options = {"look_at_once": cells_per_update, "update_every": update_every}
-    counts, others = looks_at_cells(200, num_cells, **options)
+@pytest.mark.parametrize("num_cells, cells_per_update, update_every", [(300, 70, 16), (301, 300, 16), (300, 9, 4)])
+def test_every_cell_is_updated(num_cells, cells_per_update, update_every):
+    """Also if the numbers do not divide, and if an update in every step is too few for an interval."""
+    options = {"cells_per_update": cells_per_update, "update_every": update_every}
+    counts, others = updates_of_cells(200, num_cells, **options)
     assert not others.any()
     rounds = -(-num_cells // cells_per_update)
     often = max(update_every * cells_per_update // num_cells, 1)
@@ -110,17 +110,17 @@ def test_every_cell_is_looked_at(num_cells, cells_per_update, update_every):
     assert (counts[-1] >= 1).all()
 
 
-def test_looks_that_see_all_cells_are_alike():
-    counts, _ = looks_at_cells(26, 10_000, resolution=24, cells_per_update=9000)  # every 8 steps
+def test_updates_that_together_cover_all_cells_have_the_same_size():
+    counts, _ = updates_of_cells(26, 10_000, resolution=24, cells_per_update=9000)  # every 8 steps
     assert set(np.diff(counts.sum(1), prepend=0)) == {0, 5000}
     assert (counts[-1] >= 1).all()
 
 
-def test_a_look_depends_on_its_key_alone():
-    schedule = spaces.make_grid_schedule(
+def test_an_update_depends_on_its_key_alone():
+    schedule = make_grid_schedule(
         *BOX,
         resolution=8,
-        step=0.1,
+        step_size=0.1,
         field=Field(None, lambda params, x, viewdirs: (jnp.abs(x[..., 0]), x)),
         threshold=0.01,
         update_every=4,
@@ -148,17 +148,17 @@ def lengths(rays):
         (0.1, True, 3.0),
     ],
 )
-def test_samples_stand_for_all_of_the_way_through_the_box(step, random, stretch):
-    """Whatever the step; also along the diagonal, which no ray is longer in the box than."""
+def test_samples_cover_the_whole_way_through_the_box(step, random, stretch):
+    """For any step size; also along the diagonal, the longest way through the box."""
     grid, rays = full_grid(0.5), rays_past_origin(5, 60)
     diagonal = np.float32([[1, 1, 1], [-2, 2, 2], [0.5, 0.5, 0.5], [1, 0, 0]])
     rays = jax.tree.map(lambda a, b: np.concatenate([a, np.float32(b)]), rays, Rays(
         origins=-2 * diagonal, directions=diagonal, viewdirs=diagonal, near=np.zeros(4), far=np.full(4, 9)
     ))  # fmt: skip
     keys = jax.random.split(jax.random.key(0), 64) if random else None
-    march_rays = compiled(ray_marching.march_rays, "step", "cell")
+    march_rays = compiled(ray_marching.march_rays, "step_size", "cell")
     cell = tuple(1 / size for size in grid.valid.shape)
-    samples = march_rays(keys, grid, rays, step=float(step), cell=cell, stretch=stretch)
+    samples = march_rays(keys, grid, rays, step_size=float(step), cell=cell, stretch=stretch)
     step = step * stretch
     inside = compiled(clip_rays_to_box)(grid, rays)
     way = np.float64(inside.far) - inside.near
@@ -167,14 +167,14 @@ def test_samples_stand_for_all_of_the_way_through_the_box(step, random, stretch)
     assert (samples.delta >= 0).all()
     assert (samples.delta * lengths(rays)[:, None]).max() <= step * (1 + 1e-4)
     counted = (samples.delta > 0).sum(-1)
-    assert (counted <= way * lengths(rays) / step + 2.001).all()  # no ray asks more than it is long
+    assert (counted <= way * lengths(rays) / step + 2.001).all()  # no ray has more samples than its length needs
 
 
-def test_a_cell_that_was_empty_comes_back_when_its_density_grows():
-    """Long after the start, too, when neighbours no longer count."""
+def test_an_empty_cell_becomes_occupied_when_its_density_grows():
+    """Also long after the start, when neighbours no longer count."""
     field = Field(None, lambda params, x, viewdirs: (jnp.where(x[..., 0] > 0, params, 0.0), x))
-    options = {"resolution": 8, "step": 0.1, "threshold": 0.01, "update_every": 16, "look_at_once": 2**18}
-    schedule = spaces.make_grid_schedule(*BOX, field=field, **options)
+    options = {"resolution": 8, "step_size": 0.1, "threshold": 0.01, "update_every": 16, "cells_per_update": 2**18}
+    schedule = make_grid_schedule(*BOX, field=field, **options)
     grid, cells = schedule.create(jnp.ones(schedule.shape, bool)), jnp.arange(np.prod(schedule.shape))
     update = jax.jit(schedule.update)
     for step in range(15, 400, 16):
@@ -185,7 +185,7 @@ def test_a_cell_that_was_empty_comes_back_when_its_density_grows():
     assert grid.occupied[half:].all() and not grid.occupied[:half].any()
 
 
-def test_a_cropped_grid_is_occupied_where_the_whole_was():
+def test_a_cropped_grid_is_occupied_in_the_same_places():
     grid = full_grid(4.0, (8, 8, 8))
     occupied = np.zeros((8, 8, 8), bool)
     occupied[2, 3, 1] = occupied[4, 3, 6] = True

@@ -1,4 +1,4 @@
-"""What all programs set up before they begin."""
+"""Tests of what all command-line programs share: config names, flags, plugins and memory."""
 
 import platform
 import subprocess
@@ -6,9 +6,13 @@ import sys
 
 import pytest
 
+from jaxnerf.registry import FIELDS
+from jaxnerf.runtime import cli
+from runs import ROOT
+
 _FAULTS = """
 import ctypes, resource, threading
-from jaxnerf import app
+from jaxnerf.runtime import cli
 
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -27,16 +31,89 @@ def fill():
     print(faults() - before)
 
 SIZE = 40 * 2**20
-app._keep_memory()
+cli._keep_memory()
 fill()
 thread = threading.Thread(target=fill)
 thread.start()
 thread.join()
 """
 
+_PROGRAM = '''"""Prints a count and the names of all fields."""
+from jaxnerf.registry import FIELDS
+from jaxnerf.runtime import cli
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc alone gives large blocks back at once")
-def test_memory_that_a_step_frees_is_there_for_the_next():
-    """Blocks of 40 MiB, again and again, in the main thread and in another: 10,240 pages each."""
-    said = subprocess.run([sys.executable, "-c", _FAULTS], capture_output=True, text=True, check=True).stdout
-    assert all(int(count) < 2000 for count in said.split()), said
+COUNT = cli.define_count("count", "The number of things.")
+
+def main(argv):
+    print(COUNT.value, *FIELDS.names())
+
+cli.run(main)
+'''
+
+
+def call(folder, *flags):
+    """Returns (exit code, stdout, stderr) of _PROGRAM with flags."""
+    program = folder / "program.py"
+    program.write_text(_PROGRAM)
+    done = subprocess.run([sys.executable, program, *flags], cwd=folder, capture_output=True, text=True)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc returns large blocks at once")
+def test_freed_memory_stays_in_the_process():
+    """Allocates blocks of 40 MiB (10,240 pages) repeatedly, in the main thread and in another one."""
+    out = subprocess.run([sys.executable, "-c", _FAULTS], capture_output=True, text=True, check=True).stdout
+    assert all(int(count) < 2000 for count in out.split()), out
+
+
+def test_a_config_name_becomes_a_path():
+    assert cli.config_path("smoke") == str(cli.CONFIGS / "smoke.py")
+    assert cli.config_path("smoke:16") == str(cli.CONFIGS / "smoke.py:16")
+    assert cli.CONFIGS.resolve() == ROOT / "configs"
+
+
+def test_an_existing_file_wins_over_a_config_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "smoke").mkdir()  # a folder is no config file
+    assert cli.config_path("smoke") == str(cli.CONFIGS / "smoke.py")
+    (tmp_path / "lego_fast").write_text("")
+    assert cli.config_path("lego_fast:small") == "lego_fast:small"
+
+
+def test_a_wrong_config_name_lists_the_names():
+    with pytest.raises(ValueError, match="no config 'lego_slow', expected a path or one of .*lego_fast, lego_mlp_fast"):
+        cli.config_path("lego_slow")
+
+
+def test_a_plugin_registers_a_field(tmp_path):
+    plugin = "import jaxnerf\n\njaxnerf.register_field('mine', lambda options, box: None)\n"
+    (tmp_path / "my_plugin.py").write_text(plugin)
+    code, out, err = call(tmp_path, "--plugins=my_plugin", "--count=auto")
+    assert (code, out.split()) == (0, ["auto", *FIELDS.names(), "mine"]), err
+
+
+def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    code, out, err = call(tmp_path, "--plugins=broken")
+    assert code == 1 and not out
+    assert err.startswith("error: --plugins: cannot import 'broken' (ZeroDivisionError") and err.count("\n") == 1
+
+
+def test_a_wrong_count_is_reported_in_one_line(tmp_path):
+    code, out, err = call(tmp_path, "--count=0")
+    assert code == 2 and not out
+    assert "count" in err and "expected auto, or an integer of at least 1" in err and err.count("\n") == 1
+
+
+def test_help_lists_the_flags_of_the_program(tmp_path):
+    code, out, _ = call(tmp_path, "--help")
+    assert code == 0
+    assert out.startswith("Prints a count and the names of all fields.")
+    assert "--count: The number of things." in out
+    assert "--plugins: " in out and "--logtostderr" not in out
+
+
+def test_a_name_from_a_workdir_is_not_imported():
+    """Names that a config.json could contain are looked up, and never imported."""
+    with pytest.raises(ValueError, match="no field 'os:system'.*register_field with --plugins"):
+        FIELDS.get("os:system")

@@ -1,48 +1,38 @@
-"""One device, four devices as one program, four devices as four: the same run."""
+"""jit on one device, sharded jit and pmap on four: the same run."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from test_step import toy_draw, toy_model
 
 from helpers import assert_same, random_rays
 from jaxnerf.runtime import devices
 from jaxnerf.training.build import build
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import TrainData, make_train_step
-from runs import smoke_config
+from runs import smoke_config, smoke_experiment
+from toys import LOSSES, run_steps, toy_draw, toy_model
 
 pytest_plugins = ["run_fixtures"]
-
-
-def run_steps(step, state, data, num_steps, mode, **options):
-    """Returns the last state, in numpy, and all metrics."""
-    run, state, data = devices.compile_step(step, state, data, mode=mode, **options)
-    rows = []
-    for _ in range(num_steps):
-        state, metrics = run(state, data)
-        rows.append(jax.device_get(metrics))
-    return jax.device_get(state), rows
 
 
 @pytest.fixture(scope="module")
 def experiment():
     assert jax.local_device_count() == 4
-    return build(smoke_config())
+    return smoke_experiment()
 
 
 @pytest.fixture(scope="module")
 def views(experiment):
-    return experiment.load_views("train")
+    return experiment.load_split("train")
 
 
 @pytest.fixture(scope="module")
 def runs(unoptimized, experiment, views):
     """Ten steps of configs/smoke.py on one device and on four; device_matrix.py has pmap, too."""
     model, optimizer = experiment.model, experiment.optimizer
-    step = make_train_step(model, optimizer, experiment.draw)
+    step = make_train_step(model, optimizer, experiment.draw, experiment.losses)
     return {
         mode: run_steps(
             step,
@@ -51,17 +41,16 @@ def runs(unoptimized, experiment, views):
             10,
             mode,
             batch_size=64,
-            samples_per_ray=16,
         )
         for mode in ("jit", "sharded")
     }
 
 
-def test_ten_steps_give_the_same_parameters(runs):
+def test_ten_steps_end_in_the_same_parameters(runs):
     (one, one_rows), (many, many_rows) = runs["jit"], runs["sharded"]
-    start = create_state(build(smoke_config()).model, optax.adam(1e-3), 0).params
+    start = create_state(smoke_experiment().model, optax.adam(1e-3), 0).params
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), one.params, start)
-    assert min(jax.tree.leaves(moved)) > 1e-4, "nothing was learned, so nothing is proved"
+    assert min(jax.tree.leaves(moved)) > 1e-4, "the comparison needs parameters that moved"
     assert_same(many.params, one.params, rtol=0, atol=1e-6)
     assert int(many.step) == 10
     for row, many_row in zip(one_rows, many_rows, strict=True):
@@ -70,10 +59,10 @@ def test_ten_steps_give_the_same_parameters(runs):
 
 @pytest.mark.parametrize("mode", ["sharded", "pmap"])
 @pytest.mark.parametrize("microbatch_size", [4, 2])
-def test_the_gradient_is_not_multiplied_by_the_devices(mode, microbatch_size):
-    """Plain descent follows the gradient's length, which Adam would hide."""
+def test_gradient_is_a_mean_over_devices(mode, microbatch_size):
+    """SGD's update is proportional to the gradient, which Adam would hide."""
     optimizer = optax.sgd(0.1)
-    step = make_train_step(toy_model(), optimizer, toy_draw)
+    step = make_train_step(toy_model(), optimizer, toy_draw, LOSSES)
     data = random_rays(0, (16,)), jnp.array([-1])
     states = {}
     for name in ("jit", mode):
@@ -84,7 +73,7 @@ def test_the_gradient_is_not_multiplied_by_the_devices(mode, microbatch_size):
 
 
 @pytest.mark.parametrize("mode", ["sharded", "pmap"])
-def test_the_batch_is_the_same_ray_for_ray(experiment, views, mode):
+def test_batch_is_the_same_on_any_number_of_devices(experiment, views, mode):
     def probe(state, data, positions, *, axis_name=None):
         keys, batch = experiment.draw(state["step"], positions.reshape(-1), data)
         seen = {"key": jax.random.key_data(keys), "rgb": batch.rgb, "rays": batch.rays}
@@ -100,42 +89,44 @@ def test_the_batch_is_the_same_ray_for_ray(experiment, views, mode):
 
 
 @pytest.mark.parametrize(
-    "batch_size, num_devices, block_size",
-    [(10, 4, 0), (3, 4, 0), (0, 1, 0), (16, 4, 3), (64, 1, 48), (-4, 4, 0)],
+    "batch_size, num_devices, microbatch_size",
+    [(10, 4, None), (3, 4, None), (0, 1, None), (16, 4, 3), (64, 1, 48), (-4, 4, None), (16, 4, 0)],
 )
-def test_what_does_not_come_out_even_is_named(batch_size, num_devices, microbatch_size):
-    with pytest.raises(ValueError, match=f"batch_size {batch_size} on {num_devices} .*change train.batch_size"):
+def test_uneven_split_is_an_error(batch_size, num_devices, microbatch_size):
+    with pytest.raises(
+        ValueError, match=f"batch_size {batch_size} does not split evenly over {num_devices} .*change train.batch_size"
+    ):
         devices.split_positions(batch_size, num_devices, microbatch_size)
 
 
-def test_every_place_in_the_batch_is_taken_once():
+def test_every_position_in_the_batch_occurs_once():
     positions = devices.split_positions(48, 4, 6)
     assert positions.shape == (4, 2, 6)
     np.testing.assert_array_equal(positions.ravel(), np.arange(48))
 
 
 @pytest.mark.parametrize("mode", ["sharded", "pmap"])
-def test_an_uneven_batch_does_not_train(mode):
-    step = make_train_step(toy_model(), optax.sgd(0.1), toy_draw)
+def test_uneven_batch_is_an_error(mode):
+    step = make_train_step(toy_model(), optax.sgd(0.1), toy_draw, LOSSES)
     state = create_state(toy_model(), optax.sgd(0.1), 0)
-    with pytest.raises(ValueError, match="batch_size 30 on 4 device.*does not come out even"):
+    with pytest.raises(ValueError, match="batch_size 30 does not split evenly over 4 device"):
         devices.compile_step(step, state, None, batch_size=30, mode=mode)
 
 
-def test_an_unknown_mode_is_named():
-    with pytest.raises(ValueError, match="parallel is 'tpu', wanted one of"):
+def test_unknown_mode_is_an_error():
+    with pytest.raises(ValueError, match="parallel is 'tpu', expected one of"):
         devices.compile_step(None, None, None, batch_size=4, mode="tpu")
 
 
-def test_runs_of_other_seeds_are_one_program():
+def test_seed_does_not_change_the_program():
     texts, drawn = [], []
     for seed in (0, 1):
         config = smoke_config()
         config.seed = seed
         experiment = build(config)._replace(model=toy_model())
-        _, data = experiment.survey(experiment.load_views("train"))
+        _, data = experiment.prepare(experiment.load_split("train"))
         state = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, 0))  # noqa: B023
-        step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
+        step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, LOSSES)
         texts.append(jax.jit(step).lower(state, data, np.arange(64)[None]).as_text())
-        drawn.append(np.asarray(jax.jit(experiment.ids)(0, np.arange(64), data)))
+        drawn.append(np.asarray(jax.jit(experiment.pixel_ids)(0, np.arange(64), data)))
     assert texts[0] == texts[1] and (drawn[0] != drawn[1]).mean() > 0.9

@@ -1,4 +1,4 @@
-"""Several processes train as one; how they find each other, and what is said when they do not."""
+"""Several processes train as one, and report why they cannot connect or what differs between them."""
 
 import os
 import subprocess
@@ -22,7 +22,7 @@ SLURM["SLURM_STEP_NUM_TASKS"] = "2"
 
 @pytest.fixture(scope="module")
 def together(tmp_path_factory):
-    """A workdir, and what its two processes of two devices each said, which a faked srun has started."""
+    """The workdir and the stderr of two processes with two devices each, started as srun does."""
     folder = tmp_path_factory.mktemp("together") / "run"
     folder.mkdir()
     environment = {
@@ -48,14 +48,16 @@ def last_state(folder):
     return jax.device_get(Checkpoints(folder).load(two_hosts.STEPS, like))
 
 
-def test_two_processes_of_two_devices_train_as_one_of_four_does(together, tmp_path):
+def test_two_processes_train_as_one_with_the_same_devices(together, tmp_path):
     folder, said = together
     experiment = two_hosts.toy_experiment()
-    assert two_hosts.train(tmp_path / "run", experiment.load_views("train"))
+    assert two_hosts.train(tmp_path / "run", experiment.load_split("train"))
     one, many = last_state(tmp_path / "run"), last_state(folder)
     assert_same(many, one, rtol=0, atol=1e-6)
     start = create_state(experiment.model, experiment.optimizer, 0)
-    assert np.abs(one.params["fine"]["w"] - start.params["fine"]["w"]).max() > 1e-3, "nothing was learned"
+    assert np.abs(one.params["fine"]["w"] - start.params["fine"]["w"]).max() > 1e-3, (
+        "the comparison needs parameters that moved"
+    )
     assert np.unique(one.grid.density_max).size > 8 and one.counters["rays_dropped"] > 0
     rows, others = metric_log.read_rows(folder), metric_log.read_rows(tmp_path / "run")
     for row, other in zip(rows, others, strict=True):
@@ -63,9 +65,9 @@ def test_two_processes_of_two_devices_train_as_one_of_four_does(together, tmp_pa
             assert row[name] == pytest.approx(other[name], rel=1e-5), name
 
 
-def test_one_process_speaks_all_save_and_all_have_the_same_state(together):
+def test_first_process_prints_and_all_have_the_same_state(together):
     folder, (first, second) = together
-    assert "device      4 x cpu (cpu), in 2 processes" in first and "6/6" in first
+    assert "device        4 x cpu (cpu), in 2 processes" in first and "6/6" in first
     assert "device" not in second and "6/6" not in second
     states = [[line for line in text.splitlines() if line.startswith("state")] for text in (first, second)]
     assert len(states[0]) == 2 and states[0] == states[1]
@@ -82,40 +84,40 @@ def test_one_process_speaks_all_save_and_all_have_the_same_state(together):
         ({"SLURM_PROCID": "0", "SLURM_STEP_NUM_TASKS": "1"}, (0, 1)),
     ],
 )
-def test_who_was_started_with_others(environ, place):
+def test_launched(environ, place):
     assert processes.launched(environ) == place
 
 
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"coordinator": "localhost"}, "'localhost', wanted HOST:PORT of process 0"),
-        ({"coordinator": "host:99999", "num_processes": 2, "process_id": 0}, "wanted HOST:PORT"),
+        ({"coordinator": "localhost"}, "'localhost', expected HOST:PORT of process 0"),
+        ({"coordinator": "host:99999", "num_processes": 2, "process_id": 0}, "expected HOST:PORT"),
         ({"coordinator": "host:1", "num_processes": 2}, "num_processes is 2 and --process_id None"),
-        ({"coordinator": "host:1", "num_processes": 2, "process_id": 2}, "an id from 0 below the number"),
+        ({"coordinator": "host:1", "num_processes": 2, "process_id": 2}, "a different id from 0 to N - 1"),
         ({"process_id": 1}, "need a coordinator"),
-        ({"coordinator": "host:1", "multihost": False}, "--nomultihost keeps to one process"),
+        ({"coordinator": "host:1", "multihost": False}, "--nomultihost means one process"),
     ],
 )
-def test_what_names_no_process_is_an_error(given, message):
+def test_inconsistent_arguments_are_an_error(given, message):
     with pytest.raises(ValueError, match=message), processes.cluster(**given):
-        raise AssertionError("it went on")
+        raise AssertionError("no error")
 
 
-def test_alone_nothing_is_joined_and_everything_agrees(monkeypatch, tmp_path):
+def test_single_process_joins_nothing(monkeypatch, tmp_path):
     monkeypatch.setenv("SLURM_PROCID", "0")
     monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "1")
     monkeypatch.setattr(jax.distributed, "initialize", lambda *a, **k: pytest.fail("it joined"))
     with processes.cluster():
         assert processes.is_first() and processes.any_of(True, 3) and not processes.any_of(False)
         processes.check_same("data", np.arange(3))
-        processes.first_does(lambda: (tmp_path / "made").touch(), tmp_path / "made")
-    with pytest.raises(ValueError, match="as it is"):  # goes on as it would without
+        processes.run_on_first(lambda: (tmp_path / "made").touch(), tmp_path / "made")
+    with pytest.raises(ValueError, match="as it is"):  # raised as without cluster
         with processes.cluster():
             raise ValueError("as it is")
 
 
-def test_a_coordinator_that_is_not_there_takes_one_line(tmp_path):
+def test_missing_coordinator_prints_one_line(tmp_path):
     address = f"127.0.0.1:{free_port()}"
     by_hand = (f"--coordinator={address}", "--num_processes=2", "--process_id=1", "--join_seconds=1")
     code, _, err = run("train", "--config=configs/smoke.py", f"--workdir={tmp_path / 'run'}", *by_hand)
@@ -124,13 +126,13 @@ def test_a_coordinator_that_is_not_there_takes_one_line(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_one_device_in_many_processes_is_refused(monkeypatch):
+def test_jit_in_several_processes_is_an_error(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     with pytest.raises(ValueError, match="parallel is 'jit' in 2 processes; set it to 'auto'"):
         devices.devices_of("jit")
 
 
-def test_what_differs_between_processes_is_named(monkeypatch):
+def test_difference_between_processes_is_an_error(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 3)
     others = iter([[1, 0, 0], [0, 0, 0]])
     gather = lambda value: np.array(value, np.int64) + next(others)  # noqa: E731

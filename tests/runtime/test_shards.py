@@ -1,4 +1,4 @@
-"""Frames made by many calls: the same as by one, none twice, none spoilt, none mixed with others."""
+"""Frames rendered by many processes: the same as by one, each once, none damaged, none mixed with others."""
 
 import functools
 import json
@@ -12,7 +12,7 @@ from jaxnerf.evaluation import aggregate
 from jaxnerf.evaluation.evaluate import score_run
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.runtime import chunking, shards
+from jaxnerf.runtime import memory, shards
 from jaxnerf.training import workdir
 from runs import run as run_program
 
@@ -26,20 +26,20 @@ def run(trained, tmp_path_factory):
     folder = shutil.copytree(trained, tmp_path_factory.mktemp("shards") / "run")
     opened = restore_run(folder)
     # Threads stand for processes here, and orbax is for one thread.
-    return folder, opened._replace(weights=functools.cache(opened.weights))
+    return folder, opened._replace(variables=functools.cache(opened.variables))
 
 
 @pytest.fixture(scope="module")
 def whole(run):
-    """The results of an unsharded score, and its folder, out of the way."""
+    """The results of an unsharded evaluation, and its folder, moved aside."""
     folder, opened = run
-    results = score_run(opened, folder)  # which keeps the weights, too
+    results = score_run(opened, folder)  # which caches the variables, too
     return results, shutil.move(folder / "eval" / "20", folder / "whole")
 
 
 @pytest.fixture
 def fresh(run, whole):
-    """A function that scores a shard, below a workdir without scores; and the folder of these."""
+    """A function that scores a shard in a workdir without results; and the folder of results."""
     folder, opened = run
     shutil.rmtree(folder / "eval", ignore_errors=True)
     return lambda text=None, **options: score_run(opened, folder, shard=shards.parse(text), **options), folder / "eval"
@@ -47,14 +47,14 @@ def fresh(run, whole):
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """A list that grows by an entry a frame that is rendered."""
-    asked, render_image = [], chunking.render_image
-    monkeypatch.setattr(chunking, "render_image", lambda *a, **k: asked.append(1) or render_image(*a, **k))
-    return asked
+    """A list that grows by an entry for each rendered frame."""
+    calls, render_image = [], memory.render_image
+    monkeypatch.setattr(memory, "render_image", lambda *a, **k: calls.append(1) or render_image(*a, **k))
+    return calls
 
 
 def contents(folder):
-    """Returns the bytes of a folder's files by name, but for results.json, which has times."""
+    """Returns the bytes of a folder's files by name, except results.json, which holds times."""
     files = (path for path in folder.rglob("*.*") if path.name != "results.json")
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
@@ -64,7 +64,7 @@ def without_times(results):
     return {**results, "images": rows, "seconds_per_frame": 0, "rays_per_second": 0}
 
 
-def test_shards_in_any_order_come_to_what_one_call_does(fresh, whole, rendered):
+def test_shards_in_any_order_give_the_result_of_one_call(fresh, whole, rendered):
     score, folder = fresh
     assert score("2/3") is None and score("0/3") is None
     assert len(rendered) == 2 + 3 and [path.name for path in folder.iterdir()] == ["20.tmp"]
@@ -73,18 +73,18 @@ def test_shards_in_any_order_come_to_what_one_call_does(fresh, whole, rendered):
     assert json.loads((folder / "20" / "results.json").read_text()) == results
     assert contents(folder / "20") == contents(whole[1])
     assert [path.name for path in folder.iterdir()] == ["20"]
-    assert score("1/3") == results and len(rendered) == 8, "a shard again has nothing to do"
+    assert score("1/3") == results and len(rendered) == 8, "a finished shard renders nothing"
     assert results["seconds_per_frame"] < 2 * max(row["seconds"] for row in results["images"])
 
 
-def test_a_call_that_was_stopped_costs_the_view_it_was_at(fresh, whole, rendered, monkeypatch):
+def test_an_interrupted_call_loses_only_the_view_that_it_rendered(fresh, whole, rendered, monkeypatch):
     score, folder = fresh
     finish = aggregate.finish
 
-    def stopped(folder, index, *rest):
+    def stopped(folder, index, *rest, **options):
         if index == 2:
             raise KeyboardInterrupt
-        finish(folder, index, *rest)
+        finish(folder, index, *rest, **options)
 
     monkeypatch.setattr(aggregate, "finish", stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -96,8 +96,8 @@ def test_a_call_that_was_stopped_costs_the_view_it_was_at(fresh, whole, rendered
     assert len(rendered) == 3 + 6 and contents(folder / "20") == contents(whole[1])
 
 
-def test_two_that_finish_at_once_both_have_the_result(fresh, monkeypatch):
-    """The second gets ahead between the first one's last look and its move, and a third follows."""
+def test_two_shards_that_finish_together_both_return_the_result(fresh, monkeypatch):
+    """The second one finishes between the first one's check and its move; a third one follows."""
     score, folder = fresh
     score("0/2")
     replace, others = os.replace, []
@@ -113,7 +113,7 @@ def test_two_that_finish_at_once_both_have_the_result(fresh, monkeypatch):
     assert others[1:] == [results, results] and [path.name for path in folder.iterdir()] == ["20"]
 
 
-def test_calls_at_the_same_time_spoil_nothing(fresh, whole):
+def test_concurrent_calls_damage_no_file(fresh, whole):
     score, folder = fresh
     found, texts = [], ["0/2", "1/2", "0/2", "1/2", "0/1"]
     threads = [threading.Thread(target=lambda text=text: found.append(score(text))) for text in texts]
@@ -127,28 +127,29 @@ def test_calls_at_the_same_time_spoil_nothing(fresh, whole):
 def test_views_of_other_settings_are_not_mixed(fresh, run, whole):
     score, folder = fresh
     score("0/2")
-    other = restore_run(run[0], settings={"samples": 2.0})
-    with pytest.raises(ValueError, match=r"20.tmp: holds .* samples 1.0, not 2.0; give --overwrite without"):
+    other = restore_run(run[0], settings={"sample_multiplier": 2.0})
+    with pytest.raises(ValueError, match=r"20.tmp: holds .* sample_multiplier 1.0, not 2.0; give --overwrite without"):
         score_run(other, run[0], shard=(1, 2))
     config = workdir.read_config(run[0])
     config.fine.density_bias = 0.5
-    with pytest.raises(ValueError, match="rendered with configuration"):
+    with pytest.raises(ValueError, match="rendered with config"):
         score_run(restore_run(run[0], config), run[0])
+    chunked = restore_run(run[0], settings={"chunk": 577})
     with pytest.raises(ValueError, match="--overwrite with --shard would delete other shards' frames"):
         score("0/2", overwrite=True)
-    assert score("1/2", chunk=577)["images"][0]["name"] == "test_000", "the chunk is no matter"
-    with pytest.raises(ValueError, match="eval/20: holds .* samples 1.0, not 2.0"):
+    assert score_run(chunked, run[0], shard=(1, 2))["images"][0]["name"] == "test_000", "the chunk changes no pixel"
+    with pytest.raises(ValueError, match="eval/20: holds .* sample_multiplier 1.0, not 2.0"):
         score_run(other, run[0], shard=(1, 2))
 
 
-def test_shards_of_a_path_make_its_video_when_all_are_there(run, rendered, tmp_path, capsys):
+def test_shards_of_a_path_make_its_video_when_all_frames_exist(run, rendered, tmp_path, capsys):
     folder = shutil.copytree(run[0], tmp_path / "run", ignore=shutil.ignore_patterns("eval", "whole"))
-    options = {"path": "turntable", "num_frames": 3, "size": (8, 8), "kind": "gif", "chunk": 64}
+    options = {"path": "turntable", "num_frames": 3, "size": (8, 8), "kind": "gif", "settings": {"chunk": 64}}
     target = folder / "renders" / "turntable-20"
     assert render_path(folder, shard=(1, 2), **options) == [target]
     assert "shard 1/2 is done, 2 frames of others are missing" in capsys.readouterr().err
     assert [path.name for path in (target / "color").iterdir()] == ["0001.png"] and len(rendered) == 1
-    assert not list((target / "depth").glob("*.png")), "their range is the whole path's"
+    assert not list((target / "depth").glob("*.png")), "one range for the whole path"
     with pytest.raises(ValueError, match="would delete other shards' frames; remove .*turntable-20 first"):
         render_path(folder, shard=(0, 2), overwrite=True, **options)
     assert render_path(folder, shard=(0, 2), **options) == [target, target.with_name("turntable-20.gif")]
@@ -156,12 +157,12 @@ def test_shards_of_a_path_make_its_video_when_all_are_there(run, rendered, tmp_p
     assert render_path(folder, shard=(1, 2), **options)[1].exists() and len(rendered) == 3
 
 
-def test_what_a_shard_is_called(monkeypatch):
+def test_the_flag_names_a_shard_by_index_and_count(monkeypatch):
     assert shards.parse(None) == shards.parse("0/1") == (0, 1) and shards.parse("3/16") == (3, 16)
     assert sorted(sum((shards.own(range(7), (k, 3)) for k in range(3)), [])) == list(range(7))
     assert shards.own(range(2), (2, 3)) == []
     for wrong in ("16/16", "1", "-1/2", "1/0", "0/0", "a/b", "1/2/3", "", " 1/2"):
-        with pytest.raises(ValueError, match="--shard is .*, wanted K/N with K from 0 below N"):
+        with pytest.raises(ValueError, match="--shard is .*, expected K/N with K from 0 below N"):
             shards.parse(wrong)
     with pytest.raises(ValueError, match="neither srun nor mpirun"):
         shards.parse("auto")
@@ -170,6 +171,6 @@ def test_what_a_shard_is_called(monkeypatch):
     assert shards.parse("auto") == (2, 8)
 
 
-def test_what_shards_do_not_split_says_so(run):
+def test_shard_with_watch_is_an_error(run):
     code, _, err = run_program("eval", f"--workdir={run[0]}", "--shard=0/2", "--watch")
     assert code == 1 and "not --watch; drop" in err and len(err.splitlines()) == 1

@@ -1,11 +1,11 @@
-"""The same run on 1, 2, 4 and 8 devices and in 2 processes of 2: by hand, as it takes a quarter of an hour.
+"""Compares runs on 1, 2, 4 and 8 devices and in 2 processes with 2 devices each; takes a quarter of an hour.
 
-    python tests/device_matrix.py [FOLDER [dense|packed [float32|float64]]]
+    PYTHONPATH=.:tests python tests/slow/device_matrix.py [FOLDER [dense|packed [float32|float64]]]
 
-Trains configs/smoke.py, and it as a packed model with a grid field, each in a process of its own with so
-many virtual CPU devices; scores it; and prints the largest differences from the run on one device: of
-parameters and grid, and of any view's PSNR. Ends with 1 if a bar is missed or a pool was full. The same
-folder again keeps the runs that are finished.
+Trains configs/smoke.py ("dense") and the same with a hash grid and the occupancy sampler ("packed"), each in
+processes of its own with virtual CPU devices; scores it; and prints the largest differences from the run on one
+device: of parameters and grid, and of any view's PSNR. Exits with 1 if a limit is exceeded or a ray was
+dropped. With the same folder, finished runs are kept.
 """
 
 import json
@@ -20,16 +20,16 @@ import runs
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import metric_log
 
-STEPS, BARS = {"float32": 10, "float64": 50}, {"float32": 1e-6, "float64": 1e-9}
-SCORE_BAR = 1e-5  # dB
+STEPS, LIMITS = {"float32": 10, "float64": 50}, {"float32": 1e-6, "float64": 1e-9}
+SCORE_LIMIT = 1e-5  # dB
 PLACES = {"1 device": (1, 1), "2 devices": (1, 2), "4 devices": (1, 4), "8 devices": (1, 8), "2 x 2": (2, 2)}
 PMAPPED = (("pmap", "4 devices"), ("pmap", "2 x 2"))
 
 
 def main(folder, models=("dense", "packed"), precisions=tuple(STEPS)):
-    """Runs the matrix below a folder; returns whether all bars are met."""
+    """Runs the matrix in a folder; returns whether all differences are within the limits."""
     good = True
-    print("| model | precision | steps | mode | on | parameters differ by | PSNR by, dB | left out |")
+    print("| model | precision | steps | mode | on | parameters differ by | PSNR by, dB | rays dropped |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for model in models:
         for precision in precisions:
@@ -38,7 +38,7 @@ def main(folder, models=("dense", "packed"), precisions=tuple(STEPS)):
             for mode, place in (*(("sharded", name) for name in PLACES), *PMAPPED):
                 found = train(folder, model, precision, mode, place)
                 apart, scores = difference(one, found)
-                good &= apart <= BARS[precision] and scores <= SCORE_BAR and found["rays_dropped"] == 0
+                good &= apart <= LIMITS[precision] and scores <= SCORE_LIMIT and found["rays_dropped"] == 0
                 cells = (
                     model,
                     precision,
@@ -50,12 +50,12 @@ def main(folder, models=("dense", "packed"), precisions=tuple(STEPS)):
                     found["rays_dropped"],
                 )
                 print(f"| {' | '.join(map(str, cells))} |", flush=True)
-    print("all within the bars" if good else "NOT within the bars")
+    print("all within the limits" if good else "NOT within the limits")
     return good
 
 
 def train(folder, model, precision, mode, place):
-    """Returns what a run came to: its weights, rows of scores and how many rays were left out."""
+    """Returns the variables, the metrics of each image and the number of dropped rays of a run."""
     target = folder / "-".join((model, precision, mode, place.replace(" ", "")))
     processes, devices = PLACES[place]
     flags = ["--config=configs/smoke.py", f"--workdir={target}", "--config.eval.at_end=True"]
@@ -65,7 +65,7 @@ def train(folder, model, precision, mode, place):
     wide = str(int(precision == "float64"))
     program = "wide_train.py" if precision == "float64" else "train"
     environment = {
-        "PYTHONPATH": str(runs.ROOT),
+        "PYTHONPATH": f"{runs.ROOT}:{runs.ROOT / 'tests'}",
         "JAX_NUM_CPU_DEVICES": str(devices),
         "JAX_PLATFORMS": "cpu",
         "JAX_ENABLE_X64": wide,
@@ -82,15 +82,15 @@ def train(folder, model, precision, mode, place):
             raise RuntimeError(err)
     jax.config.update("jax_enable_x64", precision == "float64")
     run = restore_run(target)
-    weights = jax.device_get(run.weights(STEPS[precision]))
+    variables = jax.device_get(run.variables(STEPS[precision]))
     results = json.loads((target / "eval" / str(STEPS[precision]) / "results.json").read_text())
     rays_dropped = metric_log.read_rows(target)[-1]["rays_dropped"]
-    return {"weights": weights, "rows": results["images"], "rays_dropped": rays_dropped}
+    return {"variables": variables, "rows": results["images"], "rays_dropped": rays_dropped}
 
 
 def difference(one, other):
-    """Returns by how much parameters and grid of two runs differ, and how much the PSNR of any view, dB."""
-    pairs = zip(jax.tree.leaves(one["weights"]), jax.tree.leaves(other["weights"]), strict=True)
+    """Returns the largest differences of two runs: of variables, and of the PSNR of any view in dB."""
+    pairs = zip(jax.tree.leaves(one["variables"]), jax.tree.leaves(other["variables"]), strict=True)
     apart = max(float(np.abs(np.subtract(a, b, dtype=np.float64)).max()) for a, b in pairs)
     rows = zip(one["rows"], other["rows"], strict=True)
     return apart, max(abs(a[key] - b[key]) for a, b in rows for key in ("psnr", "psnr_float"))

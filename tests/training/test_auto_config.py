@@ -1,63 +1,132 @@
-"""What a configuration leaves open is filled from cameras, masks and images, once."""
+"""Fields that are "auto" are inferred from cameras, alpha and images; explicit values never change."""
 
 import copy
 import dataclasses
 import json
+import sys
 
 import jax
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
+from absl import flags
+from ml_collections import config_flags
 
-from configs import default, lego_fast, lego_mlp_fast
 from helpers import compiled
 from jaxnerf import Camera, Views
+from jaxnerf.configs import default, lego_fast, lego_mlp_fast
 from jaxnerf.data import synthetic
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
+from jaxnerf.runtime.config_fields import AUTO
 from jaxnerf.training import workdir
-from jaxnerf.training.auto_config import fill_from, is_open, resolve_sizes
+from jaxnerf.training.auto_config import DEVICE_FIELDS, auto_fields, fill_from, resolve, resolve_for_device
 from jaxnerf.training.build import build
 from test_configs import fields
 
-PIXEL = 4 / (1.36 * 24)  # what a pixel of the embedded scene covers at its middle
+PIXEL = 4 / (1.36 * 24)  # the size of a pixel of the embedded scene at its centre, world units
+# Every field of default.py that may be "auto", with the value that a flag or Python code sets it to.
+AUTO_FIELDS = {
+    "data.factor": 4,
+    "data.ndc": True,
+    "coarse.num_freqs": 7,
+    "fine.num_freqs": 7,
+    "hash_grid.resolutions": (8, 16),
+    "occupancy.contracted": True,
+    "occupancy.lower": (-1.0, -2.0, -3.0),
+    "occupancy.upper": (1.0, 2.0, 3.5),
+    "occupancy.step_size": 0.25,
+    "occupancy.resolution": 32,
+    "train.microbatch_size": 128,
+    "train.max_steps": 300,
+    "train.lr_steps": 300,
+    "eval.chunk": 512,
+    "eval.max_samples": 2048,
+}
 
 
-def an_open(field="grid", **occupancy):
-    """Returns the default configuration with one field and a occupancy, their sizes open."""
+def auto_config(field="hash_grid", **occupancy):
+    """Returns the default config with the occupancy sampler, whose sizes are "auto"."""
     config = default.get_config()
-    config.data.size, config.field = 24, field
-    config.sampler = "occupancy"
+    config.data.size, config.field, config.sampler = 24, field, "occupancy"
     config.occupancy.update(occupancy)
     if field == "mlp":
-        config.fine.num_freqs = 0
+        config.fine.num_freqs = AUTO
     return config
+
+
+def as_json(config):
+    return json.loads(config.to_json_best_effort())
+
+
+def unresolved(config):
+    """Returns the "auto" fields that training never leaves."""
+    return set(auto_fields(config)) - set(DEVICE_FIELDS)
+
+
+def test_table_lists_every_auto_field():
+    """They are declared with auto(type). Fields of text hold "auto" as any other text."""
+    config = default.get_config()
+    names = [name.split(".") for name in fields(config) if "." in name]
+    found = {f"{section}.{field}" for section, field in names if is_declared_auto(config[section], field)}
+    assert found == set(AUTO_FIELDS)
+
+
+def is_declared_auto(section, field):
+    return section.get_type(field).__name__.startswith("auto_")
+
+
+@pytest.mark.parametrize("name", AUTO_FIELDS)
+def test_auto_field_is_set_by_python_and_set_back(name):
+    config, (section, field) = default.get_config(), name.split(".")
+    for value in (AUTO, AUTO_FIELDS[name], AUTO):
+        config[section][field] = value
+        assert config[section][field] == value
+    with pytest.raises(TypeError):
+        config[section][field] = "many"
+
+
+@pytest.mark.parametrize("name", AUTO_FIELDS)
+def test_auto_field_is_set_by_a_flag_and_set_back(name, monkeypatch, tmp_path):
+    section, field = name.split(".")
+    file = tmp_path / "config.py"
+    for before in (AUTO, AUTO_FIELDS[name]):
+        file.write_text(
+            "from jaxnerf.configs import default\n\n\ndef get_config():\n    config = default.get_config()\n"
+            f"    config.{name} = {before!r}\n    return config\n"
+        )
+        for value in (AUTO, AUTO_FIELDS[name]):
+            config = parsed(monkeypatch, f"--config={file}", f"--config.{name}={value}")
+            assert config[section][field] == value and type(config[section][field]) is type(value)
+
+
+def parsed(monkeypatch, *arguments):
+    """Returns the config that a command line gives."""
+    monkeypatch.setattr(sys, "argv", ["program", *arguments])  # DEFINE_config_file reads it
+    values = flags.FlagValues()
+    config = config_flags.DEFINE_config_file("config", flag_values=values)
+    values(sys.argv)
+    return config.value
+
+
+def test_flag_of_a_wrong_type_is_an_error(monkeypatch):
+    path = sys.modules[default.__name__].__file__
+    with pytest.raises(flags.IllegalFlagValueError, match="expected auto, or int"):
+        parsed(monkeypatch, f"--config={path}", "--config.train.microbatch_size=many")
 
 
 @pytest.fixture(scope="module")
 def views():
-    return synthetic.load_views(size=24)
+    return synthetic.load_synthetic(size=24)
 
 
 @pytest.fixture(scope="module")
-def fitted(views):
-    return resolve_sizes(an_open(), views)
+def resolved(views):
+    return resolve(auto_config(), views)
 
 
-@pytest.mark.parametrize("missing", [False, True])
-def test_a_configuration_without_a_space_is_left_alone(missing):
-    config = default.get_config()
-    if missing:  # of a run from before there were any
-        config = ConfigDict({key: value for key, value in config.items() if key not in ("space", "features")})
-    before = config.to_json_best_effort()
-    got, lines = resolve_sizes(config, None)
-    assert got.to_json_best_effort() == before and not lines
-    assert got is not config and not is_open(config)
-
-
-def test_all_that_is_open_is_filled_and_said(fitted, views):
-    config, lines = fitted
+def test_every_auto_field_is_inferred_and_logged(resolved):
+    config, _, lines = resolved
     occupancy = config.occupancy
     longest = max(np.subtract(occupancy.upper, occupancy.lower))
     assert len(occupancy.lower) == len(occupancy.upper) == 3 and 2.3 < longest < 3.5
@@ -65,150 +134,211 @@ def test_all_that_is_open_is_filled_and_said(fitted, views):
     assert 0.3 * PIXEL < longest / occupancy.resolution < PIXEL
     sizes = config.hash_grid.resolutions
     assert list(sizes) == sorted(set(sizes)) and 0.3 * PIXEL < longest / sizes[-1] < PIXEL
-    assert not is_open(config)
-    build(config)
-    for word in ("box", "step", "cells", "features"):
-        assert any(line.startswith(word) for line in lines), word
+    assert not unresolved(config)
+    build(resolve_for_device(config)[0])
+    for word in ("contraction", "box", "step size", "grid", "hash grid"):
+        assert any(line.startswith(f"{word} ") for line in lines), word
     assert f"a pixel covers {PIXEL:.4g}" in "".join(lines)
 
 
-@pytest.mark.parametrize("field", ["grid", "mlp"])
-@pytest.mark.parametrize("seen", [True, False])
-def test_whether_colour_depends_on_the_direction_is_said(views, field, seen):
-    config = an_open(field)
-    (config.fine if field == "mlp" else config.hash_grid).use_viewdirs = seen
-    said = [line for line in resolve_sizes(config, views)[1] if "colour by direction" in line]
-    assert len(said) == 1 and said[0].startswith("kept" if seen else "left out")
+def test_config_of_the_paper_is_resolved_and_logs_nothing_about_a_box(views):
+    """Baking a grid needs a box later, though the paper's sampler has none."""
+    config = default.get_config()
+    config.data.size = 24
+    got, _, lines = resolve(config, views)
+    assert not unresolved(got) and lines == []
+    config.eval.bake_occupancy = True
+    baked, _, lines = resolve(config, views)
+    assert baked.occupancy == got.occupancy and any(line.startswith("box ") for line in lines)
 
 
-def test_what_is_given_stays_as_it_was(views):
-    given = an_open()
+def test_explicit_values_do_not_change(views):
+    given = auto_config()
     before = given.to_json_best_effort()
-    config, _ = resolve_sizes(given, views)
-    assert given.to_json_best_effort() == before and is_open(given)
+    config = resolve(given, views).config
+    assert given.to_json_best_effort() == before and unresolved(given)
     changed = {name for name, value in fields(config).items() if value != fields(given)[name]}
-    assert changed == {f"occupancy.{name}" for name in ("lower", "upper", "step", "resolution")} | {
-        "hash_grid.resolutions"
-    }
-    kinds = {name: type(value) for name, value in fields(config).items()}
-    assert kinds == {name: type(value) for name, value in fields(given).items()}
+    names = ("contracted", "lower", "upper", "step_size", "resolution")
+    expected = {"data.world", "data.fingerprint", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
+    assert changed == expected
 
 
-SET = [
+EXPLICIT = [
     {"lower": (-1.0, -1.1, -1.2), "upper": (1.3, 1.4, 1.5)},
-    {"step": 0.123},
+    {"step_size": 0.123},
     {"resolution": 7},
-    {"lower": (-2.0,) * 3, "upper": (2.0,) * 3, "step": 0.2, "resolution": 9},
+    {"contracted": True},
+    {"lower": (-2.0,) * 3, "upper": (2.0,) * 3, "step_size": 0.2, "resolution": 9},
+    {"lower": (-1.0, -1.1, -1.2)},
 ]
 
 
-@pytest.mark.parametrize("given", SET, ids=lambda given: " ".join(given))
-def test_what_is_set_is_kept(views, given):
-    config = an_open(**given)
+@pytest.mark.parametrize("given", EXPLICIT, ids=lambda given: " ".join(given))
+def test_explicit_sizes_do_not_change(views, given):
+    config = auto_config(**given)
     config.hash_grid.resolutions = (5, 6)
-    got, lines = resolve_sizes(config, views)
-    assert {name: got.space[name] for name in given} == given
-    assert got.features.resolutions == (5, 6)
-    assert not is_open(got) and not any(line.startswith("features") for line in lines)
+    got, _, lines = resolve(config, views)
+    assert {name: got.occupancy[name] for name in given} == given
+    assert got.hash_grid.resolutions == (5, 6)
+    assert not unresolved(got) and not any(line.startswith("hash grid") for line in lines)
 
 
-def test_half_a_box_is_not_replaced(views):
-    """Either it is kept or it is named; it must not be overwritten without a word."""
-    try:
-        config, _ = resolve_sizes(an_open(lower=(-1.0, -1.1, -1.2)), views)
-    except ValueError as error:
-        assert "occupancy." in str(error)
-    else:
-        assert config.occupancy.lower == (-1.0, -1.1, -1.2)
+def test_resolving_again_changes_nothing(resolved, views):
+    config = resolved.config
+    assert as_json(resolve(auto_config(), views).config) == as_json(config)
+    assert as_json(resolve(config, views).config) == as_json(config)
 
 
-def test_a_fitted_configuration_is_fitted_and_stays_so(fitted, views):
-    config, _ = fitted
-    again, _ = resolve_sizes(an_open(), views)
-    assert again.to_json_best_effort() == config.to_json_best_effort()
-    twice, _ = resolve_sizes(config, views)
-    assert twice.to_json_best_effort() == config.to_json_best_effort()
-    filled = fill_from(an_open(), config)
-    assert filled.to_json_best_effort() == config.to_json_best_effort()
+def test_fill_from_a_resolved_config(resolved):
+    given = auto_config()
+    assert as_json(fill_from(given, resolved.config)) == as_json(resolved.config)
+    given.occupancy.step_size = 0.5
+    assert fill_from(given, resolved.config).occupancy.step_size == 0.5
+    without = copy.deepcopy(resolved.config)
+    with without.unlocked():
+        del without.hash_grid
+    with pytest.raises(ValueError, match="hash_grid.resolutions is 'auto', and .* has no such field; set a value"):
+        fill_from(given, without)
 
 
-def test_a_network_of_octaves_is_fitted_too(views):
-    config, _ = resolve_sizes(an_open("mlp"), views)
+def test_fields_that_nothing_infers_are_an_error(views):
+    config = auto_config()
+    config.data.near = 0.0
+    with config.unlocked():
+        config.mine = {"size": AUTO}
+    with pytest.raises(ValueError, match="mine.size is 'auto', which is not inferred"):
+        resolve(config, views)
+
+
+@pytest.mark.parametrize("backend, chunk", [("cpu", 2**12), ("gpu", 2**16)])
+def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_path, backend, chunk):
+    """They stay "auto" in config.json, so the same workdir continues on another device."""
+    given = copy.deepcopy(resolved.config)
+    given.eval.chunk = AUTO
+    assert set(auto_fields(given)) == set(DEVICE_FIELDS)
+    workdir.claim(tmp_path, given)
+    read = workdir.read_config(tmp_path)
+    assert set(auto_fields(read)) == set(DEVICE_FIELDS)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    config, lines = resolve_for_device(read)
+    assert not auto_fields(config) and len(lines) == 3 and config.eval.chunk == chunk
+    assert config.train.batch_size % config.train.microbatch_size == 0
+    read.eval.update({"chunk": 5, "max_samples": 6})
+    read.train.microbatch_size = 64
+    config, lines = resolve_for_device(read)
+    assert (config.eval.chunk, config.eval.max_samples, config.train.microbatch_size, lines) == (5, 6, 64, [])
+
+
+def of_cameras(to_world, near=2.0, far=6.0):
+    """Returns Views of 20 x 30 pixels with these cameras [V, 3, 4]."""
+    count = len(to_world)
+    return Views(
+        pixels=np.zeros((count * 600, 3), np.uint8),
+        offset=np.arange(count, dtype=np.int32) * 600,
+        size=np.int32([[20, 30]] * count),
+        cameras=Camera(
+            to_world=np.float32(to_world),
+            focal=np.full((count, 2), 25, np.float32),
+            center=np.float32([[15, 10]] * count),
+            height=20,
+            width=30,
+        ),
+        near=np.full(count, near, np.float32),
+        far=np.full(count, far, np.float32),
+    )
+
+
+def turned(angle):
+    """Returns a camera at the origin that is turned around y."""
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return [[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0]]
+
+
+IDENTITY = np.eye(3, 4)
+ODD_CAMERAS = {
+    "one view": [IDENTITY],
+    "one view elsewhere": [IDENTITY + np.array([[0, 0, 0, 5], [0, 0, 0, -3], [0, 0, 0, 7]])],
+    "parallel": [IDENTITY, IDENTITY + np.array([[0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]])],
+    "parallel and the same": [IDENTITY] * 3,
+    "panorama": [turned(angle) for angle in (0.0, 1.0, 2.0, 4.0)],
+    "opposite": [IDENTITY, turned(np.pi)],
+}
+
+
+@pytest.mark.parametrize("name", ODD_CAMERAS)
+@pytest.mark.parametrize("sampler, field", [("hierarchical", "mlp"), ("occupancy", "hash_grid")])
+def test_odd_cameras_are_resolved(name, sampler, field):
+    """Where no point in front of the cameras is nearest to their axes, the depth range stands in."""
+    config = auto_config(field)
+    config.sampler = sampler
+    got = resolve(config, of_cameras(ODD_CAMERAS[name])).config
+    assert not unresolved(got)
+    box = np.subtract(got.occupancy.upper, got.occupancy.lower)
+    assert (0.5 < box).all() and (box < 20).all() and 1e-3 < got.occupancy.step_size < 1
+
+
+def test_octaves_are_inferred(views):
+    config = resolve(auto_config("mlp"), views).config
     wave = 2 * np.pi / 2 ** (config.fine.num_freqs - 1)
     assert 2 * PIXEL < wave < 8 * PIXEL
-    assert not config.hash_grid.resolutions and not is_open(config)
-    build(config)
+    assert not unresolved(config)
+    build(resolve_for_device(config)[0])
 
 
-def test_finer_images_are_trained_on_longer(views):
-    """Sixteen times the pixels a side: four times the steps. What is set is kept, and lr_steps follows it."""
-    config = an_open(lower=(-1.0,) * 3, upper=(1.0,) * 3)
-    config.train.max_steps = config.train.lr_steps = 0
-    assert is_open(config)
-    got, lines = resolve_sizes(config, views)
-    sharp, _ = resolve_sizes(config, dataclasses.replace(views, size=16 * views.size))
-    assert sharp.train.max_steps == pytest.approx(4 * got.train.max_steps, abs=4)
-    assert got.train.max_steps == got.train.lr_steps == round(1000 * 24**0.5) and not is_open(got)
+def test_larger_images_are_trained_on_longer(views):
+    """16 times the pixels per side take 4 times the steps; lr_steps follows max_steps."""
+    config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    config.train.max_steps = config.train.lr_steps = AUTO
+    assert {"train.max_steps", "train.lr_steps"} <= unresolved(config)
+    got, _, lines = resolve(config, views)
+    large = resolve(config, dataclasses.replace(views, size=16 * views.size)).config
+    assert large.train.max_steps == pytest.approx(4 * got.train.max_steps, abs=4)
+    assert got.train.max_steps == got.train.lr_steps == round(1000 * 24**0.5) and not unresolved(got)
     assert any(line.startswith("training") and "4,899" in line for line in lines)
-    filled = fill_from(config, got)
-    assert filled.to_json_best_effort() == got.to_json_best_effort()
+    assert as_json(fill_from(config, got)) == as_json(got)
     config.train.max_steps = 7
-    got, lines = resolve_sizes(config, views)
+    got, _, lines = resolve(config, views)
     assert (got.train.max_steps, got.train.lr_steps) == (7, 7)
-    assert not any(line.startswith("training") for line in lines)
+    assert not any(line.startswith("training") and "steps, for images" in line for line in lines)
 
 
-def test_the_box_holds_all_matter_of_the_embedded_scene(fitted):
-    lower, upper = (np.float32(bound) for bound in (fitted[0].occupancy.lower, fitted[0].occupancy.upper))
+def test_box_holds_all_matter_of_the_embedded_scene(resolved):
+    lower, upper = (np.float32(bound) for bound in (resolved.config.occupancy.lower, resolved.config.occupancy.upper))
     x = np.random.default_rng(0).uniform(-2, 2, (1, 300_000, 3)).astype(np.float32)
     density, _ = compiled(still_life.still_life)(x, x)
     outside = ((x < lower) | (x > upper)).any(-1)
     assert (density > 0.1).mean() > 0.01 and not density[outside].max() > 0.1
 
 
-def test_without_masks_the_box_is_what_all_cameras_see(fitted, views):
-    config, lines = resolve_sizes(an_open(masks=False), views)
+def test_without_alpha_the_box_is_what_all_cameras_see(resolved, views):
+    config, _, lines = resolve(auto_config(use_alpha=False), views)
     opaque = dataclasses.replace(views, pixels=views.pixels[:, :3])
-    assert resolve_sizes(an_open(), opaque)[0].occupancy.lower == config.occupancy.lower
-    assert "nothing is known to be empty" in lines[0]
-    # Cameras 4 away from the origin, which look at it with a focal length of 1.36 images.
+    assert resolve(auto_config(), opaque).config.occupancy.lower == config.occupancy.lower
+    assert any("as large as the images" in line for line in lines)
+    # The cameras are 4 units from the origin, look at it, and have a focal length of 1.36 images.
     np.testing.assert_allclose(config.occupancy.upper, 3 * [4 / 1.36 / 2], atol=1e-3)
     np.testing.assert_allclose(config.occupancy.lower, 3 * [-4 / 1.36 / 2], atol=1e-3)
-    assert (np.float64(fitted[0].occupancy.lower) >= np.float64(config.occupancy.lower) - 1e-4).all()
+    assert (np.float64(resolved.config.occupancy.lower) >= np.float64(config.occupancy.lower) - 1e-4).all()
 
 
-def test_a_scene_in_other_units_has_its_box_in_them(fitted, views):
+def test_box_is_in_the_units_of_the_scene(resolved, views):
     """A scene of a thousandth of the size has a thousandth of the box, to the same digits."""
     poses = views.cameras.to_world.copy()
     poses[:, :, 3] *= 1e-3
     small = dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, to_world=poses))
-    got, _ = resolve_sizes(an_open(), small)
-    for name in ("lower", "upper", "step"):
-        np.testing.assert_allclose(1e3 * np.float64(got.space[name]), fitted[0].space[name], rtol=2e-3)
-    assert got.occupancy.resolution == fitted[0].occupancy.resolution
+    got = resolve(auto_config(), small).config
+    for name in ("lower", "upper", "step_size"):
+        np.testing.assert_allclose(1e3 * np.float64(got.occupancy[name]), resolved.config.occupancy[name], rtol=2e-3)
+    assert got.occupancy.resolution == resolved.config.occupancy.resolution
 
 
-def test_in_normalised_coordinates_the_box_holds_all_rays():
+def test_ndc_box_holds_all_rays():
     shift = np.zeros((2, 3, 4), np.float32) + np.eye(3, 4, dtype=np.float32)
     shift[:, :2, 3] = [[0.3, -0.1], [-0.2, 0.2]]
-    size = np.int32([[20, 30]] * 2)
-    views = Views(
-        pixels=np.zeros((1200, 3), np.uint8),
-        offset=np.int32([0, 600]),
-        size=size,
-        cameras=Camera(
-            to_world=shift,
-            focal=np.full((2, 2), 25, np.float32),
-            center=np.float32([[15, 10]] * 2),
-            height=20,
-            width=30,
-        ),
-        near=np.zeros(2, np.float32),
-        far=np.ones(2, np.float32),
-    )
-    config = an_open()
-    config.data.ndc = True
-    got, _ = resolve_sizes(config, views)
+    views = of_cameras(shift, near=0.0, far=1.0)
+    config = auto_config()
+    config.data.ndc, config.data.world = True, "forward"
+    got = resolve(config, views).config
     pixels = np.random.default_rng(1).uniform(0, 1, (200, 2)).astype(np.float32) * [30, 20]
     for index in range(2):
         rays = compiled(view_rays, "ndc")(views, index, np.float32(pixels), ndc=True)
@@ -218,36 +348,36 @@ def test_in_normalised_coordinates_the_box_holds_all_rays():
             assert (x <= np.float64(got.occupancy.upper) + 2e-4).all()
 
 
-def test_the_record_of_a_run_builds_the_same_model(fitted, views, tmp_path):
-    config, _ = fitted
+def test_workdir_gives_the_same_model(resolved, views, tmp_path):
+    config = resolved.config
     workdir.claim(tmp_path, config)
-    workdir.claim(tmp_path, resolve_sizes(an_open(), views)[0])  # the same command goes on
+    workdir.claim(tmp_path, resolve(auto_config(), views).config)  # the same command resumes
     read = workdir.read_config(tmp_path)
-    assert json.loads(read.to_json_best_effort()) == json.loads(config.to_json_best_effort())
-    refitted, _ = resolve_sizes(read, views)
-    assert json.loads(refitted.to_json_best_effort()) == json.loads(config.to_json_best_effort())
-    mine, theirs = build(config).model, build(read).model
-    for part in ("lower", "upper", "shape", "step"):
-        assert tuple(np.ravel(getattr(mine.occupancy, part))) == tuple(np.ravel(getattr(theirs.occupancy, part)))
+    assert as_json(read) == as_json(config)
+    assert as_json(resolve(read, views).config) == as_json(config)
+    mine, theirs = (build(resolve_for_device(each)[0]).model for each in (config, read))
+    for part in ("lower", "upper", "shape", "step_size"):
+        expected = np.ravel(getattr(theirs.grid_schedule, part))
+        assert tuple(np.ravel(getattr(mine.grid_schedule, part))) == tuple(expected)
     shapes = [jax.eval_shape(model.init, jax.random.key(0)) for model in (mine, theirs)]
     assert jax.tree.structure(shapes[0]) == jax.tree.structure(shapes[1])
     assert jax.tree.leaves(shapes[0]) == jax.tree.leaves(shapes[1])
     other = copy.deepcopy(config)
     other.occupancy.step_size *= 2
-    with pytest.raises(ValueError, match="belongs to a run with another configuration .occupancy.step_size"):
+    with pytest.raises(ValueError, match="belongs to a run with another config .occupancy.step_size"):
         workdir.claim(tmp_path, other)
 
 
 @pytest.mark.scenes("lego")
 def test_sizes_of_lego(scenes_dir):
-    lego = blender.load_views(scenes_dir / "lego", split="train", factor=8)  # fewer views leave a larger box
-    config, _ = resolve_sizes(lego_fast.get_config(), lego)
+    lego = blender.load_blender(scenes_dir / "lego", split="train", factor=8)  # with fewer views the box is larger
+    config = resolve(lego_fast.get_config(), lego).config
     occupancy = config.occupancy
     assert (np.abs([occupancy.lower, occupancy.upper]) < 1.3).all()
     assert 0.015 < occupancy.step_size < 0.025
     assert 64 <= occupancy.resolution <= 128 and 64 <= config.hash_grid.resolutions[-1] <= 256
-    build(config)
-    slow, _ = resolve_sizes(lego_mlp_fast.get_config(), lego)
+    build(resolve_for_device(config)[0])
+    slow = resolve(lego_mlp_fast.get_config(), lego).config
     assert slow.occupancy.lower == occupancy.lower and slow.occupancy.step_size == occupancy.step_size
     assert config.train.max_steps == config.train.lr_steps == 10000
-    build(slow)
+    build(resolve_for_device(slow)[0])

@@ -1,4 +1,4 @@
-"""Training that asks only where there is something: it learns, what it hides does no harm, and it goes on."""
+"""Training with an occupancy grid: it learns, occlusion does no harm, and it resumes bit for bit."""
 
 import dataclasses
 import functools
@@ -9,100 +9,100 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from test_devices import run_steps
 
-from configs import default
 from helpers import all_finite, assert_same, compiled, rays_past_origin
 from jaxnerf import Batch, load_scene, render_samples
+from jaxnerf.configs import default
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.data import synthetic
-from jaxnerf.evaluation.evaluate import reference
+from jaxnerf.evaluation.evaluate import reference, train_and_evaluate
 from jaxnerf.fields.base import Field
 from jaxnerf.fields.hash_grid import hash_grid_field
 from jaxnerf.models import occupancy as occupancy_module
 from jaxnerf.models.grid_schedule import make_grid_schedule
 from jaxnerf.models.occupancy import occupancy_model
 from jaxnerf.training import loop
-from jaxnerf.training.auto_config import is_open, resolve_sizes
+from jaxnerf.training.auto_config import DEVICE_FIELDS, auto_fields, resolve, resolve_for_device
 from jaxnerf.training.build import build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import TrainData, make_train_step
 from jaxnerf.training.workdir import read_config
 from runs import smoke_config
+from toys import run_steps
 
 pytest_plugins = ["run_fixtures"]
 
 BATCH, STEPS, SIZE = 192, 250, 24
-NEVER, EAGERLY = 10**9, 20  # steps from which on training hides what the grid guesses to be hidden
+NEVER, EARLY = 10**9, 20  # training steps from which samples that the grid estimates to be occluded are masked
 SEEDS, COMPARED = range(10), range(3)
 
 
 def tiny_config():
-    """Returns a fast field on the embedded scene, of one small level."""
+    """Returns a hash grid of one small level on the embedded scene."""
     config = default.get_config()
-    config.data.size, config.field = SIZE, "grid"
-    config.occupancy.update({"skip_empty": True, "step": 0.1, "update_every": 16})
+    config.data.size, config.field, config.sampler = SIZE, "hash_grid", "occupancy"
+    config.occupancy.update({"step_size": 0.1, "update_every": 16})
     config.hash_grid.update({"resolutions": (16,), "table_size": 2**12, "view_width": 16})
     train = config.train
     train.batch_size, train.lr_steps, train.warmup_steps = BATCH, STEPS, 10
     train.lr_init, train.lr_final, train.beta2, train.epsilon = 2e-2, 2e-3, 0.99, 1e-15
-    train.muon = 0.15  # of so high a rate, as much as lego_fast.py has
+    train.muon = 0.15  # times this learning rate it is as large as in lego_fast.py
     return config
 
 
 class Tiny:
-    """Runs of tiny_config that differ in their seed and in what they hide, by one compiled function."""
+    """Runs of tiny_config that differ in their seed and occlusion, by one compiled function."""
 
     def __init__(self):
-        views, test = (synthetic.load_views(size=SIZE, split=split) for split in ("train", "test"))
-        config, _ = resolve_sizes(tiny_config(), views)
+        views, test = (synthetic.load_synthetic(size=SIZE, split=split) for split in ("train", "test"))
+        config = resolve_for_device(resolve(tiny_config(), views).config)[0]
         self.experiment = experiment = build(config)
         self.field = hash_grid_field(lower=config.occupancy.lower, upper=config.occupancy.upper, **config.hash_grid)
-        self.valid, data = experiment.survey(views)
+        self.valid, data = experiment.prepare(views)
         self.data = jax.tree.map(jnp.asarray, data)
         self.train = jax.jit(self._train)
         pixels = np.moveaxis(np.indices((SIZE, SIZE)), 0, -1)[..., ::-1] + np.float32(0.5)
 
         @compiled
         def error(params, grid):
-            """Returns the mean squared error of three views that training has not seen."""
+            """Returns the mean squared error of three test views."""
             rays, truth = [], []
             for index in (0, 3, 6):
                 rays.append(experiment.view_rays(test, index, pixels))
                 truth.append(reference(test, index))
-            seen = experiment.model.view(params, grid, jax.tree.map(lambda *x: jnp.stack(x), *rays))
-            return ((seen.rgb - jnp.stack(truth)) ** 2).mean()
+            rendering = experiment.model.view(params, grid, jax.tree.map(lambda *x: jnp.stack(x), *rays))
+            return ((rendering.rgb - jnp.stack(truth)) ** 2).mean()
 
         self.error = error
 
     def _train(self, data, seed, occlusion_start_step, treated):
-        """treated: whether rays that are cut see no background, as _over_background has it."""
+        """Trains; treated: whether occluded rays show no background, as in _over_background."""
         experiment = self.experiment
         model = occupancy_model(
             self.field,
             experiment.model.grid_schedule,
-            samples_per_ray=16,
+            pool_samples_per_ray=16,
             long_steps_until=20,
-            max_optical_depth=3.0,  # optical depth: 5 % of the light is left
+            max_optical_depth=3.0,  # a transmittance of 5 %
             occlusion_start_step=occlusion_start_step,
             early_stop_eps=0.0,
             sample_multiplier=1.0,
             max_samples=1,
             background=(1.0, 1.0, 1.0),
         )
-        whole = occupancy_module._over_background
+        over_background = occupancy_module._over_background
 
         def draw(step, positions, data):
             return experiment.draw(step + 1000 * seed, positions, data)
 
-        def over_background(seen, cut, background):
-            return whole(seen, cut & treated, background)
+        def maybe_treated(rendering, occluded, background):
+            return over_background(rendering, occluded & treated, background)
 
         state = create_state(model, experiment.optimizer, seed, self.valid)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(occupancy_module, "_over_background", over_background)
-            step = make_train_step(model, experiment.optimizer, draw)
+            patch.setattr(occupancy_module, "_over_background", maybe_treated)
+            step = make_train_step(model, experiment.optimizer, draw, experiment.losses)
             positions = jnp.arange(BATCH)[None]
             return jax.lax.scan(lambda state, _: step(state, data, positions), state, length=STEPS)
 
@@ -112,7 +112,7 @@ class Tiny:
         return self.train(self.data, seed, occlusion_start_step, treated)
 
     def score(self, state):
-        """Returns the PSNR of views that training has not seen."""
+        """Returns the PSNR of test views."""
         return -10 * np.log10(self.error(state.params, state.grid))
 
     def scores(self, seeds, *how):
@@ -135,8 +135,8 @@ def test_it_learns(tiny):
     assert rays_dropped.mean() < 0.05 * BATCH
 
 
-def test_cells_are_left_out_without_matter(tiny):
-    """Asking all that masks leave possible shows nothing more than asking what the grid has left."""
+def test_empty_cells_hold_no_matter(tiny):
+    """Images with all valid cells occupied are no better."""
     state, _ = tiny.run(0, NEVER)
     occupied, valid = np.asarray(state.grid.occupied), np.asarray(state.grid.valid)
     np.testing.assert_array_equal(valid, tiny.valid)
@@ -145,26 +145,27 @@ def test_cells_are_left_out_without_matter(tiny):
     assert abs(tiny.score(everywhere) - tiny.score(state)) < 0.1
 
 
-def test_hiding_too_eagerly_costs_little_because_cut_rays_do_not_see_the_background(tiny):
-    """A guess that hides what has not formed yet must not make it form worse.
+def test_early_occlusion_costs_little_as_occluded_rays_do_not_show_the_background(tiny):
+    """An estimate that hides matter which has not formed yet must not prevent it from forming.
 
-    Were the background seen where a ray is cut, all that is before the cut would have to be opaque at once;
-    the guess would then hide more. So it went, by several decibels, with a guess from the grid's peaks.
+    If occluded rays showed the background, everything in front of the first masked sample would have to become
+    opaque at once, and the estimate would then hide more. This costs several decibels.
     """
-    wanted = tiny.scores(COMPARED, NEVER)
-    ours = tiny.scores(COMPARED, EAGERLY)
-    untreated = tiny.scores(COMPARED, EAGERLY, False)
-    assert (wanted - ours).mean() < 1.2
-    assert (wanted - untreated).mean() > 1.5
+    expected = tiny.scores(COMPARED, NEVER)
+    ours = tiny.scores(COMPARED, EARLY)
+    untreated = tiny.scores(COMPARED, EARLY, False)
+    assert (expected - ours).mean() < 1.2
+    assert (expected - untreated).mean() > 1.5
     assert (ours - untreated > 0.8).all()
 
 
+@pytest.mark.slow
 def test_no_seed_collapses(tiny):
-    scores = tiny.scores(SEEDS, EAGERLY)
+    scores = tiny.scores(SEEDS, EARLY)
     assert scores.min() > 20.5 and np.ptp(scores) < 3, scores
 
 
-def test_without_a_space_there_is_nothing_for_it():
+def test_without_a_grid_the_step_has_no_state_for_it():
     experiment = build(smoke_config())
     state = jax.eval_shape(functools.partial(create_state, experiment.model, experiment.optimizer, 0))
     assert experiment.model.grid_schedule is None and state.grid is None
@@ -175,44 +176,45 @@ def test_without_a_space_there_is_nothing_for_it():
         "dead_coarse",
         "dead_fine",
     }
-    views = experiment.load_views("train")
-    valid, data = experiment.survey(views)
-    assert valid is None and data.live is None and data.cells is None
-    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw)
+    views = experiment.load_split("train")
+    valid, data = experiment.prepare(views)
+    assert valid is None and data.active_pixels is None and data.cells is None
+    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
     after, metrics = jax.eval_shape(step, state, data, jnp.arange(64)[None])
     assert jax.tree.structure(after) == jax.tree.structure(state)
     assert "rays_dropped" not in metrics and after.grid is None
 
 
 def toy_field():
-    """A ball of fog with coloured sides: little to compile."""
+    """Returns a Gaussian ball with a colour gradient, which compiles fast."""
 
     def init(key):
         return {"size": jnp.full(3, 2.0), "rgb": 0.1 * jax.random.normal(key, (3, 3))}
 
     def apply(params, x, viewdirs):
         parts = [x[..., axis] for axis in range(3)]
-        away = sum((part * params["size"][axis]) ** 2 for axis, part in enumerate(parts))
+        distance = sum((part * params["size"][axis]) ** 2 for axis, part in enumerate(parts))
         rgb = [sum(part * params["rgb"][axis, c] for axis, part in enumerate(parts)) for c in range(3)]
-        return 4 * jnp.exp(-away), jax.nn.sigmoid(jnp.stack(rgb, axis=-1))
+        return 4 * jnp.exp(-distance), jax.nn.sigmoid(jnp.stack(rgb, axis=-1))
 
     return Field(init, apply)
 
 
 @pytest.fixture(scope="module")
 def toy():
-    """An Experiment of the toy field, 64 rays a step in blocks of 16, with a pool far too small for them."""
+    """An Experiment of the toy field, 64 rays per step in microbatches of 16, whose sample buffer is far too small."""
     config = tiny_config()
     config.occupancy.update({"lower": (-1.5,) * 3, "upper": (1.5,) * 3, "resolution": 8})
     train = config.train
     train.batch_size, train.microbatch_size, train.parallel = 64, 16, "sharded"
     train.log_every, train.save_every, train.max_steps = 3, 6, 12
-    experiment, field = build(config), toy_field()
+    views = synthetic.load_synthetic(size=SIZE)
+    experiment, field = build(resolve_for_device(resolve(config, views).config)[0]), toy_field()
     schedule = make_grid_schedule(
         config.occupancy.lower,
         config.occupancy.upper,
         resolution=8,
-        step=0.5,
+        step_size=0.5,
         field=field,
         threshold=0.01,
         update_every=2,
@@ -222,7 +224,7 @@ def toy():
     model = occupancy_model(
         field,
         schedule,
-        samples_per_ray=1,
+        pool_samples_per_ray=1,
         long_steps_until=4,
         max_optical_depth=1.0,
         occlusion_start_step=8,
@@ -236,7 +238,7 @@ def toy():
     def draw(step, positions, data):
         order = jax.random.permutation(jax.random.fold_in(jax.random.key(1), step), 64)
         keys = jax.vmap(lambda place: jax.random.fold_in(jax.random.key(2), 64 * step + place))(positions)
-        drawn = jax.tree.map(lambda leaf: leaf[order[positions]], data.live)
+        drawn = jax.tree.map(lambda leaf: leaf[order[positions]], data.active_pixels)
         return keys, Batch(rays=drawn, rgb=0.5 + 0.5 * drawn.viewdirs)
 
     cells = np.arange(512, dtype=np.int32)
@@ -244,16 +246,16 @@ def toy():
         model=model,
         optimizer=optax.adam(1e-2),
         draw=draw,
-        survey=lambda views: (np.ones(schedule.shape, bool), TrainData(np.uint32(0), views, rays, cells)),
+        prepare=lambda views: (np.ones(schedule.shape, bool), TrainData(np.uint32(0), views, rays, cells)),
     )
 
 
 @pytest.fixture(scope="module")
 def toy_runs(unoptimized, toy):
-    """Twelve steps in each mode."""
-    views = toy.load_views("train")
-    valid, data = toy.survey(views)
-    step = make_train_step(toy.model, toy.optimizer, toy.draw)
+    """Twelve steps in each mode of parallelism."""
+    views = toy.load_split("train")
+    valid, data = toy.prepare(views)
+    step = make_train_step(toy.model, toy.optimizer, toy.draw, toy.losses)
     return {
         mode: run_steps(
             step,
@@ -273,7 +275,7 @@ def test_devices_give_the_same_update_grid_and_counts(toy_runs, toy, mode):
     (one, one_rows), (many, many_rows) = toy_runs["jit"], toy_runs[mode]
     start = create_state(toy.model, toy.optimizer, 0)
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), one.params, start.params)
-    assert min(jax.tree.leaves(moved)) > 1e-3, "nothing was learned, so nothing is proved"
+    assert min(jax.tree.leaves(moved)) > 1e-3, "the comparison needs parameters that moved"
     assert 0 < one.grid.occupied.mean() < 1
     assert_same(many.params, one.params, rtol=0, atol=1e-5)
     assert_same(many.grid, one.grid, rtol=1e-4, atol=1e-5)
@@ -283,7 +285,7 @@ def test_devices_give_the_same_update_grid_and_counts(toy_runs, toy, mode):
         assert_same(many_row, row, rtol=1e-3)
 
 
-def test_a_pool_far_too_small_leaves_rays_out_and_trains_with_the_others(toy_runs):
+def test_small_sample_buffer_drops_rays_and_trains_on_the_others(toy_runs):
     state, rows = toy_runs["jit"]
     assert all_finite((state.params, rows)) and int(state.counters["nonfinite"]) == 0
     rays = np.array([row["rays"] for row in rows])
@@ -293,14 +295,14 @@ def test_a_pool_far_too_small_leaves_rays_out_and_trains_with_the_others(toy_run
     assert rows[-1]["mse"] < rows[0]["mse"]
 
 
-def test_a_run_that_was_stopped_goes_on_bit_for_bit_with_its_grid(toy, unoptimized, tmp_path):
-    """Steps 6 to 12 hold looks at cells, and the first step from which samples are hidden."""
-    views, template = toy.load_views("train"), create_state(toy.model, toy.optimizer, 0)
+def test_resumed_run_is_bit_exact_with_its_grid(toy, unoptimized, tmp_path):
+    """Steps 6 to 12 include updates of the grid and the first step with occlusion."""
+    views, template = toy.load_split("train"), create_state(toy.model, toy.optimizer, 0)
 
     def train(folder, max_steps):
         folder.mkdir(exist_ok=True)
         options = SimpleNamespace(**{**vars(toy.train), "max_steps": max_steps})
-        assert loop.train(toy._replace(train=options), views, folder)
+        assert loop.run_training(toy._replace(train=options), views, folder)
         return jax.device_get(Checkpoints(folder).load(max_steps, template))
 
     whole = train(tmp_path / "whole", 12)
@@ -313,27 +315,27 @@ def test_a_run_that_was_stopped_goes_on_bit_for_bit_with_its_grid(toy, unoptimiz
     ).any()
 
 
-def test_a_run_ends_in_files_that_give_it_back(unoptimized, tmp_path, capsys):
-    """From a configuration with open sizes, by its folder alone, to a scene and the pictures of it."""
+def test_workdir_restores_the_scene_and_its_images(unoptimized, tmp_path, capsys):
+    """The config has "auto" sizes, and only the workdir is known afterwards."""
     config = tiny_config()
-    config.field, config.occupancy.step_size = "mlp", 0.0
-    config.fine.update({"depth": 1, "width": 8, "num_freqs": 0, "view_width": 8})
+    config.field, config.occupancy.step_size = "mlp", "auto"
+    config.fine.update({"depth": 1, "width": 8, "num_freqs": "auto", "view_width": 8})
     config.fine.update({"density_activation": "softplus", "density_bias": 1.0})
     config.train.update({"batch_size": 64, "max_steps": 20, "log_every": 10, "parallel": "jit"})
-    assert loop.train_and_evaluate(config, tmp_path)
+    assert train_and_evaluate(config, tmp_path)
     said = capsys.readouterr().err
-    assert all(word in said for word in ("box ", "step ", "cells ", "octaves ", "space "))
+    assert all(word in said for word in ("box ", "step size ", "grid ", "octaves ", "valid"))
     recorded = read_config(tmp_path)
-    assert not is_open(recorded) and recorded.fine.num_freqs > 0
+    assert set(auto_fields(recorded)) <= set(DEVICE_FIELDS) and recorded.fine.num_freqs > 0
     scene, render = load_scene(tmp_path)
-    schedule, rays = build(recorded).model.grid_schedule, rays_past_origin(0, 256)
+    schedule, rays = build(resolve_for_device(recorded)[0]).model.grid_schedule, rays_past_origin(0, 256)
 
     @compiled
-    def plainly(rays):
+    def reference_images(rays):
         box = schedule.create(jnp.ones(schedule.shape, bool))
         samples = march_rays(None, box, rays, step_size=schedule.step_size, cell=schedule.cell)
         return render_samples(scene, rays, samples, background=(1.0, 1.0, 1.0))
 
-    seen, want = render(rays), plainly(rays)
-    assert 0.05 < want.opacity.mean() < 0.95 and want.opacity.min() == 0
-    np.testing.assert_allclose(seen.rgb, want.rgb, atol=1.1e-3)  # eval.early_stop_eps is 1e-3
+    found, expected = render(rays), reference_images(rays)
+    assert 0.05 < expected.opacity.mean() < 0.95 and expected.opacity.min() == 0
+    np.testing.assert_allclose(found.rgb, expected.rgb, atol=1.1e-3)  # eval.early_stop_eps is 1e-3

@@ -1,4 +1,4 @@
-"""What goes wrong around a run is named, and nothing that was saved is lost. At length: tests/faults/."""
+"""Faults around a run are reported, and nothing that was saved is lost. tests/slow/faults has more of them."""
 
 import contextlib
 import json
@@ -12,15 +12,16 @@ import sys
 import jax
 import numpy as np
 import pytest
-from faults import kill_many
 
+from jaxnerf.evaluation import evaluate
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.training import loop, metric_log
+from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.lock import workdir_lock
 from jaxnerf.training.state import create_state
+from jaxnerf.training.workdir import workdir_lock
 from runs import ROOT, smoke_config
+from slow.faults import kill_many
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -32,8 +33,8 @@ def folder(trained, tmp_path):
     return shutil.copytree(trained, tmp_path / "run")
 
 
-def weights(folder, step):
-    return jax.device_get(restore_run(folder).weights(step))
+def variables(folder, step):
+    return jax.device_get(restore_run(folder).variables(step))
 
 
 def load_newest(folder, keep):
@@ -51,7 +52,7 @@ def assert_near(a, b, atol):
 
 
 def numbers(folder, step):
-    """Returns the files that hold the numbers of a checkpoint; orbax may write them in two places."""
+    """Returns the files that hold the arrays of a checkpoint; orbax may write them in two places."""
     return [path for path in (folder / "checkpoints" / str(step)).rglob("d/*") if path.is_file()]
 
 
@@ -65,39 +66,40 @@ def cut(paths):
         os.truncate(path, path.stat().st_size // 2)
 
 
-def test_a_kill_loses_nothing(compiled_once, tmp_path):
+@pytest.mark.slow
+def test_kill_loses_nothing(compiled_once, tmp_path):
     kill_many.main(kills=1, seed=3, out=tmp_path)
 
 
-def test_a_checkpoint_cut_short_is_named_kept_and_gone_behind(folder, trained, capsys):
+def test_truncated_checkpoint_is_renamed_and_training_continues_from_the_one_before(folder, trained, capsys):
     cut(numbers(folder, 20))
     assert train_and_evaluate(smoke_config(), folder)
     said = [line for line in capsys.readouterr().err.splitlines() if "cannot be read" in line]
     assert len(said) == 1 and "checkpoints/20: " in said[0]
-    assert said[0].endswith("kept as 20.unreadable, going on from the one before")
+    assert said[0].endswith("kept as 20.unreadable, continuing from the previous checkpoint")
     assert Checkpoints(folder).steps() == [10, 15, 20]
     assert numbers(folder, "20.unreadable") and not numbers(folder, "20.unreadable-2")
-    assert_near(weights(folder, 20), weights(trained, 20), atol=0)
+    assert_near(variables(folder, 20), variables(trained, 20), atol=0)
     assert [row["step"] for row in metric_log.read_rows(folder)] == [5, 10, 15, 20]
 
 
 @pytest.mark.parametrize("damage", [cut, remove])
-def test_a_checkpoint_that_lacks_something_is_named(folder, damage):
+def test_incomplete_checkpoint_is_an_error(folder, damage):
     damage(numbers(folder, 20))
     with pytest.raises(ValueError, match="checkpoints/20: cannot be read .*remove it"):
-        weights(folder, 20)
-    weights(folder, 15)
+        variables(folder, 20)
+    variables(folder, 15)
 
 
-def test_no_other_numbers_are_read_than_were_saved(folder):
-    """orbax alone reads them without a word, as it does where a bit of an array has changed."""
+def test_changed_checkpoint_is_an_error(folder):
+    """orbax itself does not detect changed arrays."""
     shutil.rmtree(folder / "checkpoints" / "20" / "state")
     shutil.copytree(folder / "checkpoints" / "15" / "state", folder / "checkpoints" / "20" / "state")
     with pytest.raises(ValueError, match="checkpoints/20: .*its numbers are not those that were saved"):
-        weights(folder, 20)
+        variables(folder, 20)
 
 
-def test_where_no_checkpoint_can_be_read_none_is_touched(folder):
+def test_if_no_checkpoint_can_be_read_none_is_renamed(folder):
     for step in (10, 15, 20):
         cut(numbers(folder, step))
     with pytest.raises(ValueError, match="checkpoints/20: cannot be read"):
@@ -105,14 +107,14 @@ def test_where_no_checkpoint_can_be_read_none_is_touched(folder):
     assert Checkpoints(folder).steps() == [10, 15, 20]
 
 
-def test_a_run_goes_on_with_another_number_of_devices(folder, trained):
-    """It was trained on four; sums of the gradient in another order are all that differs."""
+def test_run_resumes_with_another_number_of_devices(folder, trained):
+    """It was trained on four; only the order in which gradients are summed differs."""
     shutil.rmtree(folder / "checkpoints" / "20")
     assert train_and_evaluate(smoke_config(parallel="jit"), folder)
-    assert_near(weights(folder, 20), weights(trained, 20), atol=1e-6)
+    assert_near(variables(folder, 20), variables(trained, 20), atol=1e-6)
 
 
-def test_rest_of_a_killed_save_is_no_checkpoint(folder):
+def test_unfinished_checkpoint_of_a_killed_process_is_ignored_and_removed(folder):
     rest = shutil.copytree(folder / "checkpoints" / "15", folder / "checkpoints" / "17.orbax-checkpoint-tmp")
     state, said = load_newest(folder, keep=None)
     assert (int(state.step), said) == (20, []) and rest.exists(), "a reader removes nothing"
@@ -120,10 +122,10 @@ def test_rest_of_a_killed_save_is_no_checkpoint(folder):
     assert not rest.exists()
 
 
-def test_a_second_training_is_refused_by_name(folder):
+def test_second_training_is_an_error_that_names_the_first(folder):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with workdir_lock(folder):
-        with pytest.raises(ValueError, match=f"run: process {os.getpid()} on .* is training in it; wait"):
+        with pytest.raises(ValueError, match=f"run: process {os.getpid()} on .* is training there; wait"):
             train_and_evaluate(smoke_config(max_steps=40), folder)
         assert Checkpoints(folder).steps() == [10, 15, 20]
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
@@ -131,8 +133,11 @@ def test_a_second_training_is_refused_by_name(folder):
         pass
 
 
-def test_a_killed_training_holds_nobody_up(tmp_path):
-    held = f"from jaxnerf.training.lock import alone\nwith alone({str(tmp_path)!r}): print(1, flush=True); input()"
+def test_lock_of_a_killed_process_is_released(tmp_path):
+    held = (
+        f"from jaxnerf.training.workdir import workdir_lock\n"
+        f"with workdir_lock({str(tmp_path)!r}): print(1, flush=True); input()"
+    )
     process = subprocess.Popen([sys.executable, "-c", held], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     process.stdout.readline()
     with pytest.raises(ValueError, match=f"process {process.pid} on "):
@@ -145,8 +150,17 @@ def test_a_killed_training_holds_nobody_up(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_where_nothing_can_be_locked_that_is_said(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("jaxnerf.training.lock.fcntl", None)
+def test_lock_follows_no_symbolic_link(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "precious").write_text("content")
+    os.symlink(tmp_path / "precious", tmp_path / "run" / "running")
+    with pytest.raises(ValueError, match="run: cannot be written"), workdir_lock(tmp_path / "run"):
+        pass
+    assert (tmp_path / "precious").read_text() == "content"
+
+
+def test_system_without_locks_prints_a_warning(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("jaxnerf.training.workdir.fcntl", None)
     with workdir_lock(tmp_path):
         assert "cannot be locked" in capsys.readouterr().err
 
@@ -156,24 +170,24 @@ def mounted(folder, *options):
     folder.mkdir()
     done = subprocess.run(["mount", "-t", "tmpfs", *options, "none", folder], capture_output=True, text=True)
     if done.returncode:
-        pytest.skip(f"no disk may be mounted here: {done.stderr.strip()}")
+        pytest.skip(f"mounting is not permitted here: {done.stderr.strip()}")
     try:
         yield folder
     finally:
         subprocess.run(["umount", "-l", folder], check=True)
 
 
-def test_a_read_only_disk_is_named(trained, tmp_path):
+def test_read_only_disk_is_an_error(trained, tmp_path):
     with mounted(tmp_path / "disk", "-o", "size=8m") as disk:
         shutil.copytree(trained, disk / "run")
         subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
         for name in ("run", "new"):
             with pytest.raises(ValueError, match=f"disk/{name}: cannot be written .Read-only file system.; make"):
                 train_and_evaluate(smoke_config(), disk / name)
-        weights(disk / "run", 20)  # reading is all right
+        variables(disk / "run", 20)  # reading works
 
 
-def test_a_disk_full_of_metrics_is_named(tmp_path):
+def test_full_disk_while_writing_metrics_is_an_error(tmp_path):
     log = metric_log.MetricLog(tmp_path, first_step=0)
     os.remove(tmp_path / "metrics.jsonl")
     os.symlink("/dev/full", tmp_path / "metrics.jsonl")
@@ -182,8 +196,8 @@ def test_a_disk_full_of_metrics_is_named(tmp_path):
     log.close()
 
 
-def test_a_disk_full_of_events_holds_nobody_up(tmp_path, monkeypatch, capsys):
-    """tensorboardX's own thread ends there, and the eleventh row would wait for it for ever."""
+def test_full_disk_while_writing_events_does_not_stop_training(tmp_path, monkeypatch, capsys):
+    """tensorboardX's SummaryWriter would wait forever from the eleventh row on."""
     folder = tmp_path / "tensorboard"
     folder.mkdir()
     monkeypatch.setattr("tensorboardX.event_file_writer.time.time", lambda: 1.0)
@@ -193,11 +207,11 @@ def test_a_disk_full_of_events_holds_nobody_up(tmp_path, monkeypatch, capsys):
         log.append({"step": step, "seconds": 1.0})
     log.close()
     said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and "tensorboard: no more events are written (No space left on device)" in said[0]
+    assert len(said) == 1 and "tensorboard: event files end here (No space left on device)" in said[0]
     assert len(metric_log.read_rows(tmp_path)) == 99
 
 
-def test_metrics_that_are_damaged_are_left_out_and_said(tmp_path, capsys):
+def test_damaged_rows_are_dropped_and_reported(tmp_path, capsys):
     good = [json.dumps({"step": step, "seconds": 1.0 * step}).encode() for step in (1, 2, 3, 4)]
     bad = [b'{"step": 2, "sec', b"\xff\xfe\x00", b"5", b'{"seconds": 1}', b'{"step": "3", "seconds": 1}', b""]
     content = b"\n".join([good[0], *bad, *good[1:], b'{"step": 5'])
@@ -208,37 +222,37 @@ def test_metrics_that_are_damaged_are_left_out_and_said(tmp_path, capsys):
     log.close()
     said = capsys.readouterr().err.splitlines()
     assert said[0].endswith(
-        "left out 6 lines from line 2 on that are no rows; the file is kept as metrics.jsonl.damaged"
+        "dropped 6 lines from line 2 on that are no rows; the file is kept as metrics.jsonl.damaged"
     )
-    assert said[1].endswith("metrics.jsonl: left out a last line that was cut short") and len(said) == 2
+    assert said[1].endswith("metrics.jsonl: dropped an incomplete last line") and len(said) == 2
     assert (tmp_path / "metrics.jsonl.damaged").read_bytes() == content
     assert [row["seconds"] for row in metric_log.read_rows(tmp_path)] == [1.0, 2.0, 3.0, 9.0]
     assert (tmp_path / "metrics.jsonl").read_bytes().count(b"\n") == 4
 
 
-def test_a_checkpoint_between_two_rows_has_a_row_with_its_clock(trained, tmp_path):
+def test_checkpoint_between_two_rows_has_its_own_row(trained, tmp_path):
     assert train_and_evaluate(smoke_config(log_every=4, save_every=6, max_steps=12), tmp_path / "run")
     assert [row["step"] for row in metric_log.read_rows(tmp_path / "run")] == [4, 6, 8, 12]
 
 
-def test_a_signal_while_scoring_leaves_what_was_trained(folder, monkeypatch, capsys):
+def test_signal_during_evaluation_keeps_the_checkpoints(folder, monkeypatch, capsys):
     config = smoke_config()
     config.eval.at_end = True
 
-    def stop(folder, shard):
+    def interrupt(folder, shard):
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(loop, "evaluate", stop)
+    monkeypatch.setattr(evaluate, "evaluate", interrupt)
     assert not train_and_evaluate(config, folder)
-    assert capsys.readouterr().err.splitlines()[-1].startswith("stopped while scoring; what was trained is saved")
+    assert capsys.readouterr().err.splitlines()[-1].startswith("stopped while scoring; the checkpoints are saved")
     (folder / "eval" / "20").mkdir(parents=True)
-    assert train_and_evaluate(config, folder), "what is scored is not scored again"
+    assert train_and_evaluate(config, folder), "an evaluated checkpoint is not evaluated again"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_with_nothing_to_save_takes_one_line(number):
+def test_signal_before_training_prints_one_line(number):
     main = f"lambda argv: os.kill(os.getpid(), {int(number)}) or input()"
-    program = f"import os\nfrom jaxnerf import app\napp.run({main})"
+    program = f"import os\nfrom jaxnerf.runtime import cli\ncli.run({main})"
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, stdin=subprocess.PIPE
     )

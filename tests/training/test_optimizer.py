@@ -1,6 +1,4 @@
-"""With train.muon a matrix moves as far in each of its directions, and everything else as Adam moves it."""
-
-import types
+"""Muon and averaged parameters: which parameters they change, by how much, and how they are saved."""
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +7,19 @@ import optax
 import pytest
 
 from helpers import assert_same
+from jaxnerf.evaluation.evaluate import train_and_evaluate
+from jaxnerf.evaluation.restore import restore_run
+from jaxnerf.models.base import Model
 from jaxnerf.training import dead_networks
 from jaxnerf.training.build import build
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.optimizer import make_optimizer
+from jaxnerf.training.optimizer import averaged_params, make_optimizer, with_averaging
 from jaxnerf.training.state import TrainState, create_state
 from runs import smoke_config
 
+pytest_plugins = ["run_fixtures"]
 RATE, SIZE = 0.01, 0.4
+ADAM = optax.adam(0.1, 0.9, 0.99)
 
 
 def optimizer(**train):
@@ -42,20 +45,20 @@ def slopes(seed):
     return {"fine": grads}
 
 
-def test_a_matrix_moves_as_far_in_each_direction_however_steep():
+def test_muon_moves_a_matrix_equally_far_in_each_direction():
     params = {"fine": network(jax.random.key(0))}
     update = optimizer()
     step = jax.jit(update.update)(slopes(1), update.init(params), params)[0]["fine"]
     for kernel in (step["kernel"], step["deep"]["kernel"]):
         sizes = np.linalg.svd(kernel, compute_uv=False) / (RATE * SIZE * max(kernel.shape) ** 0.5)
-        # The gradient's own go from 1 to 1e-6. Muon's five iterations, which are made to be few, bring those
-        # that are not below a hundredth to between 0.6 and 1.3.
+        # The gradient's singular values range from 1 to 1e-6. Muon's five iterations bring those above 0.01
+        # into the range from 0.6 to 1.3.
         assert ((sizes[:5] > 0.6) & (sizes[:5] < 1.3)).all(), sizes
         assert np.sqrt(np.mean(kernel**2)) < 1.3 * RATE * SIZE
 
 
 @pytest.mark.parametrize("power", [0.0, 10.0])
-def test_all_else_is_left_to_adam(power):
+def test_adam_updates_all_other_parameters(power):
     start = {"fine": network(jax.random.key(0))}
     ends = []
     for update in (optimizer(averaging_power=power), optimizer(muon=0.0)):
@@ -69,19 +72,18 @@ def test_all_else_is_left_to_adam(power):
     assert np.abs(ends[0]["kernel"] - ends[1]["kernel"]).max() > RATE / 10
 
 
-def test_a_matrix_without_a_gradient_stays():
+def test_matrix_without_a_gradient_does_not_move():
     params = {"fine": network(jax.random.key(0))}
     update = optimizer()
     step, _ = update.update(jax.tree.map(jnp.zeros_like, params), update.init(params), params)
     assert_same(step, jax.tree.map(jnp.zeros_like, params), rtol=0, atol=0)
 
 
-def test_it_forgets_what_begins_anew():
-    model = types.SimpleNamespace(
-        init=lambda key: {"coarse": network(key), "fine": network(jax.random.fold_in(key, 1))},
-        schedule=None,
-        input_layers={},
-    )
+def test_reinitialization_resets_the_moments():
+    def init(key):
+        return {"coarse": network(key), "fine": network(jax.random.fold_in(key, 1))}
+
+    model = Model(init, render=None, view=None, scene=None, samples_per_ray=1.0)
     update = optimizer(averaging_power=10.0)
     start = create_state(model, update, 0)
     used = jax.tree.map(lambda leaf: leaf + 1, start)
@@ -94,8 +96,8 @@ def test_it_forgets_what_begins_anew():
         assert_same(found, (begun if path in moments else old)[path], rtol=0, atol=0)
 
 
-def test_its_state_comes_back_from_a_checkpoint(tmp_path):
-    """Also what stands for parameters that the other part moves."""
+def test_state_is_restored_from_a_checkpoint(tmp_path):
+    """This includes the masks that stand for parameters of the other optimizer."""
     params = {"fine": network(jax.random.key(0))}
     update = optimizer(averaging_power=10.0)
     _, moved = update.update(slopes(1), update.init(params), params)
@@ -107,6 +109,77 @@ def test_its_state_comes_back_from_a_checkpoint(tmp_path):
     assert_same(checkpoints.load(1, like), state, rtol=0, atol=0)
 
 
-def test_a_size_below_0_is_refused():
-    with pytest.raises(ValueError, match=r"train.muon is -0.2, wanted more than 0, or 0 for none"):
+def test_negative_size_is_an_error():
+    with pytest.raises(ValueError, match=r"train.muon is -0.2, expected a number above 0, or 0 for off"):
         build(smoke_config(muon=-0.2))
+
+
+def descend(optimizer, steps=40):
+    """Returns the parameters after each step towards a moving minimum, and the optimizer's last state."""
+    params = {"a": jnp.float32([3.0, -2.0]), "b": jnp.float32(1.0)}
+    state, params_of_steps = optimizer.init(params), []
+    for step in range(steps):
+        grads = jax.tree.map(lambda leaf, step=step: leaf - jnp.sin(step / 3), params)
+        updates, state = optimizer.update(grads, state, params)
+        params = optax.apply_updates(params, updates)
+        params_of_steps.append(params)
+    return params_of_steps, state
+
+
+@pytest.mark.parametrize("power", [1.0, 10.0])
+def test_average_has_the_weights_of_polynomial_decay(power):
+    params_of_steps, state = descend(with_averaging(ADAM, power))
+    fractions = [(power + 1) / (power + count) for count in range(1, len(params_of_steps) + 1)]
+    weights = np.float64(
+        [fraction * np.prod(1 - np.float64(fractions[i + 1 :])) for i, fraction in enumerate(fractions)]
+    )
+    assert abs(weights.sum() - 1) < 1e-12
+    # About (s / t)^power, from the step on at which the two differ by no more than rounding in power / s.
+    rough = (np.arange(1, len(params_of_steps) + 1) + power / 2) ** power
+    assert np.abs(weights - rough / rough.sum()).max() < 0.1 * weights.max()
+    expected = jax.tree.map(lambda *leaves: np.tensordot(weights, np.float64(leaves), 1), *params_of_steps)
+    assert_same(state.average, expected, rtol=0, atol=1e-6)
+
+
+def test_first_average_equals_the_parameters():
+    params_of_steps, state = descend(with_averaging(ADAM, 10.0), steps=1)
+    assert_same(state.average, params_of_steps[0], rtol=0, atol=1e-7)
+
+
+def test_averaging_does_not_change_the_updates():
+    (averaging, state), (plain, expected) = descend(with_averaging(ADAM, 10.0)), descend(ADAM)
+    assert_same(averaging, plain, rtol=0, atol=0)
+    assert_same(state.inner, expected, rtol=0, atol=0)
+
+
+def last_state(params_of_steps, opt_state):
+    step = jnp.int32(len(params_of_steps))
+    return TrainState(step=step, params=params_of_steps[-1], opt_state=opt_state, grid=None, counters={})
+
+
+def test_averaged_params_returns_the_average_or_the_last_parameters():
+    params_of_steps, state = descend(with_averaging(ADAM, 10.0))
+    _, plain = descend(ADAM)
+    assert averaged_params(last_state(params_of_steps, state)) is state.average
+    assert averaged_params(last_state(params_of_steps, plain)) is params_of_steps[-1]
+
+
+def test_run_renders_its_average(unoptimized, tmp_path):
+    config = smoke_config(averaging_power=10.0, max_steps=8, parallel="jit")
+    config.sampling.num_fine = 0  # one network compiles faster
+    config.fine.depth = 1
+    assert train_and_evaluate(config, tmp_path)
+    run = restore_run(tmp_path)
+    like = create_state(run.experiment.model, run.experiment.optimizer, run.experiment.seed)
+    state = Checkpoints(tmp_path).load(8, like)
+    params, _ = run.variables(8)
+    assert_same(params, state.opt_state.average, rtol=0, atol=0)
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), params, state.params)
+    assert max(jax.tree.leaves(moved)) > 1e-4
+
+
+def test_negative_power_is_an_error():
+    config = smoke_config()
+    config.train.averaging_power = -1.0
+    with pytest.raises(ValueError, match=r"train.averaging_power is -1.0, expected a number above 0"):
+        build(config)

@@ -1,8 +1,8 @@
-"""A grid for a scene that was trained without one: where it is dense, and where anybody would see that."""
+"""The occupancy grid of a scene that was trained without one: the cells that are dense and visible."""
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import ArrayLike
 
 from jaxnerf.core.occupancy.grid import (
     OccupancyGrid,
@@ -13,54 +13,70 @@ from jaxnerf.core.occupancy.grid import (
 )
 from jaxnerf.core.occupancy.packed import visible_samples
 from jaxnerf.core.occupancy.ray_marching import march_rays
+from jaxnerf.core.types import Background, Rays, SceneFn, Vector
 
-_AT_ONCE = 2**11  # rays
-_INVISIBLE = 1 / 512  # half a step of 8 bits
-
-
-def num_visibility_rays(schedule):
-    """Returns how many rays visible_grid should have: some for each cell that a surface may have."""
-    return -(-16 * max(schedule.shape) ** 2 // _AT_ONCE) * _AT_ONCE
+_CHUNK = 2**11  # rays
+_MAX_ERROR = 1 / 512  # of a colour: half a step of 8 bits
 
 
-def visible_grid(scene, schedule, rays, *, max_samples, background):
-    """Returns the Grid of the cells of a Space where a scene is dense and that shows.
+def num_visibility_rays(shape: tuple[int, int, int]) -> int:
+    """Returns how many rays visible_grid needs for a grid of a shape: some for each cell on a surface."""
+    return -(-16 * max(shape) ** 2 // _CHUNK) * _CHUNK
 
-    Kept is what the rays need to differ by less than half a step of 8 bits, and what lies between two such
-    cells. A network trained along whole rays has plenty of white fog before white, of fog thinner than the
-    threshold before all that is dense, and of matter inside of things.
+
+def visible_grid(
+    scene: SceneFn,
+    rays: Rays,
+    *,
+    lower: Vector,
+    upper: Vector,
+    shape: tuple[int, int, int],
+    step_size: float,
+    threshold: ArrayLike,
+    contracted: bool = False,
+    max_samples: int,
+    background: Background | None = None,
+) -> OccupancyGrid:
+    """Creates the grid of the cells of a box in which a scene is dense and visible.
+
+    Occupied are the cells that the rays need for colours within half a step of 8 bits, and those between two
+    such cells. A network that was trained along whole rays has white fog before white, fog thinner than the
+    threshold before all that is dense, and matter inside of objects; none of these is kept.
 
     Args:
         scene: see render_samples.
-        space: Space.
         rays: Rays [N], a multiple of 2048: what the training views see.
-        samples_at_once: samples in flight.
+        lower, upper: [3] world units, the box.
+        shape: cells along x, y and z.
+        step_size: world units between samples.
+        threshold, contracted: see grid_from_scene.
+        max_samples: samples evaluated at once.
         background: see render_samples.
     """
-    bounds = (jnp.asarray(bound, jnp.float32) for bound in (schedule.lower, schedule.upper))
-    options = {"threshold": schedule.threshold, "contracted": schedule.contracted}
-    grid = grid_from_scene(jax.random.key(0), scene, *bounds, schedule.shape, **options)
-    clear = drop_thin_density(scene, grid, schedule.threshold)
+    bounds = (jnp.asarray(bound, jnp.float32) for bound in (lower, upper))
+    options = {"threshold": threshold, "contracted": contracted}
+    grid = grid_from_scene(jax.random.key(0), scene, *bounds, shape, **options)
+    dense = drop_thin_density(scene, grid, threshold)
+    cell = tuple((high - low) / count for low, high, count in zip(lower, upper, shape, strict=True))
 
-    def look(marked, rays):
-        samples = march_rays(None, grid, rays, step_size=schedule.step_size, cell=schedule.cell)
-        options = {"error": _INVISIBLE, "max_samples": max_samples, "background": background}
-        needed = visible_samples(clear, grid, rays, samples, **options)
+    def mark(marked, rays):
+        samples = march_rays(None, grid, rays, step_size=step_size, cell=cell)
+        options = {"error": _MAX_ERROR, "max_samples": max_samples, "background": background}
+        needed = visible_samples(dense, grid, rays, samples, **options)
         return mark_cells(marked, grid, rays, samples.t, needed), None
 
-    parts = jax.tree.map(lambda leaf: leaf.reshape(-1, _AT_ONCE, *leaf.shape[1:]), rays)
-    marked = jax.lax.scan(look, jnp.zeros(schedule.shape, bool), parts)[0]
+    parts = jax.tree.map(lambda leaf: leaf.reshape(-1, _CHUNK, *leaf.shape[1:]), rays)
+    marked = jax.lax.scan(mark, jnp.zeros(shape, bool), parts)[0]
     return keep_cells(grid, marked)
 
 
-def crop_grid(grid):
-    """Returns the Grid of the smallest box of cells that holds the occupied ones; all if it is contracted."""
-    occupied = np.asarray(grid.occupied)
+def crop_grid(grid: OccupancyGrid) -> OccupancyGrid:
+    """Returns the grid of the smallest box that holds the occupied cells; the same grid if it is contracted."""
+    occupied, lower, upper = jax.device_get((grid.occupied, grid.lower, grid.upper))
     if grid.contracted or not occupied.any():
         return grid
-    places = np.argwhere(occupied)
-    first, end = places.min(axis=0), places.max(axis=0) + 1
-    lower, upper = np.asarray(grid.lower, np.float64), np.asarray(grid.upper, np.float64)
+    first, end = zip(*((index.min(), index.max() + 1) for index in occupied.nonzero()), strict=True)
+    lower = lower.astype("float64")
     cell = (upper - lower) / occupied.shape
     inside = tuple(slice(*ends) for ends in zip(first, end, strict=True))
     return OccupancyGrid(

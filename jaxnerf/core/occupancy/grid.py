@@ -1,46 +1,65 @@
-"""Only where there is something: a grid of what may be occupied, learned beside the scene.
+"""The occupancy grid: which cells of a box may hold matter, learned beside the scene (after arXiv:2201.05989).
 
-The grid is part of the model. A field that was trained under one means nothing where the grid is empty, so
-whoever renders that field renders it with its grid.
+The grid is part of the model. A field that was trained with one is undefined in its empty cells, so it must be
+rendered with its grid.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxnerf.core import contraction, volume_rendering
-from jaxnerf.core.types import check_shapes, pytree
+from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, check_shapes, pytree
 
 _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 
 
 @pytree(static=("contracted",))
 class OccupancyGrid:
-    """What is known of the X x Y x Z cells of a box, into which all of space may be contracted."""
+    """What is known of the X x Y x Z cells of a box, into which all of space may be contracted.
 
-    lower: jax.Array  # [3] world units, the box
-    upper: jax.Array  # [3]
-    valid: jax.Array  # [X, Y, Z] bool; False is empty for good, as alpha masks have shown
-    density_max: jax.Array  # [X, Y, Z] 1 / world unit, the largest density found of late
-    density_mean: jax.Array  # [X, Y, Z] 1 / world unit, the running mean of those found; -1 where not occupied
-    occupied: jax.Array  # [X, Y, Z] bool, where a scene is asked
-    contracted: bool = False  # the box's inner half is plain, and its outer half holds all the rest
+    Attributes:
+        lower: [3] world units, the box's lower corner.
+        upper: [3] world units, its upper corner.
+        valid: [X, Y, Z] bool; False: always empty, as alpha masks have shown.
+        density_max: [X, Y, Z] 1 / world unit, the largest density that recent updates found.
+        density_mean: [X, Y, Z] 1 / world unit, the running mean of the densities found; -1 in empty cells.
+        occupied: [X, Y, Z] bool, where a scene is evaluated.
+        contracted: whether the box's outer half holds all of space outside its inner half.
+    """
+
+    lower: Float[Array, "3"]
+    upper: Float[Array, "3"]
+    valid: Bool[Array, "X Y Z"]
+    density_max: Float[Array, "X Y Z"]
+    density_mean: Float[Array, "X Y Z"]
+    occupied: Bool[Array, "X Y Z"]
+    contracted: bool = False
 
 
-def create_grid(lower, upper, valid, *, initial_density, contracted=False):
-    """Returns the Grid of a box of which only is known what is possible (as the grids of arXiv:2201.05989).
+def create_grid(
+    lower: Vector,
+    upper: Vector,
+    valid: Bool[ArrayLike, "X Y Z"],
+    *,
+    initial_density: float,
+    contracted: bool = False,
+) -> OccupancyGrid:
+    """Creates the grid of a box of which only the valid cells are known (as the grids of arXiv:2201.05989).
 
     Args:
         lower, upper: [3] world units.
-        possible: [X, Y, Z] bool, x first.
-        assumed: 1 / world unit, the density taken for found everywhere. An empty cell is left out after as
-            many looks as bring that down to the threshold: log(assumed / threshold) / log(1 / decay).
+        valid: [X, Y, Z] bool, x first.
+        initial_density: 1 / world unit, the density_max of every cell. An empty cell stays occupied until
+            updates bring that down to the threshold: log(initial_density / threshold) / log(1 / decay) of them.
         contracted: whether there is space outside of the box, too: then the cells of its inner half are
             plain, and those of the outer half hold all the rest, see contraction.contract.
 
     Returns:
-        Grid with fields [X, Y, Z], occupied wherever that is possible.
+        OccupancyGrid with fields [X, Y, Z], occupied wherever it is valid.
 
     Raises:
         ValueError: on other shapes.
@@ -59,26 +78,37 @@ def create_grid(lower, upper, valid, *, initial_density, contracted=False):
     )
 
 
-def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2, spread=True, chunk=8192):
-    """Returns the Grid after a look at a random point in each of some cells (as in arXiv:2201.05989).
+def update_grid(
+    key: Keys,
+    grid: OccupancyGrid,
+    scene: SceneFn,
+    cells: Int[ArrayLike, " cells"],
+    *,
+    threshold: Float[ArrayLike, ""] | Float[ArrayLike, "X Y Z"],
+    decay: Float[ArrayLike, ""] = 0.6,
+    smoothing: Float[ArrayLike, ""] = 0.2,
+    spread: Bool[ArrayLike, ""] = True,
+    chunk: int = 8192,
+) -> OccupancyGrid:
+    """Updates some cells from the density at a random point in each (as in arXiv:2201.05989).
 
-    A cell is occupied where the largest density of late exceeds the threshold, or, with spread, that of a
-    neighbour does: a field that is still forming must not lose what it is about to grow.
+    A cell is occupied where its density_max exceeds the threshold, or, with spread, that of a neighbour does:
+    a field that is still forming must not lose what it is about to grow.
 
     Args:
-        key: where in each cell.
-        grid: Grid.
+        key: for the point in each cell.
+        grid: OccupancyGrid.
         scene: see render_samples.
-        cells: [M] int32, flat indices x first, each at most once; what lies past the last cell is ignored.
-        threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there leaves out
-            what absorbs 1 % of the light.
-        decay: what of the peak outlasts a look that finds less.
-        smoothing: the weight of a look in the running mean.
-        spread: bool, traced or not. When the field has formed, its neighbours cost samples and are empty.
-        chunk: cells asked at once.
+        cells: [M] int32, flat indices x first, each at most once; indices past the last cell are ignored.
+        threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there drops what
+            absorbs less than 1 % of the light.
+        decay: the factor of density_max at an update that finds less.
+        smoothing: the weight of an update in density_mean.
+        spread: bool, traced or not. Once the field has formed, neighbours cost samples and are empty.
+        chunk: cells evaluated at once.
 
     Returns:
-        Grid. What is not possible stays empty. No gradient is meant to flow through it.
+        OccupancyGrid. What is not valid stays empty. No gradient is meant to flow through it.
 
     Raises:
         ValueError: on other shapes.
@@ -91,31 +121,42 @@ def update_grid(key, grid, scene, cells, *, threshold, decay=0.6, smoothing=0.2,
         place = (contraction.expand(jnp.clip(4 * place - 2, -_JUST_INSIDE, _JUST_INSIDE)) + 2) / 4
     x = grid.lower[None] + place * (grid.upper - grid.lower)[None]
     # Density has no direction; any will do.
-    ask = lambda x: scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]))[0][0, 0]  # noqa: E731
-    found = jax.lax.map(ask, x, batch_size=min(chunk, cells.size))
-    peak, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
-    peak = peak.at[cells].set(jnp.maximum(decay * peak[cells], found)).reshape(grid.density_max.shape)
+    density_at = lambda x: scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]))[0][0, 0]  # noqa: E731
+    found = jax.lax.map(density_at, x, batch_size=min(chunk, cells.size))
+    largest, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
+    largest = largest.at[cells].set(jnp.maximum(decay * largest[cells], found)).reshape(grid.density_max.shape)
     mean = mean.at[cells].add(smoothing * (found - mean[cells])).reshape(grid.density_mean.shape)
-    dense = ~(peak <= threshold)  # NaN counts, and shows
+    dense = ~(largest <= threshold)  # NaN is dense, and shows
     occupied = jnp.where(spread, _widen(dense), dense) & grid.valid
-    return dataclasses.replace(grid, density_max=peak, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
+    return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
 
 
-def grid_from_scene(key, scene, lower, upper, shape, *, threshold, contracted=False, num_updates=4, chunk=8192):
-    """Returns the Grid of a scene that was trained without one (a grid of arXiv:2201.05989).
+def grid_from_scene(
+    key: Keys,
+    scene: SceneFn,
+    lower: Vector,
+    upper: Vector,
+    shape: tuple[int, int, int],
+    *,
+    threshold: Float[ArrayLike, ""] | Float[ArrayLike, "X Y Z"],
+    contracted: bool = False,
+    num_updates: int = 4,
+    chunk: int = 8192,
+) -> OccupancyGrid:
+    """Creates the grid of a scene that was trained without one (after arXiv:2201.05989).
 
     Args:
-        key: where in the cells.
+        key: for the points in the cells.
         scene: see render_samples.
-        lower, upper: [3] world units, the box; outside of it nothing will be asked.
+        lower, upper: [3] world units, the box; outside of it nothing will be evaluated.
         shape: cells along x, y and z.
         threshold, chunk: see update_grid.
         contracted: see create_grid.
-        num_updates: random points in each cell. A cell is occupied where one of them, or of a neighbour's, is
-            above the threshold, so that matter much thinner than a cell may be missed.
+        num_updates: random points in each cell. A cell is occupied where the density at one of them, or of a
+            neighbour's, exceeds the threshold, so matter much thinner than a cell may be missed.
 
     Returns:
-        Grid.
+        OccupancyGrid.
     """
     grid = create_grid(lower, upper, jnp.ones(shape, bool), initial_density=0.0, contracted=contracted)
     cells = jnp.arange(grid.valid.size)
@@ -127,14 +168,20 @@ def grid_from_scene(key, scene, lower, upper, shape, *, threshold, contracted=Fa
     return jax.lax.fori_loop(0, num_updates, update, grid)
 
 
-def mark_cells(marked, grid, rays, t, chosen):
-    """Returns marked [X, Y, Z] bool, with the cells of those of the samples at t that are chosen [..., S]."""
-    index, inside = _cell(grid, _along(grid, rays, t))
+def mark_cells(
+    marked: Bool[ArrayLike, "X Y Z"],
+    grid: OccupancyGrid,
+    rays: Rays,
+    t: Float[ArrayLike, "*batch samples"],
+    chosen: Bool[ArrayLike, "*batch samples"],
+) -> Bool[Array, "X Y Z"]:
+    """Returns marked [X, Y, Z] with the cells of the chosen samples marked, too."""
+    index, inside = _cells_of(grid, _along_rays(grid, rays, t))
     return marked.reshape(-1).at[index].max(chosen & inside).reshape(marked.shape)
 
 
-def keep_cells(grid, marked):
-    """Returns the Grid with only the cells that are marked [X, Y, Z], or between two that are, occupied."""
+def keep_cells(grid: OccupancyGrid, marked: Bool[ArrayLike, "X Y Z"]) -> OccupancyGrid:
+    """Returns the grid in which only cells that are marked, or between two that are, stay occupied."""
     between = marked
     for axis in range(3):
         around = jnp.pad(marked, [(1, 1) if i == axis else (0, 0) for i in range(3)])
@@ -144,8 +191,8 @@ def keep_cells(grid, marked):
     return dataclasses.replace(grid, density_mean=jnp.where(occupied, grid.density_mean, -1), occupied=occupied)
 
 
-def clip_rays_to_box(grid, rays):
-    """Returns the Rays between their ends and inside the grid's box; near = far where they miss it."""
+def clip_rays_to_box(grid: OccupancyGrid, rays: Rays) -> Rays:
+    """Returns the rays with near and far clipped to the grid's box; near = far where they miss it."""
     origins, directions = rays.origins, rays.directions
     level = directions == 0
     lower, upper = (bound.reshape(*(1,) * rays.near.ndim, 3) for bound in (grid.lower, grid.upper))
@@ -157,80 +204,87 @@ def clip_rays_to_box(grid, rays):
     return dataclasses.replace(rays, near=near, far=jnp.clip(leave, near, rays.far))
 
 
-def is_occupied(grid, rays, t):
-    """Returns [..., S], whether the cell around x(t) may be occupied; a t that is NaN counts, and shows."""
-    index, inside = _cell(grid, _along(grid, rays, t))
+def is_occupied(
+    grid: OccupancyGrid, rays: Rays, t: Float[ArrayLike, "*batch samples"]
+) -> Bool[Array, "*batch samples"]:
+    """Returns whether the cell around each x(t) is occupied; True where t is NaN, so that it shows."""
+    index, inside = _cells_of(grid, _along_rays(grid, rays, t))
     return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t)
 
 
-def mask_samples(grid, rays, samples, *, max_optical_depth=jnp.inf):
-    """Returns the Samples [..., S], with delta 0 where the grid is empty or where a sample hardly shows.
+def mask_samples(
+    grid: OccupancyGrid, rays: Rays, samples: Samples, *, max_optical_depth: Float[ArrayLike, ""] = jnp.inf
+) -> tuple[Samples, Bool[Array, "*batch"]]:
+    """Masks the samples in empty cells and those that dense cells occlude.
 
-    That is a guess for training, from the grid alone: no scene is asked.
+    Occlusion is estimated for training from the grid alone: no scene is evaluated.
 
     Args:
-        grid: Grid. Its running mean is the guess: the peak would hide what still has to form.
+        grid: OccupancyGrid. The estimate is its running mean: its maximum would occlude what still has to form.
         rays: Rays [...].
         samples: Samples [..., S].
-        max_optical_depth: optical depth before a sample, by the guess, from which on it counts as hidden.
+        max_optical_depth: estimated optical depth in front of a sample beyond which it is occluded.
 
     Returns:
-        Samples [..., S]; and hidden [...], whether a ray has samples left out that only the guess hides.
+        Samples [..., S] with delta 0 where they are masked; and occluded [...], whether a ray has samples in
+        occupied cells that are masked.
     """
-    index, inside = _cell(grid, _along(grid, rays, samples.t))
+    index, inside = _cells_of(grid, _along_rays(grid, rays, samples.t))
     mean = jnp.where(inside & ~(samples.delta <= 0), grid.density_mean.reshape(-1)[index], -1)
-    # A plain norm, as it is redone for every sample: a guess needs no care for directions of 1e-20.
+    # A plain norm, as it is computed again for every sample: an estimate needs no care for directions of 1e-20.
     x, y, z = (rays.directions[..., axis] for axis in range(3))
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
-    hidden = volume_rendering.exclusive_sum(jnp.maximum(mean, 0) * samples.delta * size) > max_optical_depth
-    worth = ~(mean < 0) | jnp.isnan(samples.t)  # NaN counts, and shows
-    kept = worth & ~hidden
+    occluded = volume_rendering.exclusive_sum(jnp.maximum(mean, 0) * samples.delta * size) > max_optical_depth
+    occupied = ~(mean < 0) | jnp.isnan(samples.t)  # NaN is kept, and shows
+    kept = occupied & ~occluded
     masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
-    return masked, (worth & hidden).any(axis=-1)
+    return masked, (occupied & occluded).any(axis=-1)
 
 
-def mask_scene(scene, grid):
-    """Returns a scene with nothing where the grid is empty: what render_packed sees (arXiv:2201.05989).
+def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
+    """Makes a scene that is empty where the grid is: what render_packed renders (arXiv:2201.05989).
 
     Args:
         scene: see render_samples.
-        grid: Grid. Outside its box, too, there is nothing.
+        grid: OccupancyGrid. Outside its box space is empty, too.
 
     Returns:
         A scene, whose density is 0, with gradient 0, in empty cells.
     """
 
-    def restricted(x, viewdirs):
+    def masked(x, viewdirs):
         density, rgb = scene(x, viewdirs)
-        index, inside = _cell_around(grid, x)
+        index, inside = _cells_around(grid, x)
         return jnp.where(inside & grid.occupied.reshape(-1)[index], density, 0), rgb
 
-    return restricted
+    return masked
 
 
-def drop_thin_density(scene, grid, threshold):
-    """Returns a scene with nothing where its density is at most a threshold; what is NaN stays.
+def drop_thin_density(
+    scene: SceneFn, grid: OccupancyGrid, threshold: Float[ArrayLike, ""] | Float[ArrayLike, "X Y Z"]
+) -> SceneFn:
+    """Makes a scene that is empty where its density is at most a threshold; NaN stays.
 
     Args:
         scene: see render_samples.
-        grid: Grid, whose cells the threshold is of.
+        grid: OccupancyGrid, to whose cells the threshold belongs.
         threshold: see update_grid.
     """
     threshold = jnp.asarray(threshold, jnp.float32)
 
-    def clear(x, viewdirs):
+    def thinned(x, viewdirs):
         density, rgb = scene(x, viewdirs)
-        least = threshold.reshape(-1)[_cell_around(grid, x)[0]] if threshold.ndim else threshold
+        least = threshold.reshape(-1)[_cells_around(grid, x)[0]] if threshold.ndim else threshold
         return jnp.where(density <= least, 0, density), rgb
 
-    return clear
+    return thinned
 
 
-def flat_index(places, shape):
-    """Returns the indices [...] among all cells of a shape (X, Y, Z) of places, three times [...] int32.
+def flat_index(places: Sequence[Int[Array, "*batch"]], shape: tuple[int, ...]) -> Int[Array, "*batch"]:
+    """Returns the indices [...] among all cells of a shape (X, Y, Z) of places, three arrays [...] int32.
 
-    It is a sum over a stack, as XLA ends a loop there on a CPU: where one loop finds cells and looks into
-    them, none of that is vectorised.
+    It is a sum over a stack, because XLA ends a loop there on a CPU: if one loop found cells and read them,
+    none of it would be vectorised.
     """
     strides = jnp.array([shape[1] * shape[2], shape[2], 1]).reshape(3, *(1,) * places[0].ndim)
     return (jnp.stack(places) * strides).sum(axis=0)
@@ -245,8 +299,8 @@ def _widen(occupied):
     return wide
 
 
-def _along(grid, rays, t):
-    """Returns x(t), three times [..., S], in cells from the box's lower corner."""
+def _along_rays(grid, rays, t):
+    """Returns x(t), three arrays [..., S], in cells from the box's lower corner."""
     places = []
     for axis in range(3):
         scale = _cells_per_unit(grid, axis)
@@ -259,12 +313,12 @@ def _cells_per_unit(grid, axis):
     return grid.occupied.shape[axis] / (grid.upper[axis] - grid.lower[axis])
 
 
-def _cell_around(grid, x):
-    """Returns _cell of positions x [..., 3]."""
-    return _cell(grid, [(x[..., i] - grid.lower[i]) * _cells_per_unit(grid, i) for i in range(3)])
+def _cells_around(grid, x):
+    """Returns _cells_of positions x [..., 3]."""
+    return _cells_of(grid, [(x[..., i] - grid.lower[i]) * _cells_per_unit(grid, i) for i in range(3)])
 
 
-def _cell(grid, places):
+def _cells_of(grid, places):
     """Returns the flat index of the cell at each of the places, and whether they are inside the box."""
     along, inside = [], True
     if grid.contracted:
@@ -276,10 +330,10 @@ def _cell(grid, places):
 
 
 def _contracted(places, shape):
-    """Returns where contract puts places, three times [...] in cells; axis by axis, as that is faster."""
+    """Returns where contract puts places, three arrays [...] in cells; axis by axis, which is faster."""
     along = [place * (4 / size) - 2 for place, size in zip(places, shape, strict=True)]
     largest = jnp.maximum(jnp.maximum(*map(jnp.abs, along[:2])), jnp.abs(along[2]))
     safe = jnp.maximum(largest, 1)
-    # Infinitely far away the box has an end, and what lies there is in its last cell.
+    # The box ends at infinity, and a point there is in its last cell.
     scale = jnp.minimum((2 - 1 / safe) / safe, _JUST_INSIDE / safe)
     return [(value * scale + 2) * (size / 4) for value, size in zip(along, shape, strict=True)]

@@ -1,195 +1,297 @@
-"""The renderer that asks only where there is something: the samples of many rays, packed into one pool."""
+"""Rendering of the samples in occupied cells alone: packed into one buffer, or with early termination.
+
+Occupied samples are those of positive length in an occupied cell. Training packs them into one buffer of fixed
+size and composites them there. Images march each ray only until it is opaque.
+"""
 
 import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from jaxnerf.core import rendering, volume_rendering
-from jaxnerf.core.occupancy import bitmask, early_termination
-from jaxnerf.core.occupancy.grid import is_occupied
-from jaxnerf.core.types import PackedSamples, Rendering, check_shapes
+from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
+from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
 
-_HARDLY = 1e-3  # of the light
+_OPAQUE = 1e-3  # transmittance below which a ray counts as opaque
+_HIGH_EPS = 0.01  # an early_stop_eps from which on rays end so soon that long runs of samples are wasted
 
 
-def render_packed(scene, grid, rays, samples, *, max_samples, early_stop_eps=0.0, background=None):
-    """Returns what render_samples does, asking the scene only where the grid is occupied.
+def render_packed(
+    scene: SceneFn,
+    grid: OccupancyGrid | None,
+    rays: Rays,
+    samples: Samples,
+    *,
+    max_samples: int,
+    early_stop_eps: float = 0.0,
+    background: Background | None = None,
+) -> Rendering:
+    """Renders samples as render_samples does, but evaluates the scene only in the grid's occupied cells.
 
-    The samples of all rays that count are packed into a pool of fixed size, and composited there (Eq. 3,
-    with the skipping and the early stop of arXiv:2201.05989).
+    The occupied samples of all rays are packed into a buffer of fixed size and composited there (Eq. 3 of
+    arXiv:2003.08934, with the skipping and the early termination of arXiv:2201.05989).
 
     Args:
-        scene: see render_samples; it is asked for [1, K, 3] positions with as many directions, or, with a
-            early_stop_eps, for a few in a row of many rays.
-        grid: Grid, outside whose box there is nothing. None where the samples are masked already.
+        scene: see render_samples. It is evaluated at [1, K, 3] positions with as many directions, or, with an
+            early_stop_eps, at a few consecutive samples of many rays.
+        grid: OccupancyGrid, outside whose box space is empty. None where the samples are masked already.
         rays: Rays [...].
         samples: Samples [..., S]; rules "segments" and "points".
-        capacity: K >= 1, the size of the pool.
-        early_stop_eps: 0 asks all samples at once; those that do not fit are left out and counted. Greater than 0,
-            as many as fit are asked again and again, the next ones of rays that still let more than this
-            through: none is left out. What is behind a stopped ray is taken to look like what it has met:
-            where colours are in [0, 1] the colour is within early_stop_eps of the whole one, and so is the opacity,
-            which is 1. That is for rendering: it has no reverse mode.
+        max_samples: K >= 1, the size of the buffer.
+        early_stop_eps: 0 evaluates all samples at once; those that do not fit are dropped and counted. Above 0,
+            as many samples as fit are evaluated in each of several rounds, the next ones of rays whose
+            transmittance is still above this: none is dropped. What lies behind a terminated ray is taken to
+            look like what the ray has met: where colours are in [0, 1] the colour is within early_stop_eps of
+            the exact one, and so is the opacity, which is 1. This is for rendering: it has no reverse mode.
         background: see render_samples.
 
     Returns:
-        Rendering [...] without weights; dropped [...] says how many samples of a ray did not fit.
+        Rendering [...] without weights; num_dropped [...] is the number of a ray's samples that did not fit.
+        Without early termination `samples` is PackedSamples [K].
 
     Raises:
-        ValueError: as render_samples; on rule "gauss"; if capacity < 1.
+        ValueError: as render_samples; on rule "gauss"; if max_samples < 1.
     """
     shape = rays.near.shape
-    rays, samples = _checked("render_packed", rays, samples, max_samples)
-    words = _words(grid, rays, samples)
+    rays, samples = _flattened("render_packed", rays, samples, max_samples)
+    words = _occupied_words(grid, rays, samples)
     if early_stop_eps > 0:
         options = {"max_samples": max_samples, "early_stop_eps": early_stop_eps}
-        sums = early_termination.march_until_terminated("render_packed", scene, rays, samples, words, **options)
+        sums = _march_until_terminated("render_packed", scene, rays, samples, words, **options)
         num_dropped, packed = jnp.zeros_like(rays.near, jnp.int32), None
     else:
-        queue, slot = _queue(words), jnp.arange(max_samples)
-        sums, packed = _ask(scene, rays, samples, _fill(queue, slot, slot < queue.ends[-1]))
-        num_dropped = queue.count - jnp.clip(max_samples - _first(queue), 0, queue.count)
+        occupied, slot = _count_occupied(words), jnp.arange(max_samples)
+        sums, packed = _composite(scene, rays, samples, _fill(occupied, slot, slot < occupied.ends[-1]))
+        num_dropped = occupied.count - jnp.clip(max_samples - _first(occupied), 0, occupied.count)
     flat = _rendering(sums, num_dropped, rays.far, shape, background)
     return dataclasses.replace(flat, samples=packed)
 
 
-def visible_samples(scene, grid, rays, samples, *, error, max_samples, background=None):
-    """Returns which samples a ray needs: without all of the others its colour differs by at most an error.
+def visible_samples(
+    scene: SceneFn,
+    grid: OccupancyGrid | None,
+    rays: Rays,
+    samples: Samples,
+    *,
+    error: float,
+    max_samples: int,
+    background: Background | None = None,
+) -> Bool[Array, "*batch samples"]:
+    """Finds the samples that a ray needs: without all others its colour changes by at most an error.
 
-    From back to front, each sample is left out unless what that adds to the error made behind it, by Eq. 3,
-    is too much. White fog before a white background is not needed, nor is the inside of a wall.
+    From back to front, each sample is dropped unless what that adds to the error made behind it, by Eq. 3 of
+    arXiv:2003.08934, is too large. White fog before a white background is not needed, nor is the inside of a
+    wall.
 
     Args:
         scene, rays, samples, background: see render_packed.
-        grid: Grid, where the scene is asked.
+        grid: OccupancyGrid, in whose occupied cells the scene is evaluated.
         error: in each of the three channels, which are taken to be in [0, 1].
-        capacity: samples asked at once; all of them are asked, in as many rounds as that takes.
+        max_samples: samples evaluated at once; all are evaluated, in as many rounds as that takes.
 
     Returns:
-        [..., S] bool; False where the scene is not asked. A ray that lets less than a thousandth pass keeps
-        what stops it, whatever the colours: opacity and depth would show it. A NaN is needed, and shows.
+        [..., S] bool; False where the scene is not evaluated. A ray whose transmittance is below 1e-3 keeps
+        what makes it opaque, whatever the colours: opacity and depth would show it. A NaN is needed, and shows.
 
     Raises:
         ValueError: as render_packed.
     """
-    name, shape = "needed_samples", samples.t.shape
-    rays, samples = _checked(name, rays, samples, max_samples)
-    queue = _queue(_words(grid, rays, samples))
+    name, shape = "visible_samples", samples.t.shape
+    rays, samples = _flattened(name, rays, samples, max_samples)
+    occupied = _count_occupied(_occupied_words(grid, rays, samples))
 
-    def ask_round(index, answers):
+    def evaluate_round(index, outputs):
         slot = index * max_samples + jnp.arange(max_samples)
-        pool = _fill(queue, slot, slot < queue.ends[-1])
-        _, density, rgb = _answers(name, scene, rays, samples, pool)
-        place = jnp.where(pool.used, pool.ray * shape[-1] + pool.source, answers.shape[0])
-        return answers.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
+        buffer = _fill(occupied, slot, slot < occupied.ends[-1])
+        _, density, rgb = _evaluate(name, scene, rays, samples, buffer)
+        place = jnp.where(buffer.used, buffer.ray * shape[-1] + buffer.source, outputs.shape[0])
+        return outputs.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
 
-    rounds = -(-queue.ends[-1] // max_samples)
-    answers = jax.lax.fori_loop(0, rounds, ask_round, jnp.zeros((samples.t.size, 4)))
-    density, *rgb = jnp.moveaxis(answers.reshape(*samples.t.shape, 4), -1, 0)
+    rounds = -(-occupied.ends[-1] // max_samples)
+    outputs = jax.lax.fori_loop(0, rounds, evaluate_round, jnp.zeros((samples.t.size, 4)))
+    density, *rgb = jnp.moveaxis(outputs.reshape(*samples.t.shape, 4), -1, 0)
     length = rendering.segment_lengths(jnp.maximum(samples.delta, 0), rays.directions)
     depth = jnp.where(density == 0, 0, density * length)
     before = jnp.exp(-volume_rendering.exclusive_sum(depth))
-    passing = jnp.exp(-depth)
+    through = jnp.exp(-depth)
 
-    def leave_out(state, sample):
-        # [B, 3]: the colour behind the sample, and by how much it is off already; [B]: what an opaque ray
-        # would let through of light from behind it.
-        behind, wrong, bared = state
-        before, passing, rgb = sample
-        through = passing[:, None]
-        change = wrong + (1 - through) * (rgb - behind)
-        needed = ~(before * jnp.maximum(jnp.abs(change).max(axis=-1), bared) <= error)
-        wrong = jnp.where(needed[:, None], through * wrong, change)
-        bared = jnp.where(needed, passing * bared, bared)
-        return ((1 - through) * rgb + through * behind, wrong, bared), needed
+    def drop(state, sample):
+        # [B, 3]: the colour behind the sample, and its error so far; [B]: the transmittance that the dropped
+        # samples of an opaque ray open behind it.
+        behind, wrong, opened = state
+        before, through, rgb = sample
+        transmitted = through[:, None]
+        change = wrong + (1 - transmitted) * (rgb - behind)
+        needed = ~(before * jnp.maximum(jnp.abs(change).max(axis=-1), opened) <= error)
+        wrong = jnp.where(needed[:, None], transmitted * wrong, change)
+        opened = jnp.where(needed, through * opened, opened)
+        return ((1 - transmitted) * rgb + transmitted * behind, wrong, opened), needed
 
     behind = jnp.zeros(3) if background is None else jnp.asarray(background)
     behind = jnp.broadcast_to(behind, (*rays.near.shape, 3))
-    opaque = before[:, -1:] * passing[:, -1:] < _HARDLY
+    opaque = before[:, -1:] * through[:, -1:] < _OPAQUE
     start = (behind, jnp.zeros_like(behind), opaque[:, 0].astype(behind.dtype))
-    nearest_first = (before.T, passing.T, jnp.stack(rgb, axis=-1).swapaxes(0, 1))
-    return jax.lax.scan(leave_out, start, nearest_first, reverse=True)[1].T.reshape(shape)
+    nearest_first = (before.T, through.T, jnp.stack(rgb, axis=-1).swapaxes(0, 1))
+    return jax.lax.scan(drop, start, nearest_first, reverse=True)[1].T.reshape(shape)
 
 
-class _Queue(NamedTuple):
-    """The samples that count, ray after ray: a bit each, W words of 32 a ray."""
+class _Sums(NamedTuple):
+    """The sums over the samples of each ray.
 
-    words: jax.Array  # [B W] uint32, the samples' flags, the nearest lowest
-    ends: jax.Array  # [B W] int32, how many count up to the end of each word
-    count: jax.Array  # [B] int32, how many of each ray count
+    Attributes:
+        transmittance: [B].
+        opacity: [B] 1 - transmittance, without cancellation.
+        rgb: [B, 3] on black.
+        depth: [B] sum of w t.
+        disparity: [B] sum of w / t.
+    """
+
+    transmittance: Array
+    opacity: Array
+    rgb: Array
+    depth: Array
+    disparity: Array
 
 
-class _Pool(NamedTuple):
-    """What is asked at once."""
-
-    source: jax.Array  # [K] int32, places among the samples of the ray
-    ray: jax.Array  # [K] int32, ascending
-    used: jax.Array  # [K] bool, False for the room that is left
-
-
-def _checked(function, rays, samples, max_samples):
+def _flattened(function, rays, samples, max_samples):
     """Returns Rays [B] and Samples [B, S] of any leading axes; ValueError on what cannot be packed."""
     if samples.rule == "gauss":
-        raise ValueError(f"{function}: rule 'gauss' asks in pairs, which a cell's border may part; use 'segments'")
+        raise ValueError(
+            f"{function}: rule is 'gauss', whose pairs of samples a cell's border may part; expected 'segments' or "
+            "'points'"
+        )
     check_shapes(function, near=(rays.near, "..."), t=(samples.t, "... S"), delta=(samples.delta, "... S"))
     if max_samples < 1:
-        raise ValueError(f"{function}: max_samples is {max_samples}, wanted at least 1")
+        raise ValueError(f"{function}: max_samples is {max_samples}, expected at least 1")
     leading = rays.near.ndim
     return jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[leading:]), (rays, samples))
 
 
-def _words(grid, rays, samples):
-    """Returns [B, W], which samples count."""
+def _rendering(sums, num_dropped, far, shape, background):
+    rgb = sums.rgb
+    if background is not None:
+        behind = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), (*shape, 3)).reshape(-1, 3)
+        rgb = rgb + sums.transmittance[:, None] * behind
+    flat = Rendering(
+        rgb=rgb,
+        opacity=sums.opacity,
+        depth=sums.depth + volume_rendering.multiply_or_zero(sums.transmittance, far),
+        disparity=sums.disparity,
+        weights=None,
+        num_dropped=num_dropped,
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)
+
+
+# Which samples are occupied: one bit each, W words of 32 for each ray. Searching words rather than samples is
+# what makes packing cheap.
+
+
+class _Occupied(NamedTuple):
+    """The occupied samples of all rays, ray after ray.
+
+    Attributes:
+        words: [B W] uint32, a bit for each sample, the nearest lowest.
+        ends: [B W] int32, the number of occupied samples up to the end of each word.
+        count: [B] int32, the number of occupied samples of each ray.
+    """
+
+    words: Array
+    ends: Array
+    count: Array
+
+
+def _occupied_words(grid, rays, samples):
+    """Returns [B, W] uint32, a bit for each sample: whether it is occupied."""
     kept = ~(samples.delta <= 0)
-    return bitmask.pack(kept if grid is None else kept & is_occupied(grid, rays, samples.t))
+    return _pack_bits(kept if grid is None else kept & is_occupied(grid, rays, samples.t))
 
 
-def _queue(words):
-    sizes = bitmask.count(words)
-    return _Queue(words.reshape(-1), jnp.cumsum(sizes.reshape(-1)), sizes.sum(-1))
+def _pack_bits(flags):
+    """Returns flags [B, S] as words [B, W] uint32, the first flag lowest."""
+    flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[-1] % 32))).reshape(flags.shape[0], -1, 32)
+    return (flags * (jnp.uint32(1) << jnp.arange(32, dtype=jnp.uint32))[None, None]).sum(-1, dtype=jnp.uint32)
 
 
-def _first(queue):
-    """Returns [B], where each ray's samples begin in the queue."""
-    return jnp.cumsum(queue.count) - queue.count
+def _count_bits(words):
+    """Returns the number of set bits of each word, int32."""
+    return jax.lax.population_count(words).astype(jnp.int32)
 
 
-def _fill(queue, place, used):
-    """Returns the Pool of the samples at places [K] in the queue, each the next after the one before."""
+def _nth_bit(words, n):
+    """Returns the place in each word of its n-th set bit, the lowest being n = 0."""
+    place = jnp.zeros_like(n)
+    for half in (16, 8, 4, 2, 1):
+        low = _count_bits((words >> place.astype(jnp.uint32)) & jnp.uint32(2**half - 1))
+        above = n >= low
+        n, place = n - jnp.where(above, low, 0), place + jnp.where(above, half, 0)
+    return place
+
+
+def _count_occupied(words):
+    sizes = _count_bits(words)
+    return _Occupied(words.reshape(-1), jnp.cumsum(sizes.reshape(-1)), sizes.sum(-1))
+
+
+def _first(occupied):
+    """Returns [B], where each ray's samples begin among all occupied samples."""
+    return jnp.cumsum(occupied.count) - occupied.count
+
+
+# One buffer for all rays.
+
+
+class _Buffer(NamedTuple):
+    """Which sample each slot of the buffer holds.
+
+    Attributes:
+        source: [K] int32, index among the samples of the ray.
+        ray: [K] int32, ascending.
+        used: [K] bool, False for unused slots, which come last.
+    """
+
+    source: Array
+    ray: Array
+    used: Array
+
+
+def _fill(occupied, place, used):
+    """Returns the _Buffer of the occupied samples at places [K], each the next after the one before."""
     # How many words have ended up to a place: counted from place to place, rather than searched for each.
-    ended = jnp.zeros_like(place).at[jnp.maximum(queue.ends - place[0], 0)].add(1, mode="drop")
-    word = jnp.minimum(jnp.cumsum(ended), queue.words.size - 1)
-    flags = queue.words[word]
-    before = queue.ends[word] - bitmask.count(flags)
-    width = queue.words.size // queue.count.size
-    return _Pool(word % width * 32 + bitmask.nth(flags, place - before), word // width, used)
+    ended = jnp.zeros_like(place).at[jnp.maximum(occupied.ends - place[0], 0)].add(1, mode="drop")
+    word = jnp.minimum(jnp.cumsum(ended), occupied.words.size - 1)
+    flags = occupied.words[word]
+    before = occupied.ends[word] - _count_bits(flags)
+    width = occupied.words.size // occupied.count.size
+    return _Buffer(word % width * 32 + _nth_bit(flags, place - before), word // width, used)
 
 
-def _answers(function, scene, rays, samples, pool):
-    """Returns what a scene says at a pool's samples, 0 in the room left: t [K], density [K], rgb [K, 3]."""
-    t = jnp.where(pool.used, samples.t[pool.ray, pool.source], 0)
-    one = jax.tree.map(lambda leaf: leaf[pool.ray][None], rays)  # Rays [1, K], one a sample
+def _evaluate(function, scene, rays, samples, buffer):
+    """Evaluates the scene at a buffer's samples: t [K], density [K], rgb [K, 3], all 0 in unused slots."""
+    t = jnp.where(buffer.used, samples.t[buffer.ray, buffer.source], 0)
+    one = jax.tree.map(lambda leaf: leaf[buffer.ray][None], rays)  # Rays [1, K], one for each sample
     x = one.origins + t[None, :, None] * one.directions
     density, rgb = scene(x, one.viewdirs)
     rendering.check_scene_output(function, density, rgb, x)
-    return t, jnp.where(pool.used, density[0], 0), jnp.where(pool.used[:, None], rgb[0], 0)
+    return t, jnp.where(buffer.used, density[0], 0), jnp.where(buffer.used[:, None], rgb[0], 0)
 
 
-def _ask(scene, rays, samples, pool):
-    """Evaluates the scene at a pool's samples and composites them: Sums [B], PackedSamples [K]."""
-    t, density, rgb = _answers("render_packed", scene, rays, samples, pool)
-    delta = jnp.where(pool.used, samples.delta[pool.ray, pool.source], 0)
-    length = rendering.segment_lengths(delta[:, None], rays.directions[pool.ray])[:, 0]
-    starts = pool.ray != jnp.roll(pool.ray, 1).at[0].set(-1)
+def _composite(scene, rays, samples, buffer):
+    """Evaluates the scene at a buffer's samples and composites them: _Sums [B], PackedSamples [K]."""
+    t, density, rgb = _evaluate("render_packed", scene, rays, samples, buffer)
+    delta = jnp.where(buffer.used, samples.delta[buffer.ray, buffer.source], 0)
+    length = rendering.segment_lengths(delta[:, None], rays.directions[buffer.ray])[:, 0]
+    starts = buffer.ray != jnp.roll(buffer.ray, 1).at[0].set(-1)
     weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=samples.t.shape[-1])
     colours = [rgb[:, axis] * weights for axis in range(3)]
     parts = [optical_depth, *colours, weights * t, volume_rendering.divide_or_zero(weights, t)]
-    sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), pool.ray, rays.near.size, indices_are_sorted=True)
-    packed = PackedSamples(weights=weights, t=t, delta=delta, ray_index=pool.ray, used=pool.used)
-    return early_termination.Sums(
-        passing=jnp.exp(-sums[:, 0]),
+    sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), buffer.ray, rays.near.size, indices_are_sorted=True)
+    packed = PackedSamples(weights=weights, t=t, delta=delta, ray_index=buffer.ray, used=buffer.used, rule=samples.rule)
+    return _Sums(
+        transmittance=jnp.exp(-sums[:, 0]),
         opacity=-jnp.expm1(-sums[:, 0]),
         rgb=sums[:, 1:4],
         depth=sums[:, 4],
@@ -197,17 +299,133 @@ def _ask(scene, rays, samples, pool):
     ), packed
 
 
-def _rendering(sums, num_dropped, far, shape, background):
-    rgb = sums.rgb
-    if background is not None:
-        behind = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), (*shape, 3)).reshape(-1, 3)
-        rgb = rgb + sums.passing[:, None] * behind
-    flat = Rendering(
-        rgb=rgb,
-        opacity=sums.opacity,
-        depth=sums.depth + volume_rendering.multiply_or_zero(sums.passing, far),
-        disparity=sums.disparity,
-        weights=None,
-        num_dropped=num_dropped,
+# Early termination: each slot marches one ray, and takes the next ray as soon as that one terminates.
+
+
+class _Slots(NamedTuple):
+    """The state of L slots.
+
+    Attributes:
+        ray: [L] int32; B: none.
+        num_done: [L] int32, the number of the ray's samples that were evaluated.
+        sums: [7, L], the columns of _Sums.
+    """
+
+    ray: Array
+    num_done: Array
+    sums: Array
+
+
+def _march_until_terminated(function, scene, rays, samples, words, *, max_samples, early_stop_eps):
+    """Marches each ray until its transmittance is at most early_stop_eps, or to its end.
+
+    What lies behind a terminated ray is taken to look like all that it has met: such a ray is opaque.
+
+    Args:
+        function: name of the public function, for errors.
+        scene: see render_samples; it is evaluated at [L, N, 3] positions with [L, 1, 3] directions.
+        rays: Rays [B].
+        samples: Samples [B, S].
+        words: [B, W] uint32, see _occupied_words.
+        max_samples: samples evaluated at once, L N at most.
+        early_stop_eps: > 0.
+
+    Returns:
+        _Sums [B].
+    """
+    ray_count = rays.near.size
+    samples_per_slot = 2 if early_stop_eps >= _HIGH_EPS else 4  # more waste evaluations, fewer make more rounds
+    slot_count = max(min(max_samples // samples_per_slot, ray_count), 1)
+    row = jnp.arange(max_samples // slot_count)[None]
+    up_to = jnp.cumsum(_count_bits(words), axis=-1)
+    count = up_to[:, -1]
+    order = _longest_first(count, samples.t.shape[-1])
+    waiting = (count > 0).sum()
+
+    def evaluate(ray, num_done):
+        n = num_done[:, None] + row
+        used = n < count.at[ray, None].get(mode="fill", fill_value=0)
+        ray = jnp.minimum(ray, ray_count - 1)
+        own, some = _nth_samples(rays, samples, words, up_to, ray, n, used)
+        return _sum_run(function, scene, own, some, used)
+
+    no_ray = jnp.full(slot_count, ray_count)
+    none_done = jnp.zeros_like(no_ray)
+    start = jnp.zeros((7, 1), jax.eval_shape(evaluate, no_ray, none_done).dtype).at[0].set(1)
+
+    def refill(slots, num_taken):
+        """Gives the next rays to the slots without one; returns the _Slots and how many rays were taken."""
+        free = slots.ray == ray_count
+        place = num_taken + jnp.cumsum(free) - free
+        following = jnp.where(place < waiting, order.at[place].get(mode="clip"), ray_count)
+        ray, num_done = jnp.where(free, following, slots.ray), jnp.where(free, 0, slots.num_done)
+        return _Slots(ray, num_done, jnp.where(free[None], start, slots.sums)), num_taken + free.sum()
+
+    def step(state):
+        slots, num_taken, finished = state
+        slots, num_taken = refill(slots, num_taken)
+        run, transmittance = evaluate(slots.ray, slots.num_done), slots.sums[:1]
+        sums = jnp.concatenate([transmittance * run[:1], slots.sums[1:] + transmittance * run[1:]])
+        num_done = slots.num_done + row.size
+        terminates = ~(sums[0] > early_stop_eps)  # NaN terminates, and shows
+        ends = terminates | (num_done >= count.at[slots.ray].get(mode="clip"))
+        sums = jnp.where(terminates & (sums[1] > 0), _made_opaque(sums), sums)
+        finished = finished.at[:, jnp.where(ends, slots.ray, ray_count)].set(sums, mode="drop")
+        return _Slots(jnp.where(ends, ray_count, slots.ray), num_done, sums), num_taken, finished
+
+    def continues(state):
+        slots, num_taken, _ = state
+        return (num_taken < waiting) | (slots.ray < ray_count).any()
+
+    slots = _Slots(no_ray, none_done, jnp.broadcast_to(start, (7, slot_count)))
+    finished = jnp.broadcast_to(start, (7, ray_count))
+    finished = jax.lax.while_loop(continues, step, (slots, jnp.zeros_like(waiting), finished))[2]
+    transmittance, opacity, *rgb, depth, disparity = finished
+    return _Sums(transmittance, opacity, jnp.stack(rgb, axis=-1), depth, disparity)
+
+
+def _longest_first(count, most):
+    """Returns the order [B] of rays by count [B], at most `most`, so that all slots finish at about the same time.
+
+    It sorts numbers that also hold the ray's index: argsort takes several times as long on a CPU.
+    """
+    rays = count.size
+    if rays * (most + 1) > 2**32:  # too large for such numbers
+        return jnp.argsort(-count)
+    numbers = jnp.uint32(rays) * (most - count).astype(jnp.uint32) + jnp.arange(rays, dtype=jnp.uint32)
+    return (jnp.sort(numbers) % rays).astype(jnp.int32)
+
+
+def _made_opaque(sums):
+    """Returns sums [7, L] of terminated rays, whose remaining light is taken to look like the rest."""
+    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:] / sums[1:2]])
+
+
+def _nth_samples(rays, samples, words, up_to, ray, n, used):
+    """Returns the Rays [L] of the slots, and t and delta [L, N] of each one's n-th occupied samples."""
+    word = jnp.minimum((up_to[ray, None] <= n[..., None]).sum(axis=-1), words.shape[-1] - 1)
+    ray = ray[:, None]
+    flags, end = words[ray, word], up_to[ray, word]
+    source = 32 * word + _nth_bit(flags, n - end + _count_bits(flags))
+    t, delta = (jnp.where(used, leaf[ray, source], 0) for leaf in (samples.t, samples.delta))
+    return jax.tree.map(lambda leaf: leaf[ray[:, 0]], rays), (t, delta)
+
+
+def _sum_run(function, scene, rays, samples, used):
+    """Returns [7, L], the columns of _Sums of consecutive samples, as if nothing lay before them."""
+    t, delta = samples
+    x = rendering.points_on_rays(rays, t)
+    density, rgb = scene(x, rays.viewdirs[:, None])
+    rendering.check_scene_output(function, density, rgb, x)
+    density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
+    length = rendering.segment_lengths(delta, rays.directions)
+    weights = volume_rendering.weights_from_density(density, length)
+    return jnp.stack(
+        [
+            volume_rendering.transmittance(density, length),
+            volume_rendering.opacity(density, length),
+            *volume_rendering.composite(weights, rgb).T,
+            volume_rendering.multiply_or_zero(weights, t).sum(axis=-1),
+            volume_rendering.expected_disparity(weights, t),
+        ]
     )
-    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)

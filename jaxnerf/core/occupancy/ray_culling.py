@@ -1,58 +1,60 @@
-"""Rays that see nothing: found by a coarse look at a grid, and left out when a picture is rendered."""
+"""Ray culling: rays that cannot hit an occupied cell are found on a coarse grid, and not rendered."""
 
 import dataclasses
 import functools
 import math
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool
 
-from jaxnerf.core.occupancy.grid import clip_rays_to_box, flat_index
-from jaxnerf.core.types import Rendering, without_samples
+from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, flat_index
+from jaxnerf.core.types import Background, Rays, Rendering, without_samples
 
-_BLOCK = 2  # cells a side: of the blocks that tell what a ray may meet
+_COARSE = 2  # cells along a side of a coarse cell
 
 
-def rays_may_hit(grid, rays, *, cell):
-    """Returns [...], False where no sample of a ray can lie in an occupied cell.
+def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> Bool[Array, "*batch"]:
+    """Returns whether a sample of each ray can lie in an occupied cell.
 
-    Blocks of cells are asked at a few places along the ray, so of the rays that pass nearby many are True,
-    and all where space is contracted. A ray that is NaN may meet anything, and shows.
+    Coarse cells are read at a few places along the ray, so many rays that pass nearby are True, and all rays
+    where space is contracted. A ray that is NaN is True, so that it shows.
 
     Args:
-        grid, rays, cell: see samples_in_box.
+        grid, rays, cell: see march_rays.
     """
     if grid.contracted:
         return jnp.ones(rays.near.shape, bool)
-    blocks = _blocks_around(grid.occupied)
+    coarse = _coarse_cells(grid.occupied)
     inside = clip_rays_to_box(grid, rays)
     length = inside.far - inside.near
     sides = [size * count for size, count in zip(cell, grid.occupied.shape, strict=True)]
-    # No point of a ray is further than a block from a place, but for rounding.
-    count = math.ceil(math.hypot(*sides) / (1.99 * _BLOCK * min(cell)))
+    # No point of a ray is further than a coarse cell from a place, up to rounding.
+    count = math.ceil(math.hypot(*sides) / (1.99 * _COARSE * min(cell)))
 
-    def ask(index, met):
+    def read(index, hit):
         t, places = inside.near + length * ((index + 0.5) / count), []
-        for axis, (size, wide) in enumerate(zip(cell, blocks.shape, strict=True)):
+        for axis, (size, wide) in enumerate(zip(cell, coarse.shape, strict=True)):
             place = (rays.origins[..., axis] + t * rays.directions[..., axis] - grid.lower[axis]) / size
-            places.append(jnp.clip((place / _BLOCK).astype(jnp.int32), 0, wide - 1))
-        flat = flat_index(places, blocks.shape)
-        return met | blocks.reshape(-1)[flat]
+            places.append(jnp.clip((place / _COARSE).astype(jnp.int32), 0, wide - 1))
+        flat = flat_index(places, coarse.shape)
+        return hit | coarse.reshape(-1)[flat]
 
-    met = jax.lax.fori_loop(0, count, ask, jnp.zeros(rays.near.shape, bool))
+    hit = jax.lax.fori_loop(0, count, read, jnp.zeros(rays.near.shape, bool))
     numbers = (rays.origins.sum(axis=-1), rays.directions.sum(axis=-1), rays.near, rays.far)
-    return (met & (length > 0)) | jnp.isnan(sum(numbers))
+    return (hit & (length > 0)) | jnp.isnan(sum(numbers))
 
 
-def render_background(rays, *, background=None):
-    """Returns what rays see where there is nothing.
+def render_background(rays: Rays, *, background: Background | None = None) -> Rendering:
+    """Renders rays through empty space.
 
     Args:
         rays: Rays [...].
         background: see render_samples.
 
     Returns:
-        Rendering [...] without weights: the background's colour, depth far, and 0.
+        Rendering [...] without weights: the background's colour, depth far, opacity and disparity 0.
     """
     shape = rays.near.shape
     behind = jnp.zeros(3) if background is None else jnp.asarray(background)
@@ -66,55 +68,62 @@ def render_background(rays, *, background=None):
     )
 
 
-def render_selected(render, rays, chosen, otherwise, *, chunk):
-    """Returns a whole image of which only some rays are rendered, those that may see something.
+def render_selected(
+    render: Callable[[Rays], Rendering],
+    rays: Rays,
+    selected: Bool[ArrayLike, "*batch"],
+    otherwise: Rendering | None,
+    *,
+    chunk: int,
+) -> Rendering:
+    """Renders only some rays of an image, those that may hit an occupied cell.
 
     Args:
-        render, rays, chunk: see render_image; but the last chunk is filled up with rays of no length, which
+        render, rays, chunk: see render_image; but the last chunk is filled up with rays of length 0, which
             cost least.
-        chosen: [H, W] bool, which rays are rendered.
-        otherwise: Rendering [H, W] without weights, of the others; see render_nothing.
+        selected: [H, W] bool, which rays are rendered.
+        otherwise: Rendering [H, W] without weights, of the other rays; see render_background.
 
     Returns:
         Rendering [H, W] without weights.
 
     Raises:
-        ValueError: if chunk < 1, or on another shape of chosen.
+        ValueError: if chunk < 1, or if selected has another shape than the rays.
     """
     if chunk < 1:
-        raise ValueError(f"render_chosen: chunk {chunk}, wanted at least 1")
-    if chosen.shape != rays.near.shape:
-        raise ValueError(f"render_chosen: chosen {chosen.shape}, wanted {rays.near.shape} as the rays")
-    order, whole = _order(chosen), jax.tree.map(jnp.copy, otherwise)  # a copy, as it is written into
-    for start in range(0, int(chosen.sum()), chunk):
-        places, part = _chosen_of(rays, order, start, chunk=chunk)
+        raise ValueError(f"render_selected: chunk is {chunk}, expected at least 1")
+    if selected.shape != rays.near.shape:
+        raise ValueError(f"render_selected: selected has shape {selected.shape}, expected {rays.near.shape}, the rays'")
+    order, whole = _order(selected), jax.tree.map(jnp.copy, otherwise)  # a copy, as it is written into
+    for start in range(0, int(selected.sum()), chunk):
+        places, part = _selected_of(rays, order, start, chunk=chunk)
         whole = _with_part(whole, places, without_samples(render(part)))
     return whole
 
 
-def _blocks_around(occupied):
-    """Returns which blocks hold an occupied cell, or have one among their 26 neighbours."""
+def _coarse_cells(occupied):
+    """Returns which coarse cells hold an occupied cell, or have one among their 26 neighbours."""
     # Slices, each or-ed with the others: reduce_window takes several times as long on a CPU.
-    blocks, reach = occupied, 3 * _BLOCK
+    coarse, reach = occupied, 3 * _COARSE
     for axis in range(3):
-        around = [(_BLOCK, _BLOCK + -occupied.shape[i] % _BLOCK) if i == axis else (0, 0) for i in range(3)]
-        wide = jnp.pad(blocks, around)
+        around = [(_COARSE, _COARSE + -occupied.shape[i] % _COARSE) if i == axis else (0, 0) for i in range(3)]
+        wide = jnp.pad(coarse, around)
         ends = wide.shape[axis] - reach + 1
-        cells = (jax.lax.slice_in_dim(wide, i, ends + i, stride=_BLOCK, axis=axis) for i in range(reach))
-        blocks = functools.reduce(jnp.bitwise_or, cells)
-    return blocks
+        cells = (jax.lax.slice_in_dim(wide, i, ends + i, stride=_COARSE, axis=axis) for i in range(reach))
+        coarse = functools.reduce(jnp.bitwise_or, cells)
+    return coarse
 
 
-# All jitted: op by op they would take longer than a small picture's rays.
+# All jitted: op by op they would take longer than the rays of a small image.
 @jax.jit
-def _order(chosen):
-    """Returns [N], the places of the rays that are chosen [...]; those of no ray after them."""
-    return jnp.flatnonzero(chosen, size=chosen.size, fill_value=chosen.size)
+def _order(selected):
+    """Returns [N], the indices of the selected rays; N in the remaining places."""
+    return jnp.flatnonzero(selected, size=selected.size, fill_value=selected.size)
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def _chosen_of(rays, order, start, *, chunk):
-    """Returns places [chunk], those in order from start on, and the Rays there: of no length for no ray."""
+def _selected_of(rays, order, start, *, chunk):
+    """Returns indices [chunk], those in order from start on, and their Rays: of length 0 where there is none."""
     axes = rays.near.ndim
     places = order.at[start + jnp.arange(chunk)].get(mode="fill", fill_value=order.size)
     part = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[axes:]).at[places].get(mode="clip"), rays)
@@ -123,7 +132,7 @@ def _chosen_of(rays, order, start, *, chunk):
 
 @functools.partial(jax.jit, donate_argnums=0)
 def _with_part(whole, places, part):
-    """Returns the Rendering [...] with the Rendering [N] at places [N] in it."""
+    """Returns the Rendering [...] with the Rendering [N] at indices [N] in it."""
 
     def put(leaf, new):
         flat = leaf.reshape(-1, *new.shape[1:])

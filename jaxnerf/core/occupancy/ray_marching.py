@@ -1,24 +1,38 @@
-"""Samples along rays through the box of a grid: equal steps, or steps that grow with the distance."""
+"""Ray marching: samples at equal steps through the box of an occupancy grid, or at steps that grow with distance."""
 
 import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
 
-from jaxnerf.core.occupancy.grid import clip_rays_to_box
+from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box
 from jaxnerf.core.sampling import samples_from_edges, stepped_edges
+from jaxnerf.core.types import Keys, Rays, Samples
 
 
-def march_rays(key, grid, rays, *, step_size, cell, stretch=1.0):
-    """Returns Samples [..., S] of equal steps along what a grid's box cuts from rays [...].
+def march_rays(
+    key: Keys | None,
+    grid: OccupancyGrid,
+    rays: Rays,
+    *,
+    step_size: float,
+    cell: Sequence[float],
+    stretch: Float[ArrayLike, ""] = 1.0,
+) -> Samples:
+    """Returns samples at equal steps along the part of each ray that is inside the grid's box.
 
     Args:
         key: see stepped_edges.
-        grid: Grid. Where all of space is contracted into its box, see samples_everywhere.
+        grid: OccupancyGrid. If it is contracted, the steps are those of samples_in_contracted_space.
         rays: Rays [...].
         step_size: world units, a number.
-        cell: [3] world units, numbers, the size of one of this grid's cells: they say how many
-            samples a ray may need.
-        stretch: how many steps one sample takes, at least 1, traced or not.
+        cell: [3] world units, numbers, the size of a cell of this grid: it bounds the number of samples that a
+            ray may need.
+        stretch: the number of steps that one sample takes, at least 1, traced or not.
+
+    Returns:
+        Samples [..., S].
     """
     x, y, z = (rays.directions[..., axis] for axis in range(3))
     speed = jnp.sqrt(x * x + y * y + z * z)
@@ -31,19 +45,28 @@ def march_rays(key, grid, rays, *, step_size, cell, stretch=1.0):
     return samples_from_edges(None, edges)
 
 
-def samples_in_contracted_space(key, grid, rays, t_step, steps_of_room):
-    """Returns Samples [..., S] from near to far, however far, whose steps grow as contracted cells do.
+def samples_in_contracted_space(
+    key: Keys | None,
+    grid: OccupancyGrid,
+    rays: Rays,
+    t_step: Float[Array, "*batch"],
+    steps_in_half_side: float,
+) -> Samples:
+    """Returns samples from near to far, however far, at steps that grow as contracted cells do.
 
-    With r the distance to the box's center, r0 the ray's smallest, and R the side of its plain part over
-    the square root of 2, steps are equal in s where t = m tan(s / m), m = max(r0, R), counted from the place
-    of r0: plain near the center, times (r / R)^2 far from it, and alike at any scale where r0 exceeds R.
+    With r the distance to the box's center, r0 the ray's smallest, and R the side of its inner half over the
+    square root of 2, steps are equal in s where t = m tan(s / m), m = max(r0, R), counted from the point at
+    r0: plain near the center, times (r / R)^2 far from it, and self-similar where r0 exceeds R.
 
     Args:
         key: see stepped_edges.
-        grid: Grid, contracted.
+        grid: OccupancyGrid, contracted.
         rays: Rays [...].
-        t_step: [...] in t, where space is plain.
-        steps_of_room: a number, half of the plain part's side over the step.
+        t_step: [...] in t, the step where space is plain.
+        steps_in_half_side: a number, half the side of the inner half over the step.
+
+    Returns:
+        Samples [..., S].
     """
     middle, half = (grid.lower + grid.upper) / 2, (grid.upper - grid.lower).max() / 4 * math.sqrt(2)
     middle = middle.reshape(*(1,) * rays.near.ndim, 3)
@@ -53,9 +76,9 @@ def samples_in_contracted_space(key, grid, rays, t_step, steps_of_room):
     smallest = half / jnp.sqrt(squares)
     scale = jnp.maximum(jnp.sqrt((away**2).sum(axis=-1) / squares), smallest)
     t_step = t_step * scale / smallest
-    last = scale * (math.pi / 2) - t_step / 2  # a whole step more would never end
+    last = scale * (math.pi / 2) - t_step / 2  # a whole step more would end at infinity
     near, far = (jnp.minimum(scale * jnp.arctan((t - nearest) / scale), last) for t in (rays.near, rays.far))
-    count = _whole_words(math.pi * math.sqrt(2) * steps_of_room + 1)
+    count = _whole_words(math.pi * math.sqrt(2) * steps_in_half_side + 1)
     edges = stepped_edges(key, near, far, step_size=t_step, num_segments=count)
     nearest, scale = nearest[..., None], scale[..., None]
     edges = nearest + scale * jnp.tan(edges / scale)
@@ -63,6 +86,6 @@ def samples_in_contracted_space(key, grid, rays, t_step, steps_of_room):
 
 
 def _whole_words(count):
-    """Returns a number of samples for which the packer's flags fill whole words: padding takes longer."""
+    """Rounds up to whole words of 32, as render_packed keeps a bit for each sample and padding takes longer."""
     count = math.ceil(count)
     return count + -count % 32

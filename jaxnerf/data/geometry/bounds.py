@@ -1,23 +1,26 @@
-"""Where matter begins and ends along a camera's axis, as far as a capture tells."""
+"""Bounds of the matter along each camera's axis, as the dataset states or implies them."""
 
 import numpy as np
+from jaxtyping import Float
 
+from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import gaze_center
 from jaxnerf.data.geometry.world import poses_of
+from jaxnerf.data.readers.base import Capture
 
-_STRAYS = 1.0  # percent of points at each end that may be wrong matches
-_MARGIN = 0.8  # what the points miss: near is that much nearer, far as much farther
-_FEWEST = 8  # points that a view must show to tell
-_OTHERS = 2  # views, beside its own, that must see a place for its matter to be placed
-_WITNESSES = 64  # other views at most, spread over all
-_FARTHEST = 10.0  # times the distance to what the cameras look at, where nothing tells more
+_OUTLIERS = 1.0  # percent of points at each end that may be wrong matches
+_MARGIN = 0.8  # for matter without points: near is multiplied, far divided by it
+_MIN_POINTS = 8  # points that a view must show for bounds
+_MIN_WITNESSES = 2  # other views that must see a place
+_MAX_WITNESSES = 64  # other views that are considered, spread over all
+_FARTHEST = 10.0  # far over the distance to what the cameras look at, if nothing else is known
 
 
-def with_bounds(capture):
-    """Returns the capture with bounds in every frame, in world units along the camera's axis.
+def with_bounds(capture: Capture) -> Capture:
+    """Returns the Capture with bounds in every frame, in world units along the camera's axis.
 
-    A frame that has some keeps them. Otherwise they come from the points that it shows; or, without, near is
-    where two other cameras begin to see what it sees, and far is the end of the box that the format states.
+    Existing bounds are kept. Otherwise they come from the points that the frame shows. Without points, near is
+    the depth from which two other cameras see what the frame sees, and far is the end of the dataset's box.
     """
     if all(frame.bounds is not None for frame in capture.frames):
         return capture
@@ -29,16 +32,16 @@ def with_bounds(capture):
     return capture._replace(frames=tuple(frames))
 
 
-def given(capture, near, far, to_file):
-    """Returns the capture with near and far in place of its frames' bounds, each where it is not 0.
+def override_bounds(capture: Capture, near: float, far: float, to_file: Float[np.ndarray, "4 4"]) -> Capture:
+    """Returns the Capture with near and far in place of its frames' bounds, each unless it is 0.
 
     Args:
-        capture: Capture with bounds in every frame.
-        near, far: in units of the capture's file, along the axis.
-        to_file: [4, 4] from the capture's world to the file's.
+        capture: with bounds in every frame.
+        near, far: in the file's units, along the axis.
+        to_file: from the Capture's world to the file's.
 
     Raises:
-        ValueError: if a frame's near is not less than its far then.
+        ValueError: if a frame's near is not less than its far.
     """
     unit = np.cbrt(np.linalg.det(np.asarray(to_file)[:3, :3]))
     frames = []
@@ -47,14 +50,14 @@ def given(capture, near, far, to_file):
         if not 0 <= bounds[0] < bounds[1]:
             raise ValueError(
                 f"{capture.source}: {frame.name} has near {bounds[0] * unit:g} and far {bounds[1] * unit:g}, "
-                "wanted near < far; correct data.near and data.far, or set them to 0"
+                "expected near < far; correct data.near and data.far, or set them to 0"
             )
         frames.append(frame._replace(bounds=bounds))
     return capture._replace(frames=tuple(frames))
 
 
-def depths(camera, points):
-    """Returns the distances [N] of points [N, 3] along a camera's axis, > 0 in front."""
+def depths(camera: Camera, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
+    """Returns the distances of points along a camera's axis, positive in front of it."""
     pose = np.asarray(camera.to_world)
     return (pose[:, 3] - points) @ pose[:, 2]
 
@@ -64,23 +67,23 @@ def _of_points(capture, frame):
         return None
     along = depths(frame.camera, capture.points[frame.seen])
     along = along[along > 0]
-    if len(along) < _FEWEST:
+    if len(along) < _MIN_POINTS:
         return None
-    near, far = np.percentile(along, [_STRAYS, 100 - _STRAYS])
+    near, far = np.percentile(along, [_OUTLIERS, 100 - _OUTLIERS])
     return float(near * _MARGIN), float(far / _MARGIN)
 
 
 def _shared_depths(capture, chosen):
-    """Returns (near, far) of each of the chosen views, from the pyramids that the cameras see."""
+    """Returns (near, far) of each of the chosen views, from the intersections of the cameras' frusta."""
     poses = poses_of(capture)
     middle = gaze_center(poses)
     distance = float(np.median(np.linalg.norm(poses[:, :, 3] - middle, axis=-1)))
-    distance = max(distance, 1e-6 * (1 + float(np.abs(poses[:, :, 3]).max())))  # all may stand in one place
-    # Cameras that look away from each other say nothing of how far off it is what they see.
+    distance = max(distance, 1e-6 * (1 + float(np.abs(poses[:, :, 3]).max())))  # all may be in one place
+    # The axes of cameras that look outwards do not bound the distance of what they see.
     inwards = ((poses[:, :, 3] - middle) * poses[:, :, 2]).sum(axis=-1) > 0
     farthest = distance * (_FARTHEST if inwards.mean() > 0.5 else _FARTHEST**3)
     steps = distance * np.geomspace(1e-2, _FARTHEST, 128)
-    others = np.unique(np.linspace(0, len(poses) - 1, _WITNESSES).astype(int))
+    others = np.unique(np.linspace(0, len(poses) - 1, _MAX_WITNESSES).astype(int))
     result = []
     for index in chosen:
         camera = capture.frames[index].camera
@@ -88,7 +91,7 @@ def _shared_depths(capture, chosen):
         places = poses[index, :, 3] + steps[:, None, None] * slopes
         witnesses = others[others != index]
         count = sum(_sees(capture.frames[other].camera, places) for other in witnesses)
-        found = np.flatnonzero((count >= min(_OTHERS, len(witnesses))).any(axis=1)) if len(witnesses) else []
+        found = np.flatnonzero((count >= min(_MIN_WITNESSES, len(witnesses))).any(axis=1)) if len(witnesses) else []
         near = float(steps[found[0]]) if len(found) else 0.1 * distance
         far = farthest
         if capture.box is not None:
@@ -99,7 +102,7 @@ def _shared_depths(capture, chosen):
 
 
 def _slopes(camera, count=5):
-    """Returns directions [M, 3] in the camera's axes through a grid of pixels, that reach depth 1."""
+    """Returns directions [M, 3] in the camera's axes through a grid of pixels; each ends at depth 1."""
     size = 2 * np.asarray(camera.center) if None in (camera.width, camera.height) else None
     width, height = (camera.width, camera.height) if size is None else size
     x, y = np.meshgrid(np.linspace(0, width, count), np.linspace(0, height, count))
@@ -108,7 +111,7 @@ def _slopes(camera, count=5):
 
 
 def _sees(camera, places):
-    """Returns whether places [..., 3] lie in what a camera sees, its lens taken for a pinhole."""
+    """Returns whether points [..., 3] lie in a camera's frustum; distortion is ignored."""
     pose = np.asarray(camera.to_world)
     local = (places - pose[:, 3]) @ pose[:, :3]
     depth = -local[..., 2]

@@ -1,63 +1,79 @@
-"""The world that a capture is trained in: moved, turned and scaled from the file's, and how to get back."""
+"""Normalisation of a dataset's world: a similarity of the file's world, and its inverse."""
 
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnerf.data.geometry.poses import gaze_center, up_of
+from jaxnerf.data.readers.base import Capture
 
 
-def poses_of(capture):
-    """Returns the poses [V, 3, 4] of a capture's frames."""
+def poses_of(capture: Capture) -> Float[np.ndarray, "V 3 4"]:
+    """Returns the poses of a dataset's frames."""
     return np.stack([frame.camera.to_world for frame in capture.frames])
 
 
-def looks_forward(capture, *, cosine=0.85):
-    """Returns whether all cameras of a capture look one way, so that NDC holds what they see.
+def looks_forward(capture: Capture, *, cosine: float = 0.85) -> bool:
+    """Returns whether all cameras of a dataset look in one direction, so that NDC contain what they see.
 
-    cosine: of the widest angle between an axis and their mean. LLFF's grids stay within 20 degrees.
+    Args:
+        capture: any.
+        cosine: of the largest angle between an axis and the mean axis. In LLFF's datasets it is 20 degrees.
     """
     backs = poses_of(capture)[:, :, 2]
     mean = backs.mean(axis=0)
     return len(backs) > 1 and bool((backs @ mean > cosine * np.linalg.norm(mean)).all())
 
 
-def recenter(capture, *, bound_share=0.75):
-    """Returns the capture as the released codes move forward-facing ones, and [4, 4] back to the file.
+def recenter(capture: Capture, *, bound_factor: float = 0.75) -> tuple[Capture, Float[np.ndarray, "4 4"]]:
+    """Moves a forward-facing dataset as the released code of LLFF and NeRF does.
 
-    The mean camera becomes the identity, so that all look roughly along -z, and the nearest bound
-    lies at 1 / bound_share: what normalised device coordinates with a near plane of 1 want.
+    The mean camera becomes the identity, so that all cameras look roughly along -z. The nearest bound becomes
+    1 / bound_factor, as normalised device coordinates with a near plane of 1 require.
+
+    Returns:
+        The Capture, and the similarity that maps its world back to the file's.
+
+    Raises:
+        ValueError: if the nearest bound is not positive.
     """
     poses = poses_of(capture)
     nearest = min(frame.bounds[0] for frame in capture.frames)
     if not nearest > 0:
-        raise ValueError(f"{capture.source}: the nearest bound is {nearest}, wanted more than 0; set data.near")
-    scale = 1 / (nearest * bound_share)
+        raise ValueError(f"{capture.source}: the nearest bound is {nearest}, expected more than 0; set data.near")
+    scale = 1 / (nearest * bound_factor)
     back = _unit(poses[:, :, 2].sum(0))
     right = _unit(np.cross(poses[:, :, 1].sum(0), back))
     turn = np.stack([right, np.cross(back, right), back])
     return _moved(capture, scale, turn, poses[:, :, 3].mean(0))
 
 
-def center(capture):
-    """Returns the capture with what its cameras look at in the middle, and [4, 4] back to the file.
+def center(capture: Capture) -> tuple[Capture, Float[np.ndarray, "4 4"]]:
+    """Moves a dataset so that its cameras look at the origin.
 
-    The point nearest to all axes becomes the origin, what is up becomes z, and the cameras' median distance
-    becomes 1. A world that is upright already is not turned.
+    The point closest to all cameras' axes becomes the origin, up becomes z, and the cameras' median distance
+    becomes 1. The rotation is the smallest that takes up to z.
+
+    Returns:
+        The Capture, and the similarity that maps its world back to the file's.
+
+    Raises:
+        ValueError: if all cameras stand at the point that they look at.
     """
     poses = poses_of(capture)
     middle = gaze_center(poses)
     distance = np.median(np.linalg.norm(poses[:, :, 3] - middle, axis=-1))
     if not distance > 0:
         raise ValueError(
-            f"{capture.source}: all {len(poses)} cameras stand where they look at ({middle.round(3).tolist()}"
-            "), wanted different places; correct the poses"
+            f"{capture.source}: all {len(poses)} cameras are at the point that they look at "
+            f"({middle.round(3).tolist()}), expected different positions; correct the poses"
         )
     return _moved(capture, 1 / distance, _turn_upright(up_of(poses)), middle)
 
 
 def _turn_upright(up):
-    """Returns the rotation [3, 3] by the smallest angle that takes a direction to z."""
+    """Returns the rotation [3, 3] by the smallest angle that maps a direction to z."""
     z = np.array([0.0, 0.0, 1.0])
     if up[2] < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
@@ -68,7 +84,7 @@ def _turn_upright(up):
 
 
 def _moved(capture, scale, turn, origin):
-    """Returns the capture with x -> scale turn (x - origin), and the inverse of that as [4, 4]."""
+    """Returns the Capture after x -> scale turn (x - origin), and the inverse of that as [4, 4]."""
     frames = []
     for frame in capture.frames:
         pose = np.asarray(frame.camera.to_world)

@@ -1,101 +1,107 @@
-"""Smaller copies of photographs, in folders images_N as tools leave them, and which factor fits."""
+"""Downscaled copies of a dataset's images, in the folders images_N that tools write, and factors that fit them."""
 
 import dataclasses
 import math
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from jaxnerf.data.images.image_files import image_size
+from jaxnerf.data.readers.base import Capture, Frame
 
-IMAGES = (".png", ".jpg", ".jpeg", ".webp")
-
-
-def image_files(folder):
-    """Returns the images in a folder, by name."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGES)
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
-def smaller_folders(folder):
-    """Returns N -> path of the folders images_N in a scene's folder."""
+def list_images(folder: Path) -> list[Path]:
+    """Returns the image files of a folder, sorted by name."""
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def downscaled_folders(folder: Path) -> dict[int, Path]:
+    """Returns {N: path} of the folders images_N in a dataset's folder."""
     found = {path.name.removeprefix("images_"): path for path in folder.glob("images_*") if path.is_dir()}
     return {int(number): path for number, path in found.items() if number.isascii() and number.isdigit()}
 
 
-def choose_copies(frames, factor):
-    """Returns the frames, with the smallest images that a factor allows, and what is left of the factor.
+def choose_copies(frames: Sequence[Frame], factor: int) -> tuple[tuple[Frame, ...], int]:
+    """Replaces the images of frames by the smallest copies that a factor allows.
 
-    Their cameras have sizes then. How many times smaller a folder's images are is taken from the images.
+    The scale of a folder is measured on its images; its name is not trusted.
+
+    Returns:
+        The frames, whose cameras all have a height and width; and the factor that remains to be applied.
 
     Raises:
-        ValueError: if the factor is none that the folders can give.
+        ValueError: if the factor is a multiple of no folder's scale.
     """
     frames = tuple(with_size(frame) for frame in frames)
-    there = _copies(frames)
-    fitting = [times for times in there if factor % times == 0]
+    copies = _copies(frames)
+    fitting = [times for times in copies if factor % times == 0]
     if not fitting:
-        found = ", ".join(str(times) for times in sorted(there))
+        found = ", ".join(str(times) for times in sorted(copies))
         raise ValueError(
             f"{frames[0].image.parent.parent}: has images that are {found} times smaller than their cameras, "
-            f"data.factor is {factor}; wanted a multiple of one of these"
+            f"data.factor is {factor}, expected a multiple of one of these; correct data.factor"
         )
     times = max(fitting)
-    chosen = [frame._replace(image=there[times].get(frame.image, frame.image)) for frame in frames]
+    chosen = [frame._replace(image=copies[times].get(frame.image, frame.image)) for frame in frames]
     return tuple(chosen), factor // times
 
 
-def factor_for(capture, width):
-    """Returns the factor that brings a capture's photographs nearest to a width [px], and their own."""
+def factor_for(capture: Capture, width: int) -> tuple[int, int]:
+    """Returns the factor that brings a dataset's images closest to a width [px], and their full width [px]."""
     frames = [with_size(frame) for frame in capture.frames]
     full = max(frame.camera.width for frame in frames)
     if width < 1:
-        raise ValueError(f"data.width is {width}, wanted at least 1 px; or set data.factor")
+        raise ValueError(f"data.width is {width}, expected at least 1 px; correct it, or set data.factor")
     factors = np.arange(1, max(math.ceil(2 * full / width), 2) + 1)
-    if capture.format == "blender":  # whose reader cuts nothing off
+    if capture.format == "blender":  # the Blender reader does not crop, so the factor divides the size
         common = math.gcd(*(side for frame in frames for side in (frame.camera.height, frame.camera.width)))
         valid = factors[common % factors == 0]
     else:
-        smallest = min(_copies(frames))
-        valid = np.unique([factors // times * times for times in _copies(frames)])
-        valid = valid[valid >= smallest] if (valid >= smallest).any() else np.array([smallest])
+        scales = list(_copies(frames))
+        valid = np.unique([factors // times * times for times in scales])
+        valid = valid[valid >= min(scales)] if (valid >= min(scales)).any() else np.array([min(scales)])
     return int(valid[np.argmin(np.abs(np.log(valid * width / full)))]), full
 
 
-def with_size(frame):
-    """Returns the frame with a height and width in its camera: those of its image where it states none."""
+def with_size(frame: Frame) -> Frame:
+    """Returns the frame with a height and width in its camera: the image's if the format states none."""
     if None not in (frame.camera.height, frame.camera.width):
         return frame
-    width, height = image_size(frame.image, turn=frame.turned)
+    width, height = image_size(frame.image, follow_exif=frame.follow_exif)
     return frame._replace(camera=dataclasses.replace(frame.camera, height=height, width=width))
 
 
 def _copies(frames):
-    """Returns {how many times smaller than their cameras: {image: its copy}} of what lies there."""
+    """Returns {scale: {image: its copy}}; a scale is how many times smaller than the cameras the copies are."""
     first = frames[0]
-    there = {_times(first, first.image): {}}
+    copies = {_scale(first, first.image): {}}
     parent = first.image.parent
     if len({frame.image.parent for frame in frames}) > 1 or not parent.name.startswith("images"):
-        return there
-    for folder in (parent.parent / "images", *smaller_folders(parent.parent).values()):
-        pairs = _paired([frame.image for frame in frames], folder) if folder != parent else None
+        return copies
+    for folder in (parent.parent / "images", *downscaled_folders(parent.parent).values()):
+        pairs = _pair([frame.image for frame in frames], folder) if folder != parent else None
         if pairs:
-            there.setdefault(_times(first, pairs[first.image]), pairs)
-    return there
+            copies.setdefault(_scale(first, pairs[first.image]), pairs)
+    return copies
 
 
-def _paired(images, folder):
-    """Returns {image: the file of a folder that shows the same}, None where that is not certain."""
-    files = image_files(folder)
-    named = {path.stem: path for path in files}
-    if all(image.stem in named for image in images):
-        return {image: named[image.stem] for image in images}
-    # Tools that rename what they shrink keep the order; with some names alike it is another set of images.
-    before = image_files(images[0].parent)
-    alike = {path.stem for path in before} & set(named)
-    if len(before) != len(files) or alike or not set(images) <= set(before):
+def _pair(images, folder):
+    """Returns {image: its copy in a folder}, or None if the assignment is ambiguous."""
+    files = list_images(folder)
+    by_name = {path.stem: path for path in files}
+    if all(image.stem in by_name for image in images):
+        return {image: by_name[image.stem] for image in images}
+    # Tools that rename the copies keep their order. If some names agree, the folder holds other images.
+    originals = list_images(images[0].parent)
+    common = {path.stem for path in originals} & set(by_name)
+    if len(originals) != len(files) or common or not set(images) <= set(originals):
         return None
-    return dict(zip(before, files, strict=True))
+    return dict(zip(originals, files, strict=True))
 
 
-def _times(frame, path):
-    """Returns how many times smaller than its frame's camera an image is, however it is turned."""
+def _scale(frame, path):
+    """Returns how many times smaller than its frame's camera an image is, in either orientation."""
     return max(round(max(frame.camera.height, frame.camera.width) / max(image_size(path))), 1)

@@ -1,15 +1,18 @@
-"""Photographs as arrays: reading a file, shrinking by whole factors, straight alpha.
+"""Image files as arrays: decoding, shrinking by whole factors, straight alpha. numpy on the host.
 
-Straight alpha keeps the colour of a half covered pixel as if it were fully covered; premultiplied colour
-is already scaled by its alpha, which is what averages and composites correctly. Files and Views are
-straight, arithmetic is premultiplied. Everything here is numpy on the host.
+With straight alpha the colour of a partly covered pixel is that of full coverage. Premultiplied colour is
+multiplied by alpha, which is what averages and composites correctly. Files and Views hold straight alpha; sums
+are taken of premultiplied colour.
 """
 
+import os
+
 import numpy as np
+from jaxtyping import Bool, Float, UInt, UInt16
 from PIL import Image
 
 _ORIENTATION = 0x0112  # the EXIF tag
-_UPRIGHT = {  # its values, and what undoes each
+_UPRIGHT = {  # value of the tag -> function that makes the image upright
     2: np.fliplr,
     3: lambda pixels: np.rot90(pixels, 2),
     4: np.flipud,
@@ -20,64 +23,68 @@ _UPRIGHT = {  # its values, and what undoes each
 }
 
 
-def read_image(path, *, stored=None, turn=True):
-    """Returns the pixels of an image file, upright, at the precision that the file has.
+def read_image(
+    path: str | os.PathLike, *, camera_size: tuple | None = None, follow_exif: bool = True
+) -> UInt[np.ndarray, "H W C"]:
+    """Reads the pixels of an image file, upright, with the file's precision.
 
     Args:
-        path: an 8 or 16 bit PNG, or an 8 bit file of another kind that Pillow reads.
-        stored: (height, width) of the pixels as the cameras count them, or a multiple. Where they are stored
-            like that, an EXIF orientation that would turn them is not followed.
-        turn: whether EXIF orientation is followed at all.
+        path: an 8 or 16 bit PNG, or an 8 bit file of another format that Pillow reads.
+        camera_size: (height, width) that the camera's intrinsics refer to, or a multiple of the image's size.
+            If only the stored, unrotated pixels fit it, the EXIF orientation is ignored.
+        follow_exif: whether EXIF orientation is followed at all.
 
     Returns:
-        [H, W, 3] opaque or [H, W, 4] with straight alpha, uint8 or uint16. Grey becomes three equal
-        channels, a palette or a transparent colour key is resolved.
+        [H, W, 3] opaque or [H, W, 4] with straight alpha, uint8 or uint16. Grey becomes three equal channels;
+        a palette and a transparent colour key are resolved.
 
     Raises:
-        ValueError: if the file is missing, no image, or cut short.
+        ValueError: if the file is missing, truncated or not an image.
     """
     pixels, value = _open(path, lambda image: (_decode(path, image), _orientation(image)))
-    if not (turn and _turns(pixels.shape[:2], value, stored)):
+    if not (follow_exif and _is_rotated(pixels.shape[:2], value, camera_size)):
         return pixels
     return np.ascontiguousarray(_UPRIGHT[value](pixels))
 
 
-def image_form(path, *, stored=None, turn=True):
-    """Returns the shape (H, W, C) and the dtype of what read_image gives, from the file's first bytes."""
+def image_form(
+    path: str | os.PathLike, *, camera_size: tuple | None = None, follow_exif: bool = True
+) -> tuple[tuple[int, int, int], np.dtype]:
+    """Returns the shape (H, W, C) and the dtype of the result of `read_image`, from the file's first bytes."""
     (width, height), channels, dtype, value = _open(
         path, lambda image: (image.size, *_depth(image), _orientation(image))
     )
-    if turn and value >= 5 and _turns((height, width), value, stored):
+    if follow_exif and value >= 5 and _is_rotated((height, width), value, camera_size):
         height, width = width, height
     return (height, width, channels), dtype
 
 
-def _turns(size, value, stored):
-    """Returns whether an EXIF orientation of an image [H, W] is followed."""
+def _is_rotated(size, value, camera_size):
+    """Returns whether the EXIF orientation of an image [H, W] is followed."""
     upright = size[::-1] if value >= 5 else size
-    return value in _UPRIGHT and not (stored and fits(size, stored) and not fits(upright, stored))
+    return value in _UPRIGHT and not (camera_size and fits(size, camera_size) and not fits(upright, camera_size))
 
 
-def fits(found, declared):
-    """Returns whether (height, width) is what is declared, or all of that a whole number of times smaller."""
+def fits(found: tuple, declared: tuple) -> bool:
+    """Returns whether (height, width) is the declared one, or smaller than all of it by a whole factor."""
     times = max(round(declared[0] / found[0]), 1)
-    return all(abs(want / times - have) < 1 for want, have in zip(declared, found, strict=True))
+    return all(abs(full / times - have) < 1 for full, have in zip(declared, found, strict=True))
 
 
-def read_mask(path, *, stored=None):
-    """Returns [H, W] bool of a grey image file: whether a pixel is at least half bright; see read_image."""
-    pixels = read_image(path, stored=stored)
+def read_mask(path: str | os.PathLike, *, camera_size: tuple | None = None) -> Bool[np.ndarray, "H W"]:
+    """Reads a grey image as a mask: True where a pixel is at least half bright. See `read_image`."""
+    pixels = read_image(path, camera_size=camera_size)
     return pixels[..., 0] > np.iinfo(pixels.dtype).max // 2
 
 
-def image_size(path, *, turn=True):
-    """Returns the (width, height) in px of an image file from its first bytes; see read_image."""
+def image_size(path: str | os.PathLike, *, follow_exif: bool = True) -> tuple[int, int]:
+    """Returns the (width, height) in px of an image file from its first bytes; see `read_image`."""
     size, value = _open(path, lambda image: (image.size, _orientation(image)))
-    return size[::-1] if turn and value >= 5 else size
+    return size[::-1] if follow_exif and value >= 5 else size
 
 
-def has_alpha(path):
-    """Returns whether read_image gives an image file four channels."""
+def has_alpha(path: str | os.PathLike) -> bool:
+    """Returns whether `read_image` returns four channels for an image file."""
     return _open(path, lambda image: image.has_transparency_data)
 
 
@@ -86,11 +93,11 @@ def _open(path, use):
         with Image.open(path) as image:
             return use(image)
     except FileNotFoundError:
-        raise ValueError(f"{path}: no such file, wanted an image; copy it or correct the name") from None
-    except Exception as error:  # a damaged file makes Pillow's decoders raise almost anything
+        raise ValueError(f"{path}: no such file, expected an image; copy it or correct the name") from None
+    except Exception as error:  # Pillow's decoders raise almost any exception on a damaged file
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(
-            f"{path}: unreadable ({reason}), wanted a whole image file; copy or render it again"
+            f"{path}: unreadable ({reason}), expected a complete image file; copy or render it again"
         ) from error
 
 
@@ -104,7 +111,7 @@ def _raw(image):
 
 
 def _depth(image):
-    """Returns the channels and the dtype of what _decode gives."""
+    """Returns the number of channels and the dtype of _decode's result."""
     raw = _raw(image)
     if raw in ("RGB;16B", "RGBA;16B"):
         return (4 if raw.startswith("RGBA") else 3), np.dtype(np.uint16)
@@ -116,8 +123,8 @@ def _depth(image):
 def _decode(path, image):
     raw = _raw(image)
     if raw in ("RGB;16B", "RGBA;16B"):
-        # Pillow keeps only the first byte of each 16 bit value. Naming the byte order the other way
-        # round makes it keep the second, so two passes give all sixteen bits.
+        # Pillow keeps only the first byte of each 16 bit value. With the opposite byte order it keeps the second,
+        # so two passes give all sixteen bits.
         high, low = np.asarray(image), _second_bytes(path, raw)
         return high.astype(np.uint16) * 256 + low
     if image.mode == "I;16":
@@ -132,44 +139,46 @@ def _second_bytes(path, raw):
         return np.asarray(image)
 
 
-def average_blocks(pixels, factor, *, background=None):
-    """Returns the image shrunk by area: each new pixel is the mean of factor x factor old ones.
+def average_tiles(
+    pixels: UInt[np.ndarray, "H W C"], factor: int, *, background: tuple | None = None
+) -> UInt16[np.ndarray, "h w C"]:
+    """Shrinks an image by area: each new pixel is the mean of factor x factor old ones.
 
-    The mean is taken of premultiplied colour, summed in whole numbers and so without rounding; a transparent
-    pixel's colour, which nobody sees, does not bleed into the edge of an object.
+    The mean is taken of premultiplied colour, summed in integers and therefore without rounding. The invisible
+    colour of transparent pixels does not bleed into the edge of an object.
 
     Args:
         pixels: [H, W, 3] or [H, W, 4] with straight alpha, uint8 or uint16.
-        factor: whole number >= 1 that divides H and W.
-        background: see `to_straight`; without alpha it plays no part.
+        factor: a divisor of H and W.
+        background: see `to_straight`; it has no effect without alpha.
 
     Returns:
-        [H / factor, W / factor, 3 or 4] uint16, straight again, rounded to nearest.
+        [H / factor, W / factor, 3 or 4] with straight alpha, rounded to nearest.
 
     Raises:
-        ValueError: if factor does not divide the size; the message lists those that do.
+        ValueError: if factor does not divide the size; the message lists the divisors.
     """
     height, width, channels = pixels.shape
     if height % factor or width % factor:
         common = np.gcd(height, width)
         works = ", ".join(str(k) for k in range(1, common + 1) if common % k == 0)
         raise ValueError(
-            f"factor {factor} does not divide {width} x {height}, wanted one that does; take one of {works}"
+            f"factor {factor} does not divide {width} x {height}, expected a divisor; choose one of {works}"
         )
-    # One channel after the other, each side by side in memory: much faster than all at once.
+    # Contiguous channels, one after the other, are much faster than interleaved ones.
     planes = np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
     largest = np.iinfo(pixels.dtype).max
     if channels == 3:
-        mean = np.stack([_sum_blocks(plane, factor) for plane in planes], axis=-1) / (largest * factor**2)
+        mean = np.stack([_sum_tiles(plane, factor) for plane in planes], axis=-1) / (largest * factor**2)
         return np.rint(mean * 65535).astype(np.uint16)
     alpha = planes[3].astype(np.uint16 if pixels.dtype == np.uint8 else np.uint32)  # holds largest^2
-    colour = np.stack([_sum_blocks(plane * alpha, factor) for plane in planes[:3]], axis=-1)
-    cover = _sum_blocks(alpha, factor) / (largest * factor**2)
+    colour = np.stack([_sum_tiles(plane * alpha, factor) for plane in planes[:3]], axis=-1)
+    cover = _sum_tiles(alpha, factor) / (largest * factor**2)
     return to_straight(colour / (float(largest) ** 2 * factor**2), cover, background=background)
 
 
-def _sum_blocks(plane, factor):
-    """Returns the sums [H / factor, W / factor] uint64 of an image's [H, W] blocks."""
+def _sum_tiles(plane, factor):
+    """Returns the sum [H / factor, W / factor] uint64 of each block of a channel [H, W]."""
     height, width = plane.shape
     rows = plane.reshape(height // factor, factor, width)
     total = rows[:, 0].astype(np.uint64 if plane.dtype == np.uint32 else np.uint32)
@@ -178,20 +187,25 @@ def _sum_blocks(plane, factor):
     return total.reshape(height // factor, width // factor, factor).sum(axis=2, dtype=np.uint64)
 
 
-def to_straight(premultiplied, alpha, *, background=None):
-    """Returns premultiplied colour and alpha as 16 bit straight RGBA.
+def to_straight(
+    premultiplied: Float[np.ndarray, "*pixels 3"],
+    alpha: Float[np.ndarray, "*pixels"],
+    *,
+    background: tuple | None = None,
+) -> UInt16[np.ndarray, "*pixels 4"]:
+    """Converts premultiplied colour and alpha to 16 bit straight RGBA.
 
-    Two roundings meet when the result is composited: alpha's and the colour's. Colour is rounded last and,
-    where the background is known, makes up for what rounding alpha changed, which halves the error.
+    Compositing the result adds two rounding errors, that of alpha and that of the colour. The colour is rounded
+    last and, if the background is known, compensates the error of alpha, which halves the total error.
 
     Args:
-        premultiplied: [..., 3] colour times alpha, in [0, alpha].
-        alpha: [...] in [0, 1].
-        background: 3 values in [0, 1] over which compositing is to be right to 0.5 / 65535 = 7.7e-6, or None
-            for right to twice that over any colour.
+        premultiplied: colour times alpha, in [0, alpha].
+        alpha: in [0, 1].
+        background: 3 values in [0, 1]; compositing over this colour is correct to 0.5 / 65535 = 7.7e-6. None:
+            compositing over any colour is correct to twice that.
 
     Returns:
-        [..., 4] uint16. Colour is 0 where alpha rounds to 0.
+        Straight RGBA. Colour is 0 where alpha rounds to 0.
     """
     alpha = np.asarray(alpha, np.float64)
     rounded = np.rint(np.clip(alpha, 0, 1) * 65535) / 65535

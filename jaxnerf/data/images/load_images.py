@@ -1,31 +1,37 @@
-"""From the photographs of a Capture to Views: reading, shrinking, masks, lenses, who is held out."""
+"""Views of a Capture: splits, decoding, shrinking, masks, and cameras of several lenses."""
 
+import dataclasses
 import functools
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxnerf.core.types import Camera, Views
-from jaxnerf.data.images.decode import form_of, read_masks, read_pixels, scaled_camera
 from jaxnerf.data.images.downscaled_copies import choose_copies
-from jaxnerf.data.images.pixel_cache import workers
+from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_image, read_mask
+from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers
+from jaxnerf.data.readers.base import Capture
 from jaxnerf.data.readers.validation import check_background, check_factor
 
-_LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # coefficients
+_LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # number of coefficients
 
 
-def split_indices(capture, split, *, hold=8):
-    """Returns the indices [N] of a split's frames.
+def split_indices(capture: Capture, split: str, *, hold: int = 8) -> Int[np.ndarray, " N"]:
+    """Returns the indices of a split's frames.
 
-    The capture's own splits count where it has some; training has all the others where it is not named, and
-    so has the test where only training is. Otherwise every hold-th by name, from the first, is held out as
-    "test"; "val" is the same, and so it is where a capture has only one of the two.
+    If the dataset defines splits, they are used. Frames in none of them form the split "train" or "test" if
+    that one is not defined. Of "val" and "test", one stands for the other if only one is defined. If the
+    dataset defines no splits, every hold-th frame by name, from the first, is in "test", which equals "val".
 
     Raises:
-        ValueError: if there is no such split, or nothing in it.
+        ValueError: if the split is unknown or empty.
     """
     if split not in ("train", "val", "test"):
-        raise ValueError(f"{capture.source}: split is {split!r}, wanted 'train', 'val' or 'test'; give one")
+        raise ValueError(f"{capture.source}: split is {split!r}, expected 'train', 'val' or 'test'; choose one")
     if capture.splits:
         other = {"val": "test", "test": "val"}.get(split, split)
         rest = np.setdiff1d(np.arange(len(capture.frames)), sum(capture.splits.values(), ()))
@@ -38,40 +44,50 @@ def split_indices(capture, split, *, hold=8):
     return chosen
 
 
-def load_views(capture, *, split="train", factor=1, hold=8, background=None, only=None):
-    """Returns one split of a capture, with all its pixels, see fill_pixels.
+def load_capture(
+    capture: Capture,
+    *,
+    split: str = "train",
+    factor: int = 1,
+    hold: int = 8,
+    background: Sequence[float] | None = None,
+    select: Callable[[int], Iterable[int]] | None = None,
+) -> Views:
+    """Reads one split of a Capture with all its pixels, see `fill_pixels`.
+
+    Images of 8 and 16 bits, or with and without alpha, may be mixed: all become 16 bit, or get alpha. The
+    cameras have a height and width if all images have one size, otherwise None.
 
     Args:
-        capture: Capture, with bounds in every frame.
-        split, hold: see split_indices.
-        factor: whole number; images are averaged down by it, cut at the right and below where it does not
-            divide them. A folder images_N beside, with an N that divides it, is used where there is one.
-        background: red, green, blue in [0, 1] behind images with alpha. None drops alpha.
-        only: how many frames the split has -> the indices of those to read; None: all.
+        capture: with bounds in every frame.
+        split, hold: see `split_indices`.
+        factor: images are area-averaged down by this integer. Rows at the bottom and columns at the right that
+            do not fill a block are cropped. If there is a folder images_N whose N divides the factor, its
+            images are used.
+        background: red, green, blue in [0, 1] behind images with alpha; None drops alpha.
+        select: maps the number of the split's frames to the indices of those to read; None: all.
 
     Returns:
-        Views in the order of the names; near and far are the frames' bounds. With images of 8 bits and of
-        16, or with alpha and without, all become those with more. One size gives the cameras a height and
-        width, several leave them None.
+        Views in the order of the frames; near and far are the frames' bounds.
 
     Raises:
-        ValueError: names the file, what was found, what was wanted and what to do.
+        ValueError: names the file, what was found, what is expected and what to do.
     """
     factor, background = check_factor(factor), check_background(background)
     frames, shrink = choose_copies(capture.frames, factor)
     chosen = [frames[index] for index in split_indices(capture, split, hold=hold)]
-    chosen = chosen if only is None else [chosen[index] for index in only(len(chosen))]
-    with ThreadPoolExecutor(workers()) as pool:
-        forms = list(pool.map(functools.partial(form_of, shrink=shrink, background=background), chosen))
+    chosen = chosen if select is None else [chosen[index] for index in select(len(chosen))]
+    with ThreadPoolExecutor(num_workers()) as pool:
+        forms = list(pool.map(functools.partial(_form, shrink=shrink, background=background), chosen))
     sizes = np.array([form.size for form in forms])
     ends = np.cumsum(sizes.prod(axis=1))
     if ends[-1] >= 2**31:  # offsets and pixel ids are int32
-        raise ValueError(f"{capture.source}: has {ends[-1]} pixels, wanted less than 2^31; raise factor")
+        raise ValueError(f"{capture.source}: has {ends[-1]} pixels, expected fewer than 2^31; raise data.factor")
     offset = np.append(0, ends[:-1]).astype(np.int32)
-    pixels = read_pixels(chosen, forms, offset, shrink, background)
-    masks = read_masks(chosen, forms, shrink)
+    pixels = _read_pixels(chosen, forms, offset, shrink, background)
+    masks = _read_masks(chosen, forms, shrink)
     bounds = np.float32([frame.bounds for frame in chosen])
-    cameras = [scaled_camera(frame, form, shrink) for frame, form in zip(chosen, forms, strict=True)]
+    cameras = [_scaled_camera(frame, form, shrink) for frame, form in zip(chosen, forms, strict=True)]
     return Views(
         pixels=pixels,
         offset=offset,
@@ -85,13 +101,19 @@ def load_views(capture, *, split="train", factor=1, hold=8, background=None, onl
     )
 
 
-def stack_cameras(cameras, names):
-    """Returns one Camera [V] in float32 of several; ValueError if no one lens model holds all of them."""
+def stack_cameras(cameras: Sequence[Camera], names: Sequence[str]) -> Camera:
+    """Stacks cameras into one Camera [V] in float32.
+
+    A pinhole becomes an "opencv" lens without distortion if others have one.
+
+    Raises:
+        ValueError: if fisheye lenses are mixed with others.
+    """
     lenses = {camera.lens for camera in cameras}
     lens = max(lenses, key=list(_LENSES).index)
     if lens == "fisheye" and len(lenses) > 1:
         kinds = ", ".join(f"{name} {camera.lens}" for name, camera in zip(names[:9], cameras, strict=False))
-        raise ValueError(f"the images mix lenses ({kinds}), wanted fisheye alone or none; undistort them")
+        raise ValueError(f"the images mix lenses ({kinds}), expected only fisheye or none; undistort them")
     distortion = None
     if lens != "pinhole":
         distortion = np.zeros((len(cameras), _LENSES[lens]), np.float32)
@@ -104,3 +126,120 @@ def stack_cameras(cameras, names):
         name: np.float32([getattr(camera, name) for camera in cameras]) for name in ("to_world", "focal", "center")
     }
     return Camera(**numbers, distortion=distortion, lens=lens, height=height, width=width)
+
+
+def check_size(path: Path, found: tuple[int, int], declared: tuple[int, int]) -> None:
+    """Checks that an image (height, width) has its camera's size, or is smaller by a whole factor.
+
+    Raises:
+        ValueError: names the image and both sizes.
+    """
+    if not fits(found, declared):
+        raise ValueError(
+            f"{path}: is {found[1]} x {found[0]}, its camera is for {declared[1]} x {declared[0]}; expected "
+            "that size divided by a whole number; copy the original or correct the camera"
+        )
+
+
+class _Form(NamedTuple):
+    """The size and type that a frame's image will have, known from the file's first bytes.
+
+    Attributes:
+        full: (height, width) px of the file, upright.
+        size: (height, width) px after shrinking.
+        channels: 3 or 4.
+        dtype: uint8 or uint16.
+    """
+
+    full: tuple[int, int]
+    size: tuple[int, int]
+    channels: int
+    dtype: np.dtype
+
+
+def _form(frame, shrink, background):
+    """Returns the _Form of a frame; ValueError if the image does not fit its camera."""
+    declared = frame.camera.height, frame.camera.width
+    (height, width, channels), dtype = image_form(frame.image, camera_size=declared, follow_exif=frame.follow_exif)
+    check_size(frame.image, (height, width), declared)
+    if background is None:
+        channels = 3
+    if shrink == 1:
+        return _Form((height, width), (height, width), channels, dtype)
+    if not height // shrink or not width // shrink:
+        raise ValueError(f"{frame.image}: is {width} x {height}, too small for factor {shrink}; lower data.factor")
+    return _Form((height, width), (height // shrink, width // shrink), channels, np.dtype(np.uint16))
+
+
+def _scaled_camera(frame, form, shrink):
+    """Returns the frame's camera for the shrunk image."""
+    camera = frame.camera
+    scale = np.array(form.full[::-1]) / (camera.width, camera.height) / shrink
+    height, width = form.size
+    return dataclasses.replace(
+        camera, focal=camera.focal * scale, center=camera.center * scale, height=height, width=width
+    )
+
+
+def _read_pixels(frames, forms, offset, shrink, background):
+    """Returns the pixels [P, C] of all frames, with the largest of their types and numbers of channels."""
+    channels = max(form.channels for form in forms)
+    dtype = max((form.dtype for form in forms), key=lambda dtype: dtype.itemsize)
+    pairs = list(zip(frames, forms, strict=True))
+    return fill_pixels(
+        [frame.image for frame in frames],
+        [functools.partial(_read, frame, form, shrink, background, channels, dtype) for frame, form in pairs],
+        shape=(sum(form.size[0] * form.size[1] for form in forms), channels),
+        dtype=dtype,
+        offsets=offset,
+        depends=("images", shrink, background, [(frame.follow_exif, form) for frame, form in pairs]),
+    )
+
+
+def _read(frame, form, shrink, background, channels, dtype):
+    """Returns the pixels [H, W, channels] of a frame."""
+    camera = frame.camera
+    pixels = read_image(frame.image, camera_size=(camera.height, camera.width), follow_exif=frame.follow_exif)
+    if background is None:
+        pixels = pixels[..., :3]
+    if shrink > 1:
+        height, width = (side * shrink for side in form.size)
+        pixels = average_tiles(pixels[:height, :width], shrink, background=background)
+    if pixels.dtype != dtype:
+        pixels = pixels.astype(dtype) * dtype.type(257)
+    if pixels.shape[-1] == channels:
+        return pixels
+    opaque = np.full((*pixels.shape[:2], 1), np.iinfo(dtype).max, dtype)
+    return np.concatenate([pixels, opaque], axis=-1)
+
+
+def _read_masks(frames, forms, shrink):
+    """Returns the mask [P] of all frames, or None if no frame has one."""
+    if all(frame.mask is None for frame in frames):
+        return None
+
+    def read(frame, form):
+        if frame.mask is None:
+            return np.ones(form.size, bool)
+        mask = _read_mask(frame, form.full)
+        return mask if shrink == 1 else _all_in_tiles(mask, *form.size, shrink)
+
+    with ThreadPoolExecutor(num_workers()) as pool:
+        return np.concatenate([mask.reshape(-1) for mask in pool.map(read, frames, forms)])
+
+
+def _read_mask(frame, full):
+    """Returns the mask [H, W] of a frame at its image's size; a mask of the original's size is shrunk."""
+    mask = read_mask(frame.mask, camera_size=full)
+    times = max(round(mask.shape[0] / full[0]), 1)
+    if not fits(full, mask.shape) or any(times * have > side for have, side in zip(full, mask.shape, strict=True)):
+        raise ValueError(
+            f"{frame.mask}: is {mask.shape[1]} x {mask.shape[0]}, expected {full[1]} x {full[0]} as "
+            f"{frame.image.name}; export the mask again"
+        )
+    return _all_in_tiles(mask, *full, times)
+
+
+def _all_in_tiles(mask, height, width, times):
+    """Returns [height, width] bool: whether all pixels of a block of the mask are True."""
+    return mask[: height * times, : width * times].reshape(height, times, width, times).all((1, 3))

@@ -1,53 +1,77 @@
-"""What a reader of a format finds in a folder: posed photographs, not yet opened, in the file's own world."""
+"""The result of every reader: posed images in the world of the dataset's files, not yet decoded."""
 
-import hashlib
+import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera
 from jaxnerf.registry import READERS
+from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
 
 class Frame(NamedTuple):
-    """One photograph and its camera."""
+    """One image and its camera.
 
-    name: str  # of the file below its folder of images, without extension, with / between folders
-    image: Path  # exists
-    camera: Camera  # float64; height and width are what the format states for the photograph, or None
-    mask: Path | None = None  # exists; grey, where 0 the photograph is to be ignored
-    turned: bool = True  # whether EXIF orientation is followed: COLMAP counts pixels as they are stored
-    bounds: tuple[float, float] | None = None  # nearest and farthest matter, world units along the axis
-    seen: Any = None  # [M] indices of the Capture's points that this photograph shows; None: not known
-    seen_at: Any = None  # [M, 2] px where
+    Attributes:
+        name: the image's path below the folder of images, without extension, with / between folders.
+        image: an existing file.
+        camera: float64. Height and width are those that the format states for the image, or None.
+        mask: an existing grey image; pixels are ignored where it is 0. None: no pixel is ignored.
+        follow_exif: whether EXIF orientation is applied. COLMAP's pixel coordinates, for example, refer to the
+            pixels as they are stored.
+        bounds: nearest and farthest matter along the camera's axis, world units; None: not known.
+        seen: [M] indices into the Capture's points that this image shows; None: not known.
+        seen_at: [M, 2] px, where it shows them.
+    """
+
+    name: str
+    image: Path
+    camera: Camera
+    mask: Path | None = None
+    follow_exif: bool = True
+    bounds: tuple[float, float] | None = None
+    seen: Int[np.ndarray, " M"] | None = None
+    seen_at: Float[np.ndarray, "M 2"] | None = None
 
 
 class Capture(NamedTuple):
-    """The photographs of a folder, in the order of their names."""
+    """The images of a dataset, sorted by name.
 
-    format: str  # "colmap", "llff", "transforms" or "blender"
-    source: Path  # the file or folder that the cameras were read from
+    Attributes:
+        format: the name under which the reader is registered.
+        source: the file or folder that the cameras were read from.
+        frames: all images.
+        splits: indices into frames by the name of the split; None: the dataset defines none.
+        points: [N, 3] float64, points on surfaces, world units; None: not known.
+        box: (lower [3], upper [3]), outside which the format states that there is no matter; None: not known.
+        notes: one line for each part of the dataset that was skipped, with the reason.
+    """
+
+    format: str
+    source: Path
     frames: tuple[Frame, ...]
-    splits: dict[str, tuple[int, ...]] | None = None  # by name, indices of frames; None: the file has none
-    points: np.ndarray | None = None  # [N, 3] float64, matter on surfaces; None: not known
-    box: tuple | None = None  # (lower [3], upper [3]) outside which the format says there is nothing
-    notes: tuple[str, ...] = ()  # a line each: what was left out of the folder, and why
+    splits: dict[str, tuple[int, ...]] | None = None
+    points: Float[np.ndarray, "N 3"] | None = None
+    box: tuple[np.ndarray, np.ndarray] | None = None
+    notes: tuple[str, ...] = ()
 
 
-def fingerprint(capture):
-    """Returns a line that is the same as long as a Capture's photographs, cameras and splits are the same."""
-    digest = hashlib.sha256(repr(capture.splits).encode())
+def fingerprint(capture: Capture) -> str:
+    """Returns a line that changes whenever the names, cameras or splits of a Capture's images change."""
+    parts = [repr(capture.splits)]
     for frame in capture.frames:
         camera = frame.camera
-        digest.update(repr((frame.name, camera.lens, camera.height, camera.width)).encode())
-        for array in (camera.to_world, camera.focal, camera.center, camera.distortion):
-            digest.update(b"" if array is None else np.float32(array).tobytes())
-    return f"{len(capture.frames)} photographs, {digest.hexdigest()[:8]}"
+        parts.append(repr((frame.name, camera.lens, camera.height, camera.width)))
+        arrays = (camera.to_world, camera.focal, camera.center, camera.distortion)
+        parts += [np.float32(array) for array in arrays if array is not None]
+    return f"{len(capture.frames)} images, {content_fingerprint(*parts)[:8]}"
 
 
-def formats_in(folder) -> list[str]:
-    """Returns the names of the formats whose files lie in a folder, the one that is read first.
+def detect_formats(folder: str | os.PathLike) -> list[str]:
+    """Returns the names of all formats that a folder holds, in the order in which they are registered.
 
     Raises:
         ValueError: if there is none.
@@ -57,15 +81,16 @@ def formats_in(folder) -> list[str]:
     if not found:
         raise ValueError(
             f"{folder}: holds no dataset, expected transforms_train.json (Blender), transforms.json, a COLMAP "
-            "model in sparse/0, or poses_bounds.npy (LLFF); correct the folder"
+            "model in sparse/0, or poses_bounds.npy (LLFF); correct the folder, or import the module that "
+            "registers another format with --plugins=MODULE"
         )
     return found
 
 
-def read_capture(folder, format: str = "auto") -> Capture:
-    """Reads the Capture in a folder, in a given format or in the first that is found.
+def read_capture(folder: str | os.PathLike, format: str = "auto") -> Capture:
+    """Reads the Capture in a folder, in a given format or in the first that is detected.
 
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    return READERS.get(formats_in(folder)[0] if format == "auto" else format).read(folder)
+    return READERS.get(detect_formats(folder)[0] if format == "auto" else format).read(Path(folder))

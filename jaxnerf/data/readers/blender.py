@@ -1,15 +1,16 @@
-"""Scenes in the format of the NeRF paper's Blender renders: transforms_<split>.json beside PNG files."""
+"""Reader of the format of the NeRF paper's Blender renders: transforms_<split>.json beside PNG files."""
 
 import functools
 import math
 import os
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jaxnerf.core.types import Camera, Views
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.images.image_files import average_blocks, image_size, read_image
+from jaxnerf.data.images.image_files import average_tiles, image_size, read_image
 from jaxnerf.data.images.pixel_cache import fill_pixels
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.validation import (
@@ -24,33 +25,41 @@ from jaxnerf.data.readers.validation import (
 from jaxnerf.registry import Reader
 
 
-def load_views(folder, *, split="train", factor=1, near=2.0, far=6.0, background=(1.0, 1.0, 1.0), only=None):
-    """Returns one split of a Blender scene, with all its pixels, see fill_pixels.
+def load_blender(
+    folder: str | os.PathLike,
+    *,
+    split: str = "train",
+    factor: int = 1,
+    near: float = 2.0,
+    far: float = 6.0,
+    background: Sequence[float] | None = (1.0, 1.0, 1.0),
+    select: Callable[[int], Iterable[int]] | None = None,
+) -> Views:
+    """Reads one split of a Blender dataset with all its pixels, see `fill_pixels`.
 
     Args:
-        folder: the scene's folder, which holds transforms_<split>.json.
-        split: "train", "val" or "test", or any other whose file exists.
-        factor: whole number; images shrink to the mean of factor x factor pixels, and cameras with them.
+        folder: the dataset's folder, which holds transforms_<split>.json.
+        split: "train", "val", "test" or any other whose file exists.
+        factor: images are averaged over factor x factor pixels, which must divide them.
         near, far: in t, where rays begin and end; directions have length 1 along the camera's axis.
-        background: red, green, blue in [0, 1] that alpha is to be composited over. None takes the RGB of the
-            files as it is and drops alpha; files without alpha can be read in no other way.
-        only: how many frames there are -> the indices of those to read; None: all.
+        background: red, green, blue in [0, 1] behind alpha. None drops alpha; files without alpha need it.
+        select: maps the number of frames to the indices of those to read; None: all.
 
     Returns:
-        Views in the order of the frames. Factor 1 keeps the files' 8 or 16 bits, others give 16.
+        Views in the order of the frames. Factor 1 keeps the files' 8 or 16 bits, others return 16.
 
     Raises:
-        ValueError: names the file, what was found, what was wanted and what to do.
+        ValueError: names the file, what was found, what is expected and what to do.
     """
     factor, background = check_factor(factor), check_background(background)
     check_range(near, far)
-    source, scene = _read_transforms(folder, split)
-    angle, frames = _angle(scene, source), _frames(scene, source)
-    frames = frames if only is None else [frames[index] for index in only(len(frames))]
+    source, content = _read_transforms(folder, split)
+    angle, frames = _angle(content, source), _frames(content, source)
+    frames = frames if select is None else [frames[index] for index in select(len(frames))]
     paths = [_image_path(source, frame, where) for where, frame in frames]
     matrices = [(required(frame, "transform_matrix", where), where) for where, frame in frames]
     poses = [check_pose(matrix, source=where) for matrix, where in matrices]
-    pixels, offset, (height, width) = _read_pixels(paths, factor, background, _declared_size(scene, source))
+    pixels, offset, (height, width) = _read_pixels(paths, factor, background, _declared_size(content, source))
     count = len(paths)
     return Views(
         pixels=pixels,
@@ -70,19 +79,19 @@ def load_views(folder, *, split="train", factor=1, near=2.0, far=6.0, background
     )
 
 
-def read_capture(folder):
-    """Returns the Capture of all splits in a folder; frames are named by split and file, as train/r_0.
+def read_capture(folder: Path) -> Capture:
+    """Returns the Capture of all splits in a folder; frames are named by split and file, such as train/r_0.
 
     Raises:
-        ValueError: as load_views.
+        ValueError: as `load_blender`.
     """
     frames, splits = [], {}
     for split in ("train", "val", "test"):
         if split != "train" and not (Path(folder) / f"transforms_{split}.json").is_file():
             continue
-        source, scene = _read_transforms(folder, split)
-        angle, first = _angle(scene, source), len(frames)
-        for where, frame in _frames(scene, source):
+        source, content = _read_transforms(folder, split)
+        angle, first = _angle(content, source), len(frames)
+        for where, frame in _frames(content, source):
             path = _image_path(source, frame, where)
             pose = check_pose(required(frame, "transform_matrix", where), source=where)
             width, height = image_size(path)
@@ -100,39 +109,39 @@ def read_capture(folder):
 
 def _read_transforms(folder, split):
     if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"folder is {folder!r}, wanted the path of a scene's folder; pass one")
+        raise ValueError(f"folder is {folder!r}, expected the path of a dataset's folder; pass one")
     source = Path(folder) / f"transforms_{split}.json"
     if not source.is_file():
-        there = sorted(path.name for path in source.parent.glob("transforms*.json"))
-        found = f"the folder has {', '.join(there) or 'no transforms_*.json'}"
+        existing = sorted(path.name for path in source.parent.glob("transforms*.json"))
+        found = f"the folder has {', '.join(existing) or 'no transforms_*.json'}"
         if not source.parent.is_dir():
             found = "the folder does not exist"
-        raise ValueError(f"{source}: no such file ({found}), wanted split {split!r}; correct folder or split")
+        raise ValueError(f"{source}: no such file ({found}), expected split {split!r}; correct folder or split")
     return source, read_json(source)
 
 
-def _angle(scene, source):
-    angle = required(scene, "camera_angle_x", source)
-    if not is_number(angle) or not 1e-6 < angle < math.pi - 1e-6:  # beyond, focal is not a float32
+def _angle(content, source):
+    angle = required(content, "camera_angle_x", source)
+    if not is_number(angle) or not 1e-6 < angle < math.pi - 1e-6:  # outside, the focal length is no float32
         hint = "convert it from degrees" if is_number(angle) and angle > 0 else "export it again"
-        raise ValueError(f"{source}: camera_angle_x is {angle!r}, wanted radians between 0 and pi; {hint}")
+        raise ValueError(f"{source}: camera_angle_x is {angle!r}, expected radians between 0 and pi; {hint}")
     return angle
 
 
-def _frames(scene, source):
-    frames = required(scene, "frames", source)
+def _frames(content, source):
+    frames = required(content, "frames", source)
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         found = "an empty list" if frames == [] else f"{str(frames)[:40]!r}"
-        raise ValueError(f"{source}: frames is {found}, wanted one object {{...}} per image; export it again")
+        raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
     return [(f"{source}, frame {index}", frame) for index, frame in enumerate(frames)]
 
 
-def _declared_size(scene, source):
-    """Returns the (height, width) that the file states, None where it states none."""
-    declared = tuple(scene.get(key) for key in ("h", "w"))
+def _declared_size(content, source):
+    """Returns the (height, width) that the file states; each is None if it is not stated."""
+    declared = tuple(content.get(key) for key in ("h", "w"))
     for key, value in zip("hw", declared, strict=True):
         if value is not None and not (is_number(value) and value >= 1 and value == int(value)):
-            raise ValueError(f"{source}: {key} is {value!r}, wanted whole pixels; correct or remove it")
+            raise ValueError(f"{source}: {key} is {value!r}, expected whole pixels; correct or remove it")
     return declared
 
 
@@ -142,21 +151,21 @@ def _image_path(source, frame, where):
     tried = [path, path.with_name(path.name + ".png")]
     found = [candidate for candidate in tried if candidate.is_file()]
     if not found:
-        raise ValueError(f"{where}: {tried[1]} does not exist, wanted its image; copy it or remove the frame")
+        raise ValueError(f"{where}: {tried[1]} does not exist, expected its image; copy it or remove the frame")
     return found[0]
 
 
 def _read_pixels(paths, factor, background, declared):
-    """Returns pixels [V H W, C], where each image's begin [V] int32, and their one (height, width)."""
+    """Returns pixels [V H W, C], each image's first pixel [V] int32, and their common (height, width)."""
     first = _read_frame(paths[0], factor, background, declared)
     _check_count(paths, first)
 
     def read(path):
         image = _read_frame(path, factor, background, declared)
         if image.shape != first.shape or image.dtype != first.dtype:
-            size, wanted = (f"{a.shape[1]} x {a.shape[0]} {a.dtype}" for a in (image, first))
+            size, expected = (f"{a.shape[1]} x {a.shape[0]} {a.dtype}" for a in (image, first))
             raise ValueError(
-                f"{path}: is {size} after factor {factor}, wanted {wanted} as {paths[0].name}; render all alike"
+                f"{path}: is {size} after factor {factor}, expected {expected} as {paths[0].name}; render all alike"
             )
         return image
 
@@ -167,7 +176,7 @@ def _read_pixels(paths, factor, background, declared):
         [functools.partial(read, path) for path in paths],
         shape=(len(paths) * height * width, channels),
         dtype=first.dtype,
-        place=offset,
+        offsets=offset,
         depends=("blender", factor, background),
     )
     return pixels, offset, (height, width)
@@ -177,14 +186,16 @@ def _read_frame(path, factor, background, declared):
     image = read_image(path)
     height, width, channels = image.shape
     if background is not None and channels != 4:
-        raise ValueError(f"{path}: has no alpha, wanted RGBA; pass background=None to take RGB as it is")
-    if any(want not in (None, have) for want, have in zip(declared, (height, width), strict=True)):
-        wanted = f"w = {declared[1]}, h = {declared[0]} as its JSON says"
-        raise ValueError(f"{path}: is {width} x {height}, wanted {wanted}; correct one of them")
+        raise ValueError(
+            f"{path}: has no alpha, expected RGBA; set data.background to 'none' (background=None) for RGB"
+        )
+    if any(side not in (None, have) for side, have in zip(declared, (height, width), strict=True)):
+        expected = f"w = {declared[1]}, h = {declared[0]} as its JSON file states"
+        raise ValueError(f"{path}: is {width} x {height}, expected {expected}; correct one of them")
     if background is None:
         image = image[..., :3]
     try:
-        return image if factor == 1 else average_blocks(image, factor, background=background)
+        return image if factor == 1 else average_tiles(image, factor, background=background)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -193,7 +204,7 @@ def _check_count(paths, image):
     height, width, _ = image.shape
     if len(paths) * height * width >= 2**31:  # offsets and pixel ids are int32
         found = f"{len(paths)} images of {width} x {height}"
-        raise ValueError(f"{paths[0].parent}: has {found}, wanted less than 2^31 pixels; raise factor")
+        raise ValueError(f"{paths[0].parent}: has {found}, expected fewer than 2^31 pixels; raise data.factor")
 
 
 READER = Reader(read_capture, detect=lambda folder: (folder / "transforms_train.json").is_file())

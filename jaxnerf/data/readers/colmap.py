@@ -1,4 +1,4 @@
-"""Captures with a sparse model of COLMAP, binary or text, beside a folder of photographs."""
+"""Reader of COLMAP datasets: a sparse model, binary or text, beside a folder of images."""
 
 import os
 from pathlib import Path
@@ -19,7 +19,7 @@ from jaxnerf.data.readers.colmap_model import (
 from jaxnerf.data.readers.validation import check_inside, is_number
 from jaxnerf.registry import Reader
 
-_LENSES = {  # kinds of cameras: how many focal lengths come before the centre, and our lens
+_LENSES = {  # COLMAP's camera model: its number of focal lengths, and the lens of Camera
     "SIMPLE_PINHOLE": (1, "pinhole"),
     "PINHOLE": (2, "pinhole"),
     "SIMPLE_RADIAL": (1, "opencv"),
@@ -34,43 +34,42 @@ _LENSES = {  # kinds of cameras: how many focal lengths come before the centre, 
 }
 
 
-def find_model(folder):
-    """Returns the folder of the COLMAP model that `read_capture` would read, None where there is none.
+def find_model(folder: str | os.PathLike) -> Path | None:
+    """Returns the folder of the COLMAP model that `read_capture` reads, or None if there is none.
 
     Of several models sparse/0, sparse/1, ... it is the one with most images.
 
     Raises:
-        ValueError: if there are several, and one's images cannot be counted.
+        ValueError: if there are several and the images of one cannot be counted.
     """
     models = models_in(Path(folder))
     return models[0] if len(models) == 1 else max(models, key=count_images, default=None)
 
 
-def read_capture(folder):
-    """Returns what a COLMAP model says about the photographs in folder/images, or else in folder itself.
+def read_capture(folder: str | os.PathLike) -> Capture:
+    """Returns the Capture of the COLMAP model in a folder, in the model's world.
+
+    Registered images whose file is missing are skipped, and so are observations of points that points3D lacks:
+    users delete points, and the remaining ones stay correct. Both are noted. If there are no points, `points`
+    and the frames' `seen` are None.
 
     Args:
-        folder: has cameras, images and points3D, as .bin or else .txt, in sparse/0, sparse,
-            colmap/sparse/0, colmap/sparse or itself.
-
-    Returns:
-        A Capture in the model's world. A registered image whose file is missing is left out, with a note. So
-        is an observation of a point that points3D lacks: people thin and clean their points, and what
-        remains is as right as it was. Without any point, points and the frames' seen are None.
+        folder: has cameras, images and points3D, as .bin or else .txt, in sparse/0, sparse, colmap/sparse/0,
+            colmap/sparse or itself, and the image files in images/ or itself.
 
     Raises:
-        ValueError: names the file, what was found, what was wanted and what to do; also where more than half
-            of the photographs are missing, or a lens is none of ours.
+        ValueError: names the file, what was found, what is expected and what to do; also if more than half of
+            the images are missing, or a camera model is not supported.
     """
     folder = Path(folder)
     model = find_model(folder)
     if model is None:
         raise ValueError(
             f"{folder}: has no cameras and images, .bin or .txt, in sparse/0, sparse, colmap/sparse/0 or "
-            "itself, wanted a COLMAP model; correct the folder"
+            "itself, expected a COLMAP model; correct the folder"
         )
     cameras, images, ids, points = read_model(model)
-    present, notes = _find_photographs(images, folder, model_file(model, "images"))
+    present, notes = _find_images(images, folder, model_file(model, "images"))
     frames = [_frame(path, name, image, cameras[image.camera], ids) for path, name, image in present]
     notes += _check_seen(frames, present, model) + _other_models(folder, model)
     if not len(ids):
@@ -79,7 +78,8 @@ def read_capture(folder):
     return Capture("colmap", model, frames, points=points, notes=tuple(notes))
 
 
-def models_in(folder):
+def models_in(folder: Path) -> list[Path]:
+    """Returns the folders of all COLMAP models of a dataset, in the order of their numbers."""
     for base in (folder / "sparse", folder / "colmap" / "sparse"):
         numbered = [path for path in base.glob("*") if path.name.isdecimal() and model_suffix(path)]
         if numbered:
@@ -91,29 +91,31 @@ def models_in(folder):
 
 def _other_models(folder, model):
     others = [path.name for path in models_in(folder) if path != model]
-    said = f"{model}: read, as it has most images; left out beside it: {', '.join(others)}"
-    return [said] if others else []
+    note = f"{model}: used, as it has most images; other models skipped: {', '.join(others)}"
+    return [note] if others else []
 
 
-def _find_photographs(images, folder, source):
-    """Returns (path, name below the folder of photographs, Image) of those with a file, and the notes."""
-    photographs = folder / "images" if (folder / "images").is_dir() else folder
+def _find_images(images, folder, source):
+    """Returns (path, name below the folder of images, Image) of those with a file, and the notes."""
+    root = folder / "images" if (folder / "images").is_dir() else folder
     found, missing = {}, []
     for image in images:
-        path = photographs / check_inside(image.name, key="its name", source=image.where)
+        path = root / check_inside(image.name, key="its name", source=image.where)
         if path in found:
-            raise ValueError(f"{image.where}: {image.name[:80]!r} occurs twice, wanted one pose for each; {AGAIN}")
-        if os.path.isfile(path):  # Path.is_file would raise at a name that is too long
-            found[path] = (path, path.relative_to(photographs).with_suffix("").as_posix(), image)
+            raise ValueError(
+                f"{image.where}: {image.name[:80]!r} occurs twice, expected one pose for each image; {AGAIN}"
+            )
+        if os.path.isfile(path):  # Path.is_file raises if the name is too long
+            found[path] = (path, path.relative_to(root).with_suffix("").as_posix(), image)
         else:
             missing.append(image.name)
     if not missing:
         return list(found.values()), []
     named = ", ".join(repr(name[:80]) for name in sorted(missing)[:5]) + ", ..." * (len(missing) > 5)
-    said = f"{photographs}: lacks {len(missing)} of {len(images)} photographs of {source}, {named}"
+    note = f"{root}: lacks {len(missing)} of {len(images)} images of {source}, {named}"
     if len(missing) > len(images) / 2:
-        raise ValueError(f"{said}; wanted at least half of them, copy them there")
-    return list(found.values()), [f"{said}; they are left out"]
+        raise ValueError(f"{note}; expected at least half of them; copy them there")
+    return list(found.values()), [f"{note}; they are skipped"]
 
 
 def _frame(path, name, image, intrinsics, ids):
@@ -121,16 +123,16 @@ def _frame(path, name, image, intrinsics, ids):
     index = np.searchsorted(ids, image.points)
     known = np.isin(image.points, ids)
     camera = _camera(intrinsics, _to_world(image, where))
-    return Frame(name, path, camera, turned=False, seen=index[known], seen_at=image.seen_at[known])
+    return Frame(name, path, camera, follow_exif=False, seen=index[known], seen_at=image.seen_at[known])
 
 
 def _to_world(image, where):
-    """Returns the pose [3, 4] of a Camera: the inverse of COLMAP's, which looks along +z with y down."""
+    """Returns the pose [3, 4] of a Camera: the inverse of COLMAP's world to camera, whose z points forwards."""
     norm = np.linalg.norm(image.quaternion)
-    if not abs(norm - 1) <= 1e-3:  # files carry six digits or more: beyond this it is a mistake, not rounding
-        raise ValueError(f"{where}: its quaternion has length {norm:.4g}, wanted 1; {AGAIN}")
+    if not abs(norm - 1) <= 1e-3:  # files have six digits or more, so this is no rounding error
+        raise ValueError(f"{where}: its quaternion has length {norm:.4g}, expected 1; {AGAIN}")
     w, x, y, z = image.quaternion / norm
-    rotation = np.array(  # camera -> world, the transpose of the quaternion's
+    rotation = np.array(  # camera -> world, the transpose of the quaternion's matrix
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
             [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
@@ -145,18 +147,20 @@ def _to_world(image, where):
 def _camera(intrinsics, to_world):
     where, model, width, height, params = intrinsics
     if model not in _LENSES:
-        raise ValueError(f"{where}: {model} is none of our lenses, wanted {', '.join(_LENSES)}; {UNDISTORT}")
+        raise ValueError(f"{where}: {model} is not supported, expected {', '.join(_LENSES)}; {UNDISTORT}")
     if min(width, height) < 1 or width * height >= 2**31:  # pixel ids are int32
-        raise ValueError(f"{where}: is {width} x {height}, wanted px and less than 2^31 in all; {AGAIN}")
+        raise ValueError(f"{where}: is {width} x {height}, expected at least 1 and fewer than 2^31 pixels; {AGAIN}")
     count, lens = _LENSES[model]
     focal, center, distortion = params[:count], params[count : count + 2], params[count + 2 :]
-    if not all(1e-6 < value / max(width, height) < 1e6 for value in focal):  # beyond, a ray has no direction
-        raise ValueError(f"{where}: focal length {focal}, wanted px of {width} x {height}; {AGAIN}")
+    if not all(
+        1e-6 < value / max(width, height) < 1e6 for value in focal
+    ):  # outside, rays have no direction in float32
+        raise ValueError(f"{where}: focal length {focal}, expected px of {width} x {height}; {AGAIN}")
     if not all(is_number(value) for value in params):
-        raise ValueError(f"{where}: parameters {params}, wanted finite numbers; {AGAIN}")
+        raise ValueError(f"{where}: parameters {params}, expected finite numbers; {AGAIN}")
     size = 5 if model == "FULL_OPENCV" else 4
     if any(distortion[size:]):
-        raise ValueError(f"{where}: {model} has k4, k5, k6 = {distortion[size:]}, wanted 0; {UNDISTORT}")
+        raise ValueError(f"{where}: {model} has k4, k5, k6 = {distortion[size:]}, expected 0; {UNDISTORT}")
     padded = np.zeros(size)
     padded[: len(distortion[:size])] = distortion[:size]
     return Camera(
@@ -171,14 +175,14 @@ def _camera(intrinsics, to_world):
 
 
 def _check_seen(frames, present, model):
-    """Returns a note where observations were left out; ValueError where all were: points of another model."""
+    """Returns a note if observations were skipped; ValueError if all were: the points are another model's."""
     total = sum(len(image.points) for *_, image in present)
     kept = sum(len(frame.seen) for frame in frames)
-    path, shown = model_file(model, "points3D"), model_file(model, "images").name
+    path, images = model_file(model, "points3D"), model_file(model, "images").name
     if total and not kept:
-        raise ValueError(f"{path}: has none of the points that {shown} shows, wanted them; {AGAIN}")
-    said = f"{path}: lacks the points of {total - kept} observations in {shown}; they are left out"
-    return [said] if kept < total else []
+        raise ValueError(f"{path}: has none of the points that {images} refers to, expected them; {AGAIN}")
+    note = f"{path}: lacks the points of {total - kept} observations in {images}; they are skipped"
+    return [note] if kept < total else []
 
 
 READER = Reader(read_capture, detect=lambda folder: bool(models_in(folder)))

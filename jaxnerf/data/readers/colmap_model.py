@@ -1,14 +1,19 @@
-"""The three files of a COLMAP model, binary or text, as plain records. A count is believed if it fits."""
+"""Parsers of the three files of a COLMAP model, binary or text.
+
+Files may come from strangers: every count is compared with the file's size before memory is allocated.
+"""
 
 import os
 import struct
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from jaxnerf.data.readers.validation import LARGEST
+from jaxnerf.data.readers.validation import MAX_FLOAT32
 
-MODELS = {  # COLMAP's number of a kind of camera: its name and how many parameters it has
+MODELS = {  # COLMAP's number of a camera model: its name and number of parameters
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
     2: ("SIMPLE_RADIAL", 4),
@@ -31,72 +36,92 @@ MODELS = {  # COLMAP's number of a kind of camera: its name and how many paramet
 AGAIN = "copy the model again or export it again"
 UNDISTORT = "run `colmap image_undistorter` and give the folder that it writes"
 _NUMBER = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")  # id, number of its kind, width, height; then its parameters
-_POSE = struct.Struct("<I7dI")  # id, quaternion and translation, camera; then name, 0, count, observations
-_POINT = struct.Struct("<q3d3BdQ")  # id, place, colour, error, count; then the images that show it
-_OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])  # point is -1 where there is none
+_CAMERA = struct.Struct("<IiQQ")  # id, model number, width, height; followed by its parameters
+_POSE = struct.Struct("<I7dI")  # id, quaternion and translation, camera; followed by name, 0, count, observations
+_POINT = struct.Struct("<q3d3BdQ")  # id, position, colour, error, count; followed by the images that show it
+_OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])  # point -1: none
 _SMALLEST_IMAGE = _POSE.size + 1 + _NUMBER.size  # bytes
-_LONGEST = 4096  # bytes of a name that an operating system takes
+_MAX_NAME = 4096  # bytes, the limit of common operating systems
 
 
 class Intrinsics(NamedTuple):
-    """A camera without its pose. COLMAP's pixel centres are at + 0.5, as ours."""
+    """A camera without its pose. Pixel centres are at + 0.5, as in Camera.
 
-    where: str  # it stands, for messages
-    model: str  # a name of MODELS
-    width: int  # px
-    height: int  # px
+    Attributes:
+        where: file and entry, for messages.
+        model: a name of MODELS.
+        width: px.
+        height: px.
+        params: as COLMAP orders them.
+    """
+
+    where: str
+    model: str
+    width: int
+    height: int
     params: tuple[float, ...]
 
 
 class Image(NamedTuple):
-    """A registered photograph: world -> camera, x right, y down, looking along +z."""
+    """A registered image with its pose, world -> camera: x right, y down, looking along +z.
 
-    where: str  # it stands, for messages
-    name: str  # path of its file, as the model states it
-    camera: int  # key of its Intrinsics
-    quaternion: np.ndarray  # [4] w, x, y, z
-    translation: np.ndarray  # [3]
-    points: np.ndarray  # [M] int64, ids of the points it shows
-    seen_at: np.ndarray  # [M, 2] px where
+    Attributes:
+        where: file and entry, for messages.
+        name: path of the image file, as the model states it.
+        camera: key of its Intrinsics.
+        quaternion: w, x, y, z.
+        translation: world units.
+        points: ids of the points that it shows.
+        seen_at: px, where it shows them.
+    """
+
+    where: str
+    name: str
+    camera: int
+    quaternion: Float[np.ndarray, "4"]
+    translation: Float[np.ndarray, "3"]
+    points: Int[np.ndarray, " M"]
+    seen_at: Float[np.ndarray, "M 2"]
 
 
-def model_suffix(folder):
-    """Returns ".bin" or ".txt", whichever a folder holds a model in (the first, if both), or None."""
+def model_suffix(folder: Path) -> str | None:
+    """Returns the suffix of the model's files in a folder, ".bin" before ".txt"; None if there is no model."""
     for suffix in (".bin", ".txt"):
         if all(os.path.isfile(folder / f"{name}{suffix}") for name in ("cameras", "images")):
             return suffix
     return None
 
 
-def model_file(folder, name):
-    """Returns the path of a model's cameras, images or points3D."""
+def model_file(folder: Path, name: str) -> Path:
+    """Returns the path of a model's file "cameras", "images" or "points3D"."""
     return folder / f"{name}{model_suffix(folder)}"
 
 
-def count_images(folder):
-    """Returns how many images the model in a folder says it has."""
+def count_images(folder: Path) -> int:
+    """Returns the number of images that the model in a folder states."""
     path = model_file(folder, "images")
     if path.suffix == ".bin":
         return _count(path, _bytes(path), smallest=_SMALLEST_IMAGE)
     return sum(1 for _ in _image_lines(path))
 
 
-def read_model(folder):
-    """Returns a model's ({id: Intrinsics}, [Image], point ids [N] int64 ascending, points [N, 3] float64).
+def read_model(
+    folder: Path,
+) -> tuple[dict[int, Intrinsics], list[Image], Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
+    """Returns a model's {id: Intrinsics}, images, point ids in ascending order, and points.
 
     Raises:
-        ValueError: names the file, what was found, what was wanted and what to do.
+        ValueError: names the file, what was found, what is expected and what to do.
     """
     path, images_path, points_path = (model_file(folder, name) for name in ("cameras", "images", "points3D"))
     binary = path.suffix == ".bin"
     cameras = {}
     for key, camera in (_binary_cameras if binary else _text_cameras)(path):
         if cameras.setdefault(key, camera) is not camera:
-            raise ValueError(f"{camera.where}: stands there twice, wanted each camera once; {AGAIN}")
+            raise ValueError(f"{camera.where}: occurs twice, expected each camera once; {AGAIN}")
     images = list((_binary_images if binary else _text_images)(images_path))
     if not images:
-        raise ValueError(f"{images_path}: holds no image, wanted at least one; {AGAIN}")
+        raise ValueError(f"{images_path}: holds no image, expected at least one; {AGAIN}")
     for image in images:
         _check_image(image, cameras, path)
     rows = list((_binary_points if binary else _text_points)(points_path))
@@ -111,50 +136,50 @@ def _check_image(image, cameras, path):
     if image.camera not in cameras:
         raise ValueError(f"{image.where}: has camera {image.camera}, which {path.name} lacks; {AGAIN}")
     for name in ("quaternion", "translation", "seen_at"):
-        if not (np.abs(getattr(image, name)) <= LARGEST).all():
-            raise ValueError(f"{image.where}: {name} is not finite, wanted numbers; {AGAIN}")
+        if not (np.abs(getattr(image, name)) <= MAX_FLOAT32).all():
+            raise ValueError(f"{image.where}: {name} is not finite, expected finite numbers; {AGAIN}")
 
 
 def _check_points(ids, points, path):
     if len(ids) and (ids.min() < 0 or len(np.unique(ids)) < len(ids)):
         found = "a negative id" if ids.min() < 0 else "an id twice"
-        raise ValueError(f"{path}: has {found}, wanted one id >= 0 for each point; {AGAIN}")
-    wrong = ids[~(np.abs(points) <= LARGEST).all(axis=-1)]
+        raise ValueError(f"{path}: has {found}, expected one id >= 0 for each point; {AGAIN}")
+    wrong = ids[~(np.abs(points) <= MAX_FLOAT32).all(axis=-1)]
     if len(wrong):
-        raise ValueError(f"{path}: point {wrong[0]} is not finite, wanted numbers; {AGAIN}")
+        raise ValueError(f"{path}: point {wrong[0]} is not finite, expected finite numbers; {AGAIN}")
 
 
 def _bytes(path):
     try:
         return path.read_bytes()
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}, wanted a whole model of three files; {AGAIN}") from None
+        raise ValueError(f"{path}: {error.strerror}, expected a model of three files; {AGAIN}") from None
 
 
-def _room(path, data, at, size):
-    """Returns the byte after size bytes from at. It comes before whatever allocates them."""
+def _end_of(path, data, at, size):
+    """Returns the position after size bytes from at; ValueError if the file is shorter. Called before allocation."""
     if at + size > len(data):
-        raise ValueError(f"{path}: ends after {len(data)} bytes, wanted {at + size} or more; {AGAIN}")
+        raise ValueError(f"{path}: ends after {len(data)} bytes, expected at least {at + size}; {AGAIN}")
     return at + size
 
 
 def _unpack(path, data, at, layout):
-    end = _room(path, data, at, layout.size)
+    end = _end_of(path, data, at, layout.size)
     return layout.unpack_from(data, at), end
 
 
 def _count(path, data, *, smallest):
-    """Returns the number of entries, which a file begins with, if as many smallest ones fit into it."""
+    """Returns the number of entries at the file's start; ValueError if that many cannot fit into the file."""
     (count,), at = _unpack(path, data, 0, _NUMBER)
     if count * smallest > len(data) - at:
-        found = f"says that it holds {count} entries in {len(data)} bytes"
-        raise ValueError(f"{path}: {found}, wanted {smallest} bytes or more for each; {AGAIN}")
+        found = f"states {count} entries in {len(data)} bytes"
+        raise ValueError(f"{path}: {found}, expected at least {smallest} bytes for each; {AGAIN}")
     return count
 
 
 def _check_end(path, data, at):
     if at != len(data):
-        raise ValueError(f"{path}: has {len(data) - at} bytes after its last entry, wanted none; {AGAIN}")
+        raise ValueError(f"{path}: has {len(data) - at} bytes after its last entry, expected none; {AGAIN}")
 
 
 def _binary_cameras(path):
@@ -162,8 +187,8 @@ def _binary_cameras(path):
     for _ in range(_count(path, data, smallest=_CAMERA.size)):
         (key, number, width, height), at = _unpack(path, data, at, _CAMERA)
         if number not in MODELS:
-            wanted = f"wanted 0 to {max(MODELS)}; {UNDISTORT}"
-            raise ValueError(f"{path}, camera {key}: model number {number}, {wanted}")
+            found = f"model number {number}, expected 0 to {max(MODELS)}"
+            raise ValueError(f"{path}, camera {key}: {found}; {UNDISTORT}")
         model, size = MODELS[number]
         params, at = _unpack(path, data, at, struct.Struct(f"<{size}d"))
         yield key, Intrinsics(f"{path}, camera {key}", model, width, height, params)
@@ -174,15 +199,15 @@ def _binary_images(path):
     data, at = _bytes(path), _NUMBER.size
     for _ in range(_count(path, data, smallest=_SMALLEST_IMAGE)):
         (key, *motion, camera), at = _unpack(path, data, at, _POSE)
-        where, end = f"{path}, image {key}", data.find(b"\0", at, at + _LONGEST)
+        where, end = f"{path}, image {key}", data.find(b"\0", at, at + _MAX_NAME)
         try:
             name = data[at:end].decode("utf-8")
         except UnicodeDecodeError:
             end = -1
         if end < 0:
-            raise ValueError(f"{where}: its name has no end or is not UTF-8, wanted a file name; {AGAIN}")
+            raise ValueError(f"{where}: its name has no end or is not UTF-8, expected a file name; {AGAIN}")
         (count,), at = _unpack(path, data, end + 1, _NUMBER)
-        end = _room(path, data, at, count * _OBSERVATION.itemsize)
+        end = _end_of(path, data, at, count * _OBSERVATION.itemsize)
         rows = np.frombuffer(data, _OBSERVATION, count, at)
         rows, at = rows[rows["point"] != -1], end
         seen_at = np.stack([rows["x"], rows["y"]], axis=-1)
@@ -191,11 +216,11 @@ def _binary_images(path):
 
 
 def _binary_points(path):
-    """Yields (id, x, y, z). Which images show a point is known from the images."""
+    """Yields (id, x, y, z). The images that show a point are skipped: the images' entries state them, too."""
     data, at = _bytes(path), _NUMBER.size
     for _ in range(_count(path, data, smallest=_POINT.size)):
         (*row, _, _, _, _, length), at = _unpack(path, data, at, _POINT)
-        at = _room(path, data, at, length * 8)
+        at = _end_of(path, data, at, length * 8)
         yield row
     _check_end(path, data, at)
 
@@ -204,7 +229,7 @@ def _lines(path):
     try:
         lines = _bytes(path).decode("utf-8-sig").split("\n")
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: is no UTF-8 text, wanted a model's text file; {AGAIN}") from None
+        raise ValueError(f"{path}: is no UTF-8 text, expected a model's text file; {AGAIN}") from None
     return ((f"{path}, line {number}", line.strip()) for number, line in enumerate(lines, 1))
 
 
@@ -213,33 +238,33 @@ def _entries(lines):
 
 
 def _image_lines(path):
-    """Yields (where, its line, the line of its observations, which may be empty) for each image."""
+    """Yields (where, line of the image, line of its observations, which may be empty)."""
     lines = _lines(path)
     for where, line in _entries(lines):
         yield where, line, next(lines, ("", ""))[1]
 
 
-def _split(where, line, kinds, wanted):
-    """Returns the first words of a line as the kinds say (int, float, ...), and the rest of it or ""."""
+def _split(where, line, kinds, expected):
+    """Returns the first words of a line, converted to kinds (int, float, ...), and the rest of the line."""
     words = line.split(maxsplit=len(kinds))
     try:
         values = [kind(word) for kind, word in zip(kinds, words[: len(kinds)], strict=True)]
     except (ValueError, OverflowError):
-        raise _no_entry(where, line, wanted) from None
+        raise _no_entry(where, line, expected) from None
     return values, "".join(words[len(kinds) :])
 
 
-def _no_entry(where, line, wanted):
-    return ValueError(f"{where}: is {line[:40]!r}, wanted {wanted}; {AGAIN}")
+def _no_entry(where, line, expected):
+    return ValueError(f"{where}: is {line[:40]!r}, expected {expected}; {AGAIN}")
 
 
 def _text_cameras(path):
     sizes = dict(MODELS.values())
     for where, line in _entries(_lines(path)):
-        wanted = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
-        (key, model, width, height), rest = _split(where, line, (int, str, int, int), wanted)
+        expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
+        (key, model, width, height), rest = _split(where, line, (int, str, int, int), expected)
         if model not in sizes:
-            found = f"model {model[:40]!r}, wanted one of COLMAP's"
+            found = f"model {model[:40]!r}, expected one of COLMAP's"
             raise ValueError(f"{where}, camera {key}: {found}; {UNDISTORT}")
         params, more = _split(where, rest, (float,) * sizes[model], f"{sizes[model]} PARAMS of {model}")
         if more:
@@ -249,8 +274,8 @@ def _text_cameras(path):
 
 def _text_images(path):
     for where, line, observations in _image_lines(path):
-        wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-        (key, *motion, camera), name = _split(where, line, (int, *(float,) * 7, int), wanted)
+        expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+        (key, *motion, camera), name = _split(where, line, (int, *(float,) * 7, int), expected)
         words = observations.split()
         try:
             seen_at = np.array([[float(x), float(y)] for x, y in zip(words[::3], words[1::3], strict=True)])
@@ -258,7 +283,7 @@ def _text_images(path):
         except (ValueError, OverflowError):
             points = None
         if not name or points is None or len(words) % 3:
-            raise _no_entry(where, line, f"{wanted}, and X Y POINT3D_ID in threes on the next line")
+            raise _no_entry(where, line, f"{expected}, and X Y POINT3D_ID in threes on the next line")
         where, kept, motion = f"{where}, image {key}", points != -1, np.array(motion)
         seen_at = seen_at.reshape(-1, 2)[kept]
         yield Image(where, name, camera, motion[:4], motion[4:], points[kept], seen_at)
@@ -267,6 +292,6 @@ def _text_images(path):
 def _text_points(path):
     """Yields (id, x, y, z)."""
     for where, line in _entries(_lines(path)):
-        kinds = (np.int64, float, float, float, int, int, int, float)  # int64: a larger id is a mistake
+        kinds = (np.int64, float, float, float, int, int, int, float)  # int64 rejects larger ids
         values, _ = _split(where, line, kinds, "POINT3D_ID X Y Z R G B ERROR TRACK[]")
         yield values[:4]

@@ -1,8 +1,12 @@
-"""Points from PLY files, the format of nerfstudio's sparse_pc.ply and of most scanners."""
+"""Reader of points in PLY files, such as nerfstudio's sparse_pc.ply, that may come from strangers.
+
+Every count is compared with the file's size before memory is allocated.
+"""
 
 import os
 
 import numpy as np
+from jaxtyping import Float
 
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
@@ -12,18 +16,15 @@ _TYPES = {
 _ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def read_points(path):
-    """Returns the x, y, z of a PLY file's vertices, whatever other properties they have.
+def read_points(path: str | os.PathLike) -> Float[np.ndarray, "N 3"]:
+    """Returns the x, y, z of a PLY file's vertices as float64; other properties are ignored.
 
     Args:
-        path: a PLY file, ASCII or binary, whose first element is its vertices.
-
-    Returns:
-        [N, 3] float64, N >= 0.
+        path: an ASCII or binary PLY file whose first element is "vertex". It may have no vertices.
 
     Raises:
-        ValueError: if the file cannot be read or is no such PLY, if it ends before its last vertex, or if a
-            coordinate is not a finite number. Memory is taken only after the counts fit the file's size.
+        ValueError: if the file cannot be read, is no such PLY file, ends before its last vertex, or has a
+            coordinate that is not finite.
     """
     try:
         with open(path, "rb") as file:
@@ -33,7 +34,7 @@ def read_points(path):
             else:
                 points = _binary(file, count, [(name, order + kind) for name, kind in columns], path)
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}, wanted a PLY file that can be read") from None
+        raise ValueError(f"{path}: {error.strerror}, expected a readable PLY file; correct the path") from None
     if not np.isfinite(points).all():
         row = np.argwhere(~np.isfinite(points))[0][0]
         raise _wrong(path, f"vertex {row} is {points[row].tolist()}", "finite numbers")
@@ -45,7 +46,7 @@ def _header(file, path):
     if file.readline(8).strip() != b"ply":
         raise _wrong(path, "does not begin with ply", "a PLY file")
     order, count, columns, element = "", 0, [], None
-    for _ in range(1000):  # lines; one without an end is not read to its end
+    for _ in range(1000):  # a limit on the lines, as below on their length
         words = file.readline(1000).decode("ascii", "replace").split()
         match words:
             case ["end_header"]:
@@ -74,7 +75,7 @@ def _header(file, path):
 
 
 def _ascii(file, count, columns, path):
-    _check_size(file, count, 2 * len(columns), path)  # a digit and a space each
+    _check_size(file, count, 2 * len(columns), path)  # at least a digit and a space for each number
     if not count:
         return np.zeros((0, 3))
     try:
@@ -84,7 +85,7 @@ def _ascii(file, count, columns, path):
         raise _wrong(path, f"has a line that is no vertex ({reason})", "numbers") from None
     if rows.shape != (count, len(columns)):
         found = f"{len(rows)} vertices of {rows.shape[1]} numbers"
-        raise _wrong(path, f"holds {found}", f"{count} of {len(columns)} as its header says")
+        raise _wrong(path, f"holds {found}", f"{count} of {len(columns)} as its header states")
     names = [name for name, _ in columns]
     return rows[:, [names.index(axis) for axis in "xyz"]]
 
@@ -93,15 +94,15 @@ def _binary(file, count, columns, path):
     dtype = np.dtype(columns)
     _check_size(file, count, dtype.itemsize, path)
     rows = np.fromfile(file, dtype, count)
-    with np.errstate(invalid="ignore"):  # a signalling NaN; read_points names it
+    with np.errstate(invalid="ignore"):  # signalling NaNs; read_points reports them
         return np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
 def _check_size(file, count, least, path):
-    left = os.fstat(file.fileno()).st_size - file.tell() + 1  # the last line may lack its end
+    left = os.fstat(file.fileno()).st_size - file.tell() + 1  # the last line's end may be missing
     if count * least > left:
-        raise _wrong(path, f"holds {left - 1} bytes after its header", f"{count} vertices as that says")
+        raise _wrong(path, f"holds {left - 1} bytes after its header", f"{count} vertices as the header states")
 
 
-def _wrong(path, found, wanted):
-    return ValueError(f"{path}: {found}, wanted {wanted}; export it again")
+def _wrong(path, found, expected):
+    return ValueError(f"{path}: {found}, expected {expected}; export it again")

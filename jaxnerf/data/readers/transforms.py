@@ -1,79 +1,96 @@
-"""Captures in the format of nerfstudio and instant-ngp: one transforms.json beside photographs."""
+"""Reader of the format of nerfstudio and instant-ngp: one transforms.json beside images."""
 
+import math
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.images.downscaled_copies import IMAGES
+from jaxnerf.data.images.downscaled_copies import IMAGE_SUFFIXES
+from jaxnerf.data.images.image_files import image_size
 from jaxnerf.data.readers.base import Capture, Frame
-from jaxnerf.data.readers.intrinsics import number, read_camera, wrong
 from jaxnerf.data.readers.ply import read_points
-from jaxnerf.data.readers.validation import check_inside, is_number, read_json, required
+from jaxnerf.data.readers.validation import check_inside, is_number, read_json, required, short_repr
 from jaxnerf.registry import Reader
 
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")  # instant-ngp's other lenses
+_ANGLES = ("camera_angle_x", "camera_angle_y")
+_OTHERS = ("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy")
 
-def read_capture(folder):
-    """Returns the photographs that <folder>/transforms.json lists, with their cameras.
 
-    What a frame states of its camera goes before what the file states for all, field by field. Frames whose
-    file is missing are left out, which the notes say. The world is the file's own: what its
-    applied_transform and applied_scale did is checked for its form and otherwise not undone, and not kept.
+def read_capture(folder: str | os.PathLike) -> Capture:
+    """Returns the Capture of the images that <folder>/transforms.json lists.
 
-    instant-ngp takes a point x of the file to x * scale + offset, its axes cycled, and trains in the cube of
-    side aabb_scale around 0.5; that cube, taken back, is the Capture's box.
+    A field of a frame's camera overrides the file's field. Frames whose image is missing are skipped and noted.
+    The world is that of the file's poses: applied_transform and applied_scale are checked for their form, but
+    neither undone nor stored.
+
+    instant-ngp maps a point x of the file to x * scale + offset, permutes its axes cyclically and trains in the
+    cube of side aabb_scale around 0.5. That cube, mapped back to the file's world, is the Capture's box.
 
     Args:
-        folder: holds transforms.json; no path in that leads out of it.
+        folder: holds transforms.json. Paths in that file that lead out of the folder are errors.
 
     Returns:
-        Capture. Its splits are the file's lists of names, those that are not empty. A camera has the size
-        that the file states, or, where its center or focal needs one, the image's as it is to be looked at.
+        Capture. Its splits are the file's lists of names that are not empty. A camera's height and width are
+        those that the file states; if center or focal depend on the size and it is not stated, they are the
+        upright image's.
 
     Raises:
-        ValueError: names file and frame, what was found, what was wanted and what to do.
+        ValueError: names file and frame, what was found, what is expected and what to do.
     """
     if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"folder is {folder!r}, wanted the path of a capture's folder; pass one")
+        raise ValueError(f"folder is {folder!r}, expected the path of a dataset's folder; pass one")
     source = Path(folder) / "transforms.json"
-    scene = read_json(source)
-    entries, notes = _entries(scene, source)
+    content = read_json(source)
+    entries, notes = _entries(content, source)
     kept = [entry for entry in entries if entry.image is not None]
     masks = _masks(entries, kept, source)
-    _check_applied(scene, source)
-    points, more = _points(scene, source)
-    box, most = _box(scene, source)
+    _check_applied(content, source)
+    points, points_notes = _points(content, source)
+    box, box_notes = _box(content, source)
     return Capture(
         format="transforms",
         source=source,
         frames=tuple(
-            Frame(entry.name, entry.image, _camera(scene, source, entry), mask)
+            Frame(entry.name, entry.image, _camera(content, source, entry), mask)
             for entry, mask in zip(kept, masks, strict=True)
         ),
-        splits=_splits(scene, source, entries, kept),
+        splits=_splits(content, source, entries, kept),
         points=points,
         box=box,
-        notes=(*notes, *more, *most),
+        notes=(*notes, *points_notes, *box_notes),
     )
 
 
 class _Entry(NamedTuple):
-    """A frame of the file."""
+    """A frame of the file.
 
-    where: str  # file and number, for messages
-    path: str  # the file_path, normalised
-    image: Path | None  # None: no such file
+    Attributes:
+        where: file and index, for messages.
+        path: the normalised file_path.
+        image: the image file; None: missing.
+        name: see `Frame.name`.
+        content: the frame's JSON object.
+    """
+
+    where: str
+    path: str
+    image: Path | None
     name: str
     content: dict
 
 
-def _entries(scene, source):
-    """Returns all entries by name, and notes."""
-    frames = required(scene, "frames", source)
+def _entries(content, source):
+    """Returns all entries, sorted by name, and notes."""
+    frames = required(content, "frames", source)
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise wrong(source, "frames", frames, "a list of one object {...} per image; export it again")
+        raise _wrong(source, "frames", frames, "a list of one object {...} per image; export it again")
     places = [f"{source}, frame {index}" for index in range(len(frames))]
     paths = [
         check_inside(required(frame, "file_path", where), key="file_path", source=where)
@@ -83,21 +100,21 @@ def _entries(scene, source):
     base = os.path.commonpath([os.path.dirname(path) for path in paths])
     names = []
     for path, image in zip(paths, images, strict=True):
-        whole = image is not None and image.name != os.path.basename(path)  # its extension was left out
+        whole = image is not None and image.name != os.path.basename(path)  # the file_path has no extension
         names.append(os.path.relpath(path if whole else os.path.splitext(path)[0], base or "."))
     entries = sorted(map(_Entry, places, paths, images, names, frames), key=lambda entry: entry.name)
     for entry, other in zip(entries[:-1], entries[1:], strict=True):
         if entry.name == other.name:
             found = f"file_paths {entry.path!r} and {other.path!r} have one name"
-            raise ValueError(f"{source}: {found}, wanted names that differ; remove or rename one")
+            raise ValueError(f"{source}: {found}, expected different names; remove or rename one")
     depths = sum("depth_file_path" in frame or "depth_path" in frame for frame in frames)
     notes = [f"{source}: depth files of {depths} frames are not used"] if depths else []
     return entries, [*_missing(entries, source), *notes]
 
 
 def _find(folder, path):
-    """Returns the file at a path inside the folder, which may lack its extension; None if there is none."""
-    for candidate in (path, *(path + extension for extension in IMAGES)):
+    """Returns the file at a path in the folder, with or without extension; None if there is none."""
+    for candidate in (path, *(path + extension for extension in IMAGE_SUFFIXES)):
         if os.path.isfile(folder / candidate):
             return folder / candidate
     return None
@@ -110,93 +127,207 @@ def _missing(entries, source):
     count = f"{len(names)} of {len(entries)} frames have no file"
     listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     if 2 * len(names) > len(entries):
-        raise ValueError(f"{source}: {count} ({listed}), wanted most of them; copy them or correct file_path")
-    return [f"{source}: {count} and are left out: {listed}"]
+        raise ValueError(f"{source}: {count} ({listed}), expected most of them; copy them or correct file_path")
+    return [f"{source}: {count} and are skipped: {listed}"]
 
 
 def _masks(entries, kept, source):
-    """Returns the mask of every kept entry, all None or none."""
+    """Returns the mask of each kept entry; either all have one or none."""
     without = [entry.where for entry in entries if "mask_path" not in entry.content]
     if len(without) == len(entries):
         return [None] * len(kept)
     if without:
-        raise ValueError(f"{without[0]}: has no mask_path, as others have; wanted all or none; complete them")
+        raise ValueError(f"{without[0]}: has no mask_path, other frames have; expected all or none; complete them")
     masks = []
     for entry in kept:
         path = check_inside(entry.content["mask_path"], key="mask_path", source=entry.where)
         masks.append(_find(source.parent, path))
         if masks[-1] is None:
-            raise ValueError(f"{entry.where}: mask {path!r} does not exist, wanted its file; copy it")
+            raise ValueError(f"{entry.where}: mask {path!r} does not exist, expected its file; copy it")
     return masks
 
 
-def _splits(scene, source, entries, kept):
+def _splits(content, source, entries, kept):
     known = {entry.path for entry in entries}
     places = {entry.path: index for index, entry in enumerate(kept)}
     places |= {os.path.relpath(entry.image, source.parent): index for index, entry in enumerate(kept)}
     splits = {}
     for split in ("train", "val", "test"):
         key = f"{split}_filenames"
-        names = scene.get(key, [])
+        names = content.get(key, [])
         if not isinstance(names, list):
-            raise wrong(source, key, names, "a list of file_paths; correct or remove it")
+            raise _wrong(source, key, names, "a list of file_paths; correct or remove it")
         chosen = set()
         for name in names:
             path = check_inside(name, key=key, source=source)
             if path not in places:
                 found = "which has no file" if path in known else "which is not among the frames"
-                raise ValueError(f"{source}: {key} has {path!r}, {found}; wanted a frame; copy or remove it")
+                raise ValueError(
+                    f"{source}: {key} has {path!r}, {found}; expected a frame with a file; copy or remove it"
+                )
             chosen.add(places[path])
         if chosen:
             splits[split] = tuple(sorted(chosen))
     return splits or None
 
 
-def _camera(scene, source, entry):
+def _camera(content, source, entry):
     matrix = required(entry.content, "transform_matrix", entry.where)
     pose = check_pose(matrix, source=entry.where)
-    return read_camera([(source, scene), (entry.where, entry.content)], to_world=pose, image=entry.image)
+    return _read_camera([(source, content), (entry.where, entry.content)], to_world=pose, image=entry.image)
 
 
-def _points(scene, source):
-    """Returns the points of the PLY file that is named, or None; and notes."""
-    if "ply_file_path" not in scene:
+def _points(content, source):
+    """Returns the points of the file's PLY file, or None; and notes."""
+    if "ply_file_path" not in content:
         return None, []
-    path = source.parent / check_inside(scene["ply_file_path"], key="ply_file_path", source=source)
+    path = source.parent / check_inside(content["ply_file_path"], key="ply_file_path", source=source)
     if not os.path.isfile(path):
-        return None, [f"{source}: ply_file_path {path.name} does not exist, so there are no points"]
+        return None, [f"{source}: ply_file_path {path.name} does not exist, so no points are used"]
     try:
         return read_points(path), []
     except ValueError as error:
         return None, [f"{error}; no points are used"]
 
 
-def _box(scene, source):
+def _box(content, source):
     """Returns instant-ngp's (lower [3], upper [3]) in the file's world, or None; and notes."""
-    if "aabb_scale" not in scene:
+    if "aabb_scale" not in content:
         return None, []
-    if "aabb" in scene or "normal_mts_args" in scene:  # set scale and offset in yet other ways
+    if "aabb" in content or "normal_mts_args" in content:  # these define scale and offset differently
         return None, [f"{source}: aabb_scale is not used, as the file has aabb or normal_mts_args"]
-    fields = {key: (scene[key], source) for key in ("aabb_scale", "scale") if key in scene}
-    side = number(fields, "aabb_scale", "a number from 1e-6 to 1e6", 1e-6, 1e6)
-    scale = number(fields, "scale", "a number from 1e-6 to 1e6", 1e-6, 1e6) if "scale" in scene else 0.33
-    offset = scene.get("offset", 0.5)
+    fields = {key: (content[key], source) for key in ("aabb_scale", "scale") if key in content}
+    side = _number(fields, "aabb_scale", "a number from 1e-6 to 1e6", 1e-6, 1e6)
+    scale = _number(fields, "scale", "a number from 1e-6 to 1e6", 1e-6, 1e6) if "scale" in content else 0.33
+    offset = content.get("offset", 0.5)
     offset = offset if isinstance(offset, list) else [offset] * 3
     if len(offset) != 3 or not all(is_number(value) for value in offset):
-        raise wrong(source, "offset", scene["offset"], "three numbers; correct or remove it")
-    # The cube is the same in every order of the axes, so their cycle needs no undoing.
+        raise _wrong(source, "offset", content["offset"], "three numbers; correct or remove it")
+    # A cube around 0.5 is invariant under the cyclic permutation of the axes, which is therefore not undone.
     center, half = (0.5 - np.array(offset, np.float64)) / scale, 0.5 * side / scale
     return (center - half, center + half), []
 
 
-def _check_applied(scene, source):
-    if "applied_transform" in scene:
-        rows = scene["applied_transform"]
+def _check_applied(content, source):
+    if "applied_transform" in content:
+        rows = content["applied_transform"]
         lists = isinstance(rows, list) and len(rows) in (3, 4) and all(isinstance(row, list) for row in rows)
         if not lists or not all(len(row) == 4 and all(map(is_number, row)) for row in rows):
-            raise wrong(source, "applied_transform", rows, "3 or 4 rows of 4 numbers; correct or remove it")
-    if "applied_scale" in scene:
-        number({"applied_scale": (scene["applied_scale"], source)}, "applied_scale", "more than 0", 1e-30)
+            raise _wrong(source, "applied_transform", rows, "3 or 4 rows of 4 numbers; correct or remove it")
+    if "applied_scale" in content:
+        _number({"applied_scale": (content["applied_scale"], source)}, "applied_scale", "more than 0", 1e-30)
+
+
+def _read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: Path) -> Camera:
+    """Returns the float64 camera of one image.
+
+    The center defaults to the middle of the image, the focal length in y to that in x. A perspective lens
+    whose coefficients are all 0 is a pinhole. The size is the stated one. If it is not stated and center or
+    focal depend on it, it is the image's after EXIF rotation; otherwise it is None.
+
+    Args:
+        levels: [(where, entries)]: the file's, then the frame's. Later levels override earlier ones field by
+            field; a later level's angle overrides an earlier one's focal length. where: for messages.
+        to_world: [3, 4].
+        image: opened only if its size is needed.
+
+    Raises:
+        ValueError: names where, what was found, what is expected and what to do.
+    """
+    fields, where = _fields(levels), levels[-1][0]
+    size = [_size(fields, key) for key in "wh"]
+    if None in size and (size != [None, None] or not {"cx", "cy", "fl_x"} <= fields.keys()):
+        found = image_size(image)
+        size = [have if stated is None else stated for stated, have in zip(size, found, strict=True)]
+    lens, distortion = _lens(fields, where)
+    center = [
+        _number(fields, key, "a number of px") if key in fields else length / 2
+        for key, length in zip(("cx", "cy"), size, strict=True)
+    ]
+    return Camera(
+        to_world=to_world,
+        focal=_focal(fields, size, where),
+        center=np.array(center, np.float64),
+        distortion=distortion,
+        lens=lens,
+        height=size[1],
+        width=size[0],
+    )
+
+
+def _number(fields, key, expected, low=-math.inf, high=math.inf):
+    """Returns the float in fields, {key: (value, where)}; ValueError unless it is a number in [low, high]."""
+    value, where = fields[key]
+    if not is_number(value) or not low <= value <= high:
+        raise _wrong(where, key, value, f"{expected}; correct it or export the file again")
+    return float(value)
+
+
+def _wrong(where, key, value, expected):
+    return ValueError(f"{where}: {key} is {short_repr(value)}, expected {expected}")
+
+
+def _fields(levels):
+    """Returns {key: (value, where it is stated)} of all fields of a camera."""
+    fields, keys = {}, (*_OTHERS, *_ANGLES, *_COEFFICIENTS, *_UNSUPPORTED)
+    for where, level in levels:
+        if "fl_x" not in level and any(key in level for key in _ANGLES):
+            fields = {key: field for key, field in fields.items() if key not in ("fl_x", "fl_y")}
+        fields |= {key: (level[key], where) for key in keys if key in level}
+        if "distortion_params" in level:
+            values = level["distortion_params"]
+            if not isinstance(values, list) or len(values) != 6:
+                raise _wrong(where, "distortion_params", values, "the numbers k1 k2 k3 k4 p1 p2; export the file again")
+            fields |= {key: (value, where) for key, value in zip(_COEFFICIENTS, values, strict=True)}
+    return fields
+
+
+def _focal(fields, size, where):
+    lengths = []
+    for axis, pixels in zip("xy", size, strict=True):
+        if f"fl_{axis}" in fields:
+            lengths.append(_number(fields, f"fl_{axis}", "px between 0.001 and 1e9", 1e-3, 1e9))
+        elif f"camera_angle_{axis}" in fields and "fl_x" not in fields:
+            angle = _number(fields, f"camera_angle_{axis}", "radians between 0 and pi", 1e-6, math.pi - 1e-6)
+            lengths.append(0.5 * pixels / math.tan(0.5 * angle))
+    if not lengths:
+        raise ValueError(
+            f"{where}: has no fl_x or camera_angle_x, nor has the file; expected one; export the file again"
+        )
+    return np.array([lengths[0], lengths[-1]], np.float64)
+
+
+def _lens(fields, where):
+    """Returns the lens and its coefficients; the latter are None for a pinhole."""
+    model, place = fields.get("camera_model", (None, where))
+    fisheye, flag = fields.get("is_fisheye", (model == "OPENCV_FISHEYE", where))
+    other = [key for key in _UNSUPPORTED if key in fields]
+    if other or model not in (None, *_PERSPECTIVE, "OPENCV_FISHEYE"):
+        found = f"has {other[0]}" if other else f"camera_model is {short_repr(model)}"
+        expected = f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE"
+        raise ValueError(f"{place}: {found}, expected {expected}; convert the images to one of these")
+    if not isinstance(fisheye, bool) or (model is not None and fisheye != (model == "OPENCV_FISHEYE")):
+        expected = "true or false" if model is None else f"the value that camera_model {model} implies"
+        raise _wrong(flag, "is_fisheye", fisheye, f"{expected}; correct or remove it")
+    values = {key: _number(fields, key, "a number") if key in fields else 0.0 for key in _COEFFICIENTS}
+    for key in ("p1", "p2") if fisheye else ("k4",):
+        if values[key]:
+            kind = "fisheye lens has k1 k2 k3 k4" if fisheye else "perspective lens has k1 k2 k3 p1 p2"
+            raise _wrong(fields[key][1], key, values[key], f"0, as a {kind}; calibrate without it")
+    if fisheye:
+        return "fisheye", np.array([values[key] for key in ("k1", "k2", "k3", "k4")])
+    keys = ("k1", "k2", "p1", "p2", "k3") if values["k3"] else ("k1", "k2", "p1", "p2")
+    distortion = np.array([values[key] for key in keys])
+    return ("opencv", distortion) if distortion.any() else ("pinhole", None)
+
+
+def _size(fields, key):
+    if key not in fields:
+        return None
+    pixels = _number(fields, key, "whole pixels from 1 to 1000000", 1, 1e6)
+    if pixels != int(pixels):
+        raise _wrong(fields[key][1], key, pixels, "whole pixels; correct or remove it")
+    return int(pixels)
 
 
 READER = Reader(read_capture, detect=lambda folder: (folder / "transforms.json").is_file())

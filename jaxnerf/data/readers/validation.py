@@ -1,100 +1,149 @@
-"""Checks of what a caller passes to a reader, and of the numbers in a JSON file."""
+"""Checks of arguments, and readers of JSON and .npy files of unknown origin."""
 
 import json
+import math
 import operator
 import os
 import unicodedata
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from jaxtyping import Shaped
 
-LARGEST = 3.4e38  # that float32 can hold
+MAX_FLOAT32 = 3.4e38
 
 
-def check_factor(factor):
-    """Returns the downsampling factor as an int; ValueError unless it is a whole number >= 1."""
+def check_factor(factor: Any) -> int:
+    """Returns the downscaling factor as an int; ValueError unless it is a whole number >= 1."""
     try:
         whole = operator.index(factor)
     except TypeError:
         whole = 0
     if whole < 1 or isinstance(factor, bool):
-        raise ValueError(f"factor is {factor!r}, wanted a whole number >= 1; 1 keeps the images as they are")
+        raise ValueError(f"factor is {factor!r}, expected a whole number >= 1; 1 keeps the images as they are")
     return whole
 
 
-def check_range(near, far):
-    """Raises a ValueError unless 0 <= near < far, finite and apart in float32."""
+def check_range(near: Any, far: Any) -> None:
+    """Checks that 0 <= near < far, both finite in float32; raises ValueError otherwise."""
     if not (is_number(near) and is_number(far) and 0 <= near < far):
         raise ValueError(
-            f"near, far is {near!r}, {far!r}, wanted finite numbers with 0 <= near < far; enclose the scene"
+            f"near, far is {near!r}, {far!r}, expected finite numbers with 0 <= near < far; enclose the scene"
         )
 
 
-def check_background(background):
+def check_background(background: Any) -> tuple[float, float, float] | None:
     """Returns a colour as a tuple of 3 floats, or None for None; ValueError unless all are in [0, 1]."""
     if background is None:
         return None
     values = tuple(background) if np.ndim(background) == 1 else ()
     if len(values) != 3 or not all(is_number(value) and 0 <= value <= 1 for value in values):
         raise ValueError(
-            f"background is {background!r}, wanted red, green, blue in [0, 1]; None takes RGB without alpha"
+            f"background is {background!r}, expected red, green, blue in [0, 1]; None takes RGB without alpha"
         )
     return tuple(float(value) for value in values)
 
 
-def is_number(value):
-    """Returns whether value is a real number that float32 can hold; NaN, infinity and booleans are none."""
+def is_number(value: Any) -> bool:
+    """Returns whether a value is a real number that float32 can hold: no NaN, infinity or boolean."""
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return real and bool(abs(value) <= LARGEST)
+    return real and bool(abs(value) <= MAX_FLOAT32)
 
 
-def read_json(path):
-    """Returns the object that a JSON file holds; ValueError if it is unreadable or not an object."""
+def read_json(path: Path) -> dict[str, Any]:
+    """Returns the object in a JSON file; ValueError if the file is unreadable or holds no object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}, wanted a JSON file that can be read") from None
+        raise ValueError(f"{path}: {error.strerror}, expected a readable JSON file; correct the path") from None
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: malformed JSON ({error}), wanted a whole file; export it again") from None
+        raise ValueError(f"{path}: malformed JSON ({error}), expected a complete file; export it again") from None
     if not isinstance(content, dict):
-        raise ValueError(f"{path}: holds a {type(content).__name__}, wanted an object {{...}}; export again")
+        raise ValueError(f"{path}: holds a {type(content).__name__}, expected an object {{...}}; export it again")
     return content
 
 
-def required(entries, key, source):
-    """Returns entries[key]; ValueError that lists the keys that are there if it is missing."""
+def read_npy(path: Path, expected: str) -> Shaped[np.ndarray, "..."]:
+    """Reads the array in a .npy file. Nothing is unpickled, and no more memory is allocated than the file's size.
+
+    Args:
+        path: of the file.
+        expected: its expected content, for the message.
+
+    Raises:
+        ValueError: if the file is missing, truncated or holds no plain array; names the file.
+    """
+    try:
+        with path.open("rb") as file:
+            shape, fortran, dtype = read_npy_header(file)
+            if dtype.hasobject:
+                raise ValueError("Python objects, which are never unpickled")
+            size = math.prod(shape) * dtype.itemsize
+            # Compared before the allocation: a flipped bit in the header may ask for gigabytes.
+            available = path.stat().st_size - file.tell()
+            if size != available:
+                raise ValueError(f"{available} bytes of data, its header says {size}")
+            content = file.read(size)
+        return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file, expected {expected}; correct the folder") from None
+    except Exception as error:  # numpy parses the header as Python, so a damaged one raises almost any exception
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path}: unreadable ({reason}), expected {expected}; export it again") from None
+
+
+def read_npy_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Returns shape, whether the order is Fortran's, and dtype; the file's position is then the data's start.
+
+    Raises:
+        Exception: of almost any type, on a damaged header.
+    """
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version}")
+    return getattr(np.lib.format, f"read_array_header_{version[0]}_0")(file)
+
+
+def required(entries: Mapping[str, Any], key: str, source: Any) -> Any:
+    """Returns entries[key]; ValueError with the existing keys if it is missing."""
     if key not in entries:
-        # A key may hold anything, a line break too: its repr is one line.
-        there = ", ".join(repr(key)[1:-1] for key in sorted(entries))[:200] or "none"
-        raise ValueError(f"{source}: has no {key}, only {there}; wanted {key} as in the Blender format")
+        # A key may contain line breaks; its repr is one line.
+        existing = ", ".join(repr(key)[1:-1] for key in sorted(entries))[:200] or "none"
+        raise ValueError(f"{source}: has no {key}, only {existing}; expected {key}; export the file again")
     return entries[key]
 
 
-def check_inside(name, *, key, source):
-    """Returns a path that a file states, normalised and relative to that file's folder, which it stays in.
+def check_inside(name: Any, *, key: str, source: Any) -> str:
+    """Checks that a path in a file stays in the file's folder, and normalises it.
 
-    Judged by its text and not resolved: a link inside the folder is the owner's choice, ".." the file's.
+    Only the text is checked, links are not resolved: a link in the folder was made by the folder's owner, a
+    ".." in a file possibly by a stranger.
 
     Args:
-        name: what the file has for the key; / or \\ between folders.
-        key, source: where it stands, for the message.
+        name: the file's value of the key; / or \\ between folders.
+        key, source: where it is stated, for the message.
 
     Returns:
-        str with / between folders, such as "images/0001.jpg".
+        The path relative to the folder with / between folders, such as "images/0001.jpg".
 
     Raises:
-        ValueError: if it is no path, or leads out of the folder.
+        ValueError: if the value is no path or leads out of the folder.
     """
-    # Messages and notes show the name: one with line breaks or other control characters is no file's.
+    # Messages and notes contain the name, so line breaks and other control characters are rejected.
     odd = ("Cc", "Cs", "Zl", "Zp")
     if not isinstance(name, str) or not name or any(unicodedata.category(letter) in odd for letter in name):
-        raise ValueError(f"{source}: {key} is {shown(name)}, wanted a path as ./train/r_0; export again")
+        raise ValueError(f"{source}: {key} is {short_repr(name)}, expected a path like ./train/r_0; export it again")
     inside = os.path.normpath(name.replace("\\", "/"))
     if os.path.isabs(inside) or inside.split("/")[0] in (".", ".."):
-        raise ValueError(f"{source}: {key} {shown(name)} leaves the folder, wanted one inside; move the image")
+        raise ValueError(
+            f"{source}: {key} {short_repr(name)} leaves the folder, expected a path inside; move the image"
+        )
     return inside
 
 
-def shown(value):
-    """Returns a value of a file as a message shows it: one line, and not all of a long one."""
+def short_repr(value: Any) -> str:
+    """Returns a value's repr for a message: one line of at most 80 characters."""
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."

@@ -1,6 +1,7 @@
-"""Camera paths from JSON files: frames of one's own, or a path drawn in nerfstudio's viewer."""
+"""Reads camera paths from JSON files: frames that a user lists, or a path drawn in nerfstudio's viewer."""
 
 import math
+import os
 import pathlib
 from typing import NamedTuple
 
@@ -9,71 +10,81 @@ import numpy as np
 from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.readers.validation import is_number, read_json
 
-_MOST_FRAMES, _MOST_PIXELS = 100_000, 16_384
-_FPS = {"least": 0.01, "below": 1000}
+_MAX_FRAMES, _MAX_PIXELS = 100_000, 16_384
+_FPS = {"above": 0.01, "below": 1000}
 
 
 class PathFile(NamedTuple):
-    """What a file says of a path; NaN or None where it says nothing."""
+    """The content of a path file; NaN or None where it states nothing.
 
-    poses: np.ndarray  # [N, 3, 4] float64 in the world of the capture's file
-    focal: np.ndarray  # [N, 2] px
-    center: np.ndarray  # [N, 2] px
-    width: int | None  # px
+    Attributes:
+        poses: [N, 3, 4] float64, camera to world, in the world of the dataset's file.
+        focal: [N, 2] px.
+        center: [N, 2] px.
+        width: px.
+        height: px.
+        fps: frames per second.
+    """
+
+    poses: np.ndarray
+    focal: np.ndarray
+    center: np.ndarray
+    width: int | None
     height: int | None
     fps: float | None
 
 
-def read_path_file(path):
-    """Returns the PathFile that a JSON file holds.
+def read_path_file(path: str | os.PathLike) -> PathFile:
+    """Reads the PathFile that a JSON file holds, in one of two formats.
 
-    Two formats are read. One's own: {"frames": [{"transform_matrix": 4 x 4, fl_x, fl_y, cx, cy}]}, camera to
-    world, x right, y up, looking along -z; w, h, fl_x, fl_y, cx, cy, camera_angle_x and fps may stand beside
-    frames, for all of them. nerfstudio's: {"camera_path": [{"camera_to_world": 16 numbers, row by row,
-    "fov": degrees from top to bottom}], "render_height", "render_width", "fps", "seconds"}; its numbers are
-    in the capture's world only if it was trained without its own centring, turning and scaling.
+    A list of frames: {"frames": [{"transform_matrix": 4 x 4, fl_x, fl_y, cx, cy}]}, camera to world, x right,
+    y up, looking along -z. Beside frames, w, h, fl_x, fl_y, cx, cy, camera_angle_x and fps apply to all.
+
+    nerfstudio's: {"camera_path": [{"camera_to_world": 16 numbers, row by row, "fov": vertical, degrees}],
+    "render_height", "render_width", "fps", "seconds"}. Its numbers are in the dataset's world only if
+    nerfstudio was run without centring, turning and scaling the poses.
 
     Raises:
-        ValueError: names the file and the entry, what was found and what was wanted.
+        ValueError: names the file and the entry, what was found and what is expected.
     """
     path = pathlib.Path(path)
     content = read_json(path)
     for key, read in (("camera_path", _read_nerfstudio), ("frames", _read_frames)):
         if key in content:
             frames = content[key]
-            if not isinstance(frames, list) or not 0 < len(frames) <= _MOST_FRAMES:
-                raise ValueError(f"{path}: {key} is not a list of 1 to {_MOST_FRAMES} objects; make it one")
+            if not isinstance(frames, list) or not 0 < len(frames) <= _MAX_FRAMES:
+                raise ValueError(f"{path}: {key} is not a list of 1 to {_MAX_FRAMES} objects; correct it")
             for index, frame in enumerate(frames):
                 if not isinstance(frame, dict):
-                    raise ValueError(f"{path}, {key}[{index}]: is no object {{...}}; make it one")
+                    raise ValueError(f"{path}, {key}[{index}]: is {frame!r}, expected an object {{...}}; correct it")
             return read(content, frames, path)
     there = ", ".join(sorted(content)) or "nothing"
-    raise ValueError(f"{path}: has {there}, wanted frames or camera_path; see the README on camera paths")
+    raise ValueError(f"{path}: has {there}, expected frames or camera_path; see the documentation of camera paths")
 
 
 def _read_frames(content, frames, path):
     width, height = _number(content, "w", path, whole=True), _number(content, "h", path, whole=True)
-    angle = _number(content, "camera_angle_x", path, least=1e-4, below=math.pi)
+    angle = _number(content, "camera_angle_x", path, above=1e-4, below=math.pi)
     fallback = {}
     if angle and width:
         fallback["fl_x"] = 0.5 * width / math.tan(0.5 * angle)
     elif angle:
-        raise ValueError(f"{path}: has camera_angle_x but no w, wanted both; add w, or give fl_x")
+        raise ValueError(f"{path}: has camera_angle_x but no w, expected both; add w, or give fl_x")
     fallback.update({key: content[key] for key in ("fl_x", "fl_y", "cx", "cy") if key in content})
     poses, focal, center = [], [], []
     for index, frame in enumerate(frames):
         source = f"{path}, frames[{index}]"
         poses.append(check_pose(_required(frame, "transform_matrix", source), source=source))
-        if "fl_x" in frame:  # its own lens whole: a fl_y for all would not belong to it
+        if "fl_x" in frame:  # all of its own lens: a fl_y for all frames would not belong to it
             frame = {**{key: fallback[key] for key in ("cx", "cy") if key in fallback}, **frame}
         else:
             frame = {**fallback, **frame}
         x = _number(frame, "fl_x", source)
         y = _number(frame, "fl_y", source) or x
         if y and not x:
-            raise ValueError(f"{source}: has fl_y but no fl_x, wanted both or fl_x alone; add fl_x")
+            raise ValueError(f"{source}: has fl_y but no fl_x, expected both or fl_x alone; add fl_x")
         focal.append([x, y])
-        center.append([_number(frame, key, source, least=-math.inf) for key in ("cx", "cy")])
+        center.append([_number(frame, key, source, above=-math.inf) for key in ("cx", "cy")])
     return _path_file(poses, focal, center, width, height, _number(content, "fps", path, **_FPS))
 
 
@@ -89,15 +100,15 @@ def _read_nerfstudio(content, frames, path):
             matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
         poses.append(check_pose(matrix, source=source))
         _required(frame, "fov", source)
-        fov = math.radians(_number(frame, "fov", source, least=0.01, below=180))
+        fov = math.radians(_number(frame, "fov", source, above=0.01, below=180))
         focal.append([0.5 * height / math.tan(0.5 * fov)] * 2)
-        aspect = _number(frame, "aspect", source, least=1e-4, below=1e4) or 1.0
+        aspect = _number(frame, "aspect", source, above=1e-4, below=1e4) or 1.0
         width = width or max(round(height * aspect), 1)
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
-        raise ValueError(f"{path}: camera_type is {kind!r}, wanted 'perspective'; no other is rendered")
+        raise ValueError(f"{path}: camera_type is {kind!r}, expected 'perspective'; no other is supported")
     width = _number({"render_width": width}, "render_width", path, whole=True)
-    seconds = _number(content, "seconds", path, least=0.01)
+    seconds = _number(content, "seconds", path, above=0.01)
     fps = _number({"fps": seconds and len(frames) / seconds, **content}, "fps", path, **_FPS)
     return _path_file(poses, focal, [[None, None]] * len(frames), width, height, fps)
 
@@ -110,20 +121,20 @@ def _path_file(poses, focal, center, width, height, fps):
 def _required(entries, key, source):
     if entries.get(key) is None:
         there = ", ".join(sorted(name for name in entries if name != key)) or "nothing"
-        raise ValueError(f"{source}: has {there}, wanted {key} too; add it")
+        raise ValueError(f"{source}: has {there}, expected {key}, too; add it")
     return entries[key]
 
 
-def _number(entries, key, source, *, least=0.0, below=math.inf, whole=False):
-    """Returns entries[key] after checking that it is a number between; None where there is none."""
+def _number(entries, key, source, *, above=0.0, below=math.inf, whole=False):
+    """Returns entries[key] after checking that it is a number in the range; None where there is none."""
     value = entries.get(key)
     if value is None:
         return None
     if whole:
-        if not is_number(value) or value != int(value) or not 1 <= value <= _MOST_PIXELS:
-            raise ValueError(f"{source}: {key} is {value!r}, wanted 1 to {_MOST_PIXELS} pixels; correct it")
+        if not is_number(value) or value != int(value) or not 1 <= value <= _MAX_PIXELS:
+            raise ValueError(f"{source}: {key} is {value!r}, expected 1 to {_MAX_PIXELS} pixels; correct it")
         return int(value)
-    if not is_number(value) or not least < value < below:
-        span = f" between {least:g} and {below:g}" if below < math.inf else f" above {least:g}"
-        raise ValueError(f"{source}: {key} is {value!r}, wanted a number{span}; correct it")
+    if not is_number(value) or not above < value < below:
+        span = f" between {above:g} and {below:g}" if below < math.inf else f" above {above:g}"
+        raise ValueError(f"{source}: {key} is {value!r}, expected a number{span}; correct it")
     return float(value)

@@ -1,4 +1,4 @@
-"""A grid for a scene trained along whole rays: what its views need is in it, and fog and insides are not."""
+"""visible_grid keeps the cells that views need; thin fog and the insides of objects are empty."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ WIRE = 0.02  # its radius; a cell's side is 0.083
 
 @pytest.fixture(scope="module")
 def schedule():
-    options = {"threshold": 0.01, "update_every": 1, "look_at_once": 2**15}
+    options = {"threshold": 0.01, "update_every": 1, "cells_per_update": 2**15}
     bounds = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     return make_grid_schedule(*bounds, resolution=SIDE, step_size=STEP, field=Field(None, None), **options)
 
@@ -35,7 +35,7 @@ def scene(x, viewdirs):
 
 @pytest.fixture(scope="module")
 def grid(schedule):
-    find = jax.jit(lambda rays: visible_grid(scene, schedule, rays, max_samples=2**14, background=None))
+    find = jax.jit(lambda rays: visible_grid(scene, rays, **schedule.box(), max_samples=2**14, background=None))
     return find(rays_past_origin(0, 2**15))
 
 
@@ -45,19 +45,19 @@ def kinds_of_cells():
     return np.sqrt(x**2 + y**2 + z**2), np.hypot(x - 0.75, y)
 
 
-def test_neither_fog_nor_the_inside_of_a_wall_is_kept(grid):
+def test_fog_and_the_inside_of_an_object_are_empty(grid):
     occupied, (from_ball, from_wire) = np.asarray(grid.occupied), kinds_of_cells()
     assert occupied.any()
     assert not occupied[(from_ball > 0.48) & (from_wire > 0.09)].any()
     assert not occupied[from_ball < 0.2].any()
 
 
-def test_what_is_thinner_than_a_cell_is_kept_where_a_view_has_seen_it(grid):
+def test_a_visible_wire_thinner_than_a_cell_is_kept(grid):
     occupied, (_, from_wire) = np.asarray(grid.occupied), kinds_of_cells()
     assert (occupied & (from_wire < 0.06)).any(axis=(0, 1)).mean() > 0.9
 
 
-def test_pictures_are_what_they_were_without_the_fog(schedule, grid):
+def test_images_are_those_of_the_scene_without_fog(schedule, grid):
     rays = rays_past_origin(1, 256)
     samples = march_rays(None, grid, rays, step_size=STEP, cell=schedule.cell)
     everywhere = schedule.create(jnp.ones((SIDE,) * 3, bool))

@@ -1,4 +1,4 @@
-"""The grid of what may be occupied: where its cells are, what looks find, and what it leaves out."""
+"""The occupancy grid: where its cells are, what updates find, and which samples it masks."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ from jaxnerf.core.occupancy.grid import (
     update_grid,
 )
 
-SIZES = (16, 12, 14)  # cells of the box that is looked at
+SIZES = (16, 12, 14)  # cells of the box that is updated
 LOWER, UPPER = np.float32([-3.0, -2.0, -2.5]), np.float32([3.0, 2.5, 2.0])
 is_occupied = compiled(is_occupied)
 mask_samples = compiled(mask_samples)
@@ -37,7 +37,7 @@ def one_ray(origin, direction):
 
 
 @compiled
-def look(key, grid, cells):
+def update(key, grid, cells):
     return update_grid(key, grid, fog, cells, threshold=0.5, decay=0.5)
 
 
@@ -49,7 +49,7 @@ def middles(grid):
 
 
 @pytest.mark.parametrize("axis, size", [(0, 6), (1, 5), (2, 8)])
-def test_a_cell_is_found_by_hand(axis, size):
+def test_each_position_is_in_its_cell(axis, size):
     """Along one axis, from the middle of the box's first cell: every other cell is empty."""
     cell = 3 / np.float32([6, 5, 8])
     direction = 2 * np.eye(3)[axis]
@@ -62,7 +62,7 @@ def test_a_cell_is_found_by_hand(axis, size):
     )
 
 
-def test_rays_are_cut_to_the_box():
+def test_rays_are_clipped_to_the_box():
     grid = full_grid(half=1.0)
     directions = np.float32([[2, 0, 0], [2, 0, 0], [0, 0, 1], [1, 1, 0], [-1, 0, 0]])
     origins = np.float32([[-3, 0, 0], [-3, 2, 0], [0.5, 0.5, 0], [-2, -2, 0.5], [-3, 0, 0]])
@@ -74,26 +74,26 @@ def test_rays_are_cut_to_the_box():
     np.testing.assert_array_equal(got.near[[1, 4]], got.far[[1, 4]])
 
 
-def test_looks_leave_out_what_is_empty_and_keep_what_is_not():
+def test_updates_empty_cells_without_density_and_keep_the_others():
     grid = create_grid(LOWER, UPPER, np.ones(SIZES, bool), initial_density=1.9)
     cells = np.arange(np.prod(SIZES), dtype=np.int32)
-    first = look(jax.random.key(0), grid, cells)
-    assert first.occupied.all()  # one look is not enough: 0.95 is left of what was assumed
-    grid = look(jax.random.key(1), first, cells)
+    first = update(jax.random.key(0), grid, cells)
+    assert first.occupied.all()  # one update is not enough: it leaves 0.95 of the initial density
+    grid = update(jax.random.key(1), first, cells)
     places, half = middles(grid)
     away = np.linalg.norm(places, axis=-1)
     radius = np.sqrt(np.log(4 / 0.5) / 2)  # where the density is at the threshold
-    assert grid.occupied[away < radius].all()  # the neighbours keep what one look might miss
+    assert grid.occupied[away < radius].all()  # the neighbours keep what one update might miss
     assert not grid.occupied[away > radius + 3.1 * half].any()  # its own cell's half, and a neighbour
     truth = 4 * np.exp(-2 * away**2)
     assert np.corrcoef(np.maximum(grid.density_mean, 0).reshape(-1), truth.reshape(-1))[0, 1] > 0.95
     np.testing.assert_array_equal(grid.density_mean < 0, ~grid.occupied)
 
 
-def test_a_look_at_some_cells_leaves_the_others_as_they_were():
+def test_an_update_of_some_cells_does_not_change_the_others():
     grid = checked_grid(1.0, SIZES)
     cells = np.resize(np.int32([0, 3, 77, 300]), 4)
-    got = look(jax.random.key(2), grid, cells)
+    got = update(jax.random.key(2), grid, cells)
     changed = np.flatnonzero(got.density_max != np.asarray(grid.density_max))
     assert set(changed) <= set(cells)
     valid = np.asarray(grid.valid).reshape(-1)
@@ -101,8 +101,8 @@ def test_a_look_at_some_cells_leaves_the_others_as_they_were():
     assert not got.occupied[~np.asarray(grid.valid)].any()
 
 
-def test_each_look_is_inside_its_cell():
-    """The density found in a cell is its own: here it is the number of the cell at x."""
+def test_each_update_evaluates_a_point_inside_its_cell():
+    """Here the density at x is the index of its cell."""
     grid = create_grid(LOWER, UPPER, np.ones(SIZES, bool), initial_density=0.0)
 
     def numbered(x, viewdirs):
@@ -112,12 +112,14 @@ def test_each_look_is_inside_its_cell():
         return (first * SIZES[1] + second) * SIZES[2] + third, x
 
     cells = np.random.default_rng(0).permutation(np.prod(SIZES))[:500].astype(np.int32)
-    update = jax.jit(lambda key: update_grid(key, grid, numbered, cells, threshold=0.5, smoothing=1.0, chunk=96))
-    np.testing.assert_array_equal(update(jax.random.key(0)).density_max.reshape(-1)[cells], cells)
+    update_numbered = jax.jit(
+        lambda key: update_grid(key, grid, numbered, cells, threshold=0.5, smoothing=1.0, chunk=96)
+    )
+    np.testing.assert_array_equal(update_numbered(jax.random.key(0)).density_max.reshape(-1)[cells], cells)
 
 
 def test_a_density_that_is_nan_keeps_its_cell_occupied():
-    """Or it would be silenced: what is NaN must be asked, and show, in pictures and in training."""
+    """So that NaN is evaluated and shows, in images and in training."""
     grid = create_grid(np.full(3, -1.5), np.full(3, 1.5), np.ones((6, 5, 8), bool), initial_density=0.0)
 
     def wrong(x, viewdirs):
@@ -134,7 +136,7 @@ def test_a_density_that_is_nan_keeps_its_cell_occupied():
     np.testing.assert_array_equal(masked.delta > 0, [[False, False, True, True]])
 
 
-def test_a_grid_of_a_scene_that_was_trained_without_one():
+def test_grid_from_scene_finds_the_dense_cells():
     @compiled
     def extract(key):
         return jaxnerf.grid_from_scene(key, fog, LOWER, UPPER, SIZES, threshold=0.5)
@@ -150,10 +152,10 @@ def test_a_grid_of_a_scene_that_was_trained_without_one():
     np.testing.assert_allclose(grid.density_mean[inner], 4 * np.exp(-2 * away[inner] ** 2), atol=0.7)
 
 
-def plain_mask(grid, rays, samples, beyond):
-    """Returns which samples are kept [B, S] and which rays are cut [B], sample by sample, in float64."""
+def plain_mask(grid, rays, samples, max_optical_depth):
+    """Returns which samples are kept [B, S] and which rays are occluded [B], sample by sample, in float64."""
     shape = np.array(grid.density_mean.shape)
-    kept, cut = np.zeros(samples.t.shape, bool), np.zeros(samples.t.shape[0], bool)
+    kept, occluded = np.zeros(samples.t.shape, bool), np.zeros(samples.t.shape[0], bool)
     for ray in range(len(kept)):
         depth = 0.0
         for index in range(kept.shape[1]):
@@ -161,16 +163,16 @@ def plain_mask(grid, rays, samples, beyond):
             x = np.float64(rays.origins[ray]) + t * np.float64(rays.directions[ray])
             cell = np.floor((x - grid.lower) / (np.float64(grid.upper) - grid.lower) * shape).astype(int)
             there = (cell >= 0).all() and (cell < shape).all() and grid.occupied[tuple(cell)] and delta > 0
-            if there and depth > beyond:
-                cut[ray] = True
-            kept[ray, index] = there and depth <= beyond
+            if there and depth > max_optical_depth:
+                occluded[ray] = True
+            kept[ray, index] = there and depth <= max_optical_depth
             if there:
                 depth += grid.density_mean[tuple(cell)] * delta * np.linalg.norm(rays.directions[ray])
-    return kept, cut
+    return kept, occluded
 
 
-@pytest.mark.parametrize("beyond", [np.inf, 2.0, 0.5])
-def test_what_a_guess_hides_is_what_a_plain_loop_hides(beyond):
+@pytest.mark.parametrize("max_optical_depth", [np.inf, 2.0, 0.5])
+def test_samples_are_masked_as_by_a_plain_loop(max_optical_depth):
     grid = checked_grid()
     density = np.random.default_rng(1).exponential(size=(6, 5, 8)) * (
         np.random.default_rng(2).uniform(size=(6, 5, 8)) < 0.8
@@ -178,24 +180,24 @@ def test_what_a_guess_hides_is_what_a_plain_loop_hides(beyond):
     grid = dataclasses.replace(grid, density_mean=jnp.where(grid.occupied, np.float32(density), -1))
     grid = jax.tree.map(np.asarray, grid)
     rays = rays_past_origin(4, 30)
-    # Some samples are left out already, as those behind far.
+    # Some samples are masked already, as those behind far.
     samples = jaxnerf.samples_from_edges(
         None, np.minimum(np.linspace(1, 8, 61, dtype=np.float32), rays.far[:, None] - rays.near[:, None])
     )
-    got, cut = mask_samples(grid, rays, samples, beyond=np.float32(beyond))
-    kept, wanted_cut = plain_mask(grid, rays, samples, beyond)
+    got, occluded = mask_samples(grid, rays, samples, max_optical_depth=np.float32(max_optical_depth))
+    kept, expected_occluded = plain_mask(grid, rays, samples, max_optical_depth)
     np.testing.assert_array_equal(got.delta, np.where(kept, samples.delta, 0))
     np.testing.assert_array_equal(got.t, samples.t)
-    np.testing.assert_array_equal(cut, wanted_cut)
-    if beyond == np.inf:
-        assert not cut.any()
+    np.testing.assert_array_equal(occluded, expected_occluded)
+    if max_optical_depth == np.inf:
+        assert not occluded.any()
         np.testing.assert_array_equal(kept, is_occupied(grid, rays, samples.t) & (samples.delta > 0))
     else:
-        assert 0.1 < cut.mean() < 0.95
+        assert 0.1 < occluded.mean() < 0.95
 
 
 def test_a_t_that_is_nan_is_kept_and_shows():
-    """In training as in pictures: a broken ray must not be taken for an empty one."""
+    """In training as in images: a broken ray must not look like an empty one."""
     samples = jaxnerf.samples_from_points(np.float32([[np.nan, 1.0]]), last_delta=0.1)
     masked, _ = mask_samples(full_grid(), one_ray((0, 0, 0), (1, 0, 0)), samples)
     assert np.isnan(masked.delta[0, 0])
@@ -204,13 +206,13 @@ def test_a_t_that_is_nan_is_kept_and_shows():
 def test_wrong_arguments():
     with pytest.raises(ValueError, match="create_grid: upper"):
         create_grid(np.zeros(3), np.zeros(2), np.ones((2, 2, 2), bool), initial_density=1.0)
-    with pytest.raises(ValueError, match="create_grid: possible"):
+    with pytest.raises(ValueError, match="create_grid: valid"):
         create_grid(np.zeros(3), np.ones(3), np.ones((2, 2), bool), initial_density=1.0)
     with pytest.raises(ValueError, match="update_grid: cells"):
-        look(jax.random.key(0), full_grid(), np.zeros((2, 2), np.int32))
+        update(jax.random.key(0), full_grid(), np.zeros((2, 2), np.int32))
 
 
-def test_a_grid_keeps_marked_cells():
+def test_keep_cells_keeps_marked_cells():
     grid, rays = full_grid(4.0, (8, 8, 8)), rays_past_origin(0, 64)
     t = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=64)
     chosen = np.abs(t - 4) < 0.1
@@ -226,8 +228,8 @@ def test_a_grid_keeps_marked_cells():
     assert (kept.density_mean[~kept.occupied] == -1).all()
 
 
-def test_a_grid_keeps_what_is_between_two_marked_cells():
-    """Of as many rays as there are, one may have passed on either side."""
+def test_keep_cells_keeps_what_is_between_two_marked_cells():
+    """Rays may have passed a cell on both sides."""
     marked = np.zeros((4, 4, 4), bool)
     marked[[0, 2], 0, 0] = marked[3, [1, 3], 3] = marked[0, 3, [0, 2]] = True
     want = marked.copy()
@@ -238,7 +240,7 @@ def test_a_grid_keeps_what_is_between_two_marked_cells():
 
 
 @pytest.mark.parametrize("per_cell", [False, True])
-def test_fog_is_what_is_at_most_as_dense_as_its_cells_threshold(per_cell):
+def test_density_up_to_its_cells_threshold_is_dropped(per_cell):
     grid = full_grid(4.0, (2, 2, 2))
     threshold = np.arange(8, dtype=np.float32).reshape(2, 2, 2) if per_cell else 3.0
     density = np.float32([2.0, 3.0, 3.5, 7.0, 8.0, np.nan])
@@ -254,7 +256,9 @@ def test_without_spread_only_dense_cells_count():
     grid = full_grid(4.0, (8, 8, 8))
     ball = lambda x, viewdirs: (jnp.where((x**2).sum(-1) < 4, 9.0, 0.0), x)  # noqa: E731
     options = {"threshold": 0.5, "decay": 0.0}
-    look = jax.jit(lambda spread: update_grid(jax.random.key(0), grid, ball, jnp.arange(512), spread=spread, **options))
-    wide, narrow = look(True), look(False)
+    update_ball = jax.jit(
+        lambda spread: update_grid(jax.random.key(0), grid, ball, jnp.arange(512), spread=spread, **options)
+    )
+    wide, narrow = update_ball(True), update_ball(False)
     np.testing.assert_array_equal(narrow.occupied, narrow.density_max > 0.5)
     assert 0 < narrow.occupied.sum() < wide.occupied.sum() and wide.occupied[narrow.occupied].all()

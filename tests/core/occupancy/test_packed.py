@@ -1,4 +1,4 @@
-"""The renderer that asks only where there is something gives what render_samples gives."""
+"""render_packed renders as render_samples does, and evaluates the scene in occupied cells only."""
 
 import dataclasses
 import itertools
@@ -11,9 +11,9 @@ import pytest
 import jaxnerf
 from helpers import all_finite, assert_same, checked_grid, compiled, full_grid, rays_past_origin
 from jaxnerf.core import volume_rendering
-from jaxnerf.core.occupancy import early_termination
 from jaxnerf.core.occupancy import packed as packed_module
 from jaxnerf.core.occupancy.grid import is_occupied, mask_samples
+from jaxnerf.core.types import without_samples
 from jaxnerf.fields import analytic
 
 RAYS, SEGMENTS = 24, 40
@@ -43,9 +43,9 @@ def dense(rays, samples):
 
 
 @compiled
-def dense_and_restricted(grid, rays, samples):
-    restricted = jaxnerf.mask_scene(scene, grid)
-    return jaxnerf.render_samples(restricted, rays, samples, background=BACKGROUND)
+def dense_and_masked(grid, rays, samples):
+    masked = jaxnerf.mask_scene(scene, grid)
+    return jaxnerf.render_samples(masked, rays, samples, background=BACKGROUND)
 
 
 packed = compiled(
@@ -89,79 +89,78 @@ def test_a_full_grid_changes_no_gradient(rays, samples):
 
         return jax.jit(jax.grad(value, argnums=(0, 1, 2)))
 
-    def in_pool(scene, rays, samples):
+    def packed_render(scene, rays, samples):
         return jaxnerf.render_packed(scene, full_grid(), rays, samples, max_samples=RAYS * SEGMENTS)
 
     given = jax.tree.map(jnp.asarray, (rays, samples)), jnp.float32(1.3)
-    got = total(in_pool)(*given[0], given[1])
+    got = total(packed_render)(*given[0], given[1])
     want = total(jaxnerf.render_samples)(*given[0], given[1])
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-6 * max(1.0, np.abs(b).max()))
 
 
 def test_an_empty_cell_is_as_if_the_scene_were_empty_there(rays, samples):
-    """By samples that count for nothing, and by a scene with nothing there."""
+    """Compared with samples of length 0, and with a masked scene."""
     grid = checked_grid()
     kept = np.asarray(is_occupied(grid, rays, samples.t))
     assert 0.05 < kept.mean() < 0.6
     got = packed(grid, rays, samples, max_samples=RAYS * SEGMENTS)
     assert_close(got, dense(rays, dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))))
-    assert_close(got, dense_and_restricted(grid, rays, samples))
+    assert_close(got, dense_and_masked(grid, rays, samples))
     assert np.abs(got.rgb - dense(rays, samples).rgb).max() > 0.05
 
 
-def test_what_is_masked_already_needs_no_grid(rays, samples):
+def test_masked_samples_need_no_grid(rays, samples):
     grid = checked_grid()
     masked, _ = compiled(mask_samples)(grid, rays, samples)
     got = packed(None, rays, masked, max_samples=RAYS * SEGMENTS)
     assert_close(got, packed(grid, rays, samples, max_samples=RAYS * SEGMENTS))
 
 
-def test_rays_that_miss_everything_see_the_background(rays, samples):
-    nothing = dataclasses.replace(full_grid(), occupied=jnp.zeros((6, 5, 8), bool))
+def test_rays_that_hit_nothing_show_the_background(rays, samples):
+    empty = dataclasses.replace(full_grid(), occupied=jnp.zeros((6, 5, 8), bool))
     for early_stop_eps in (0.0, 1e-3):
-        got = packed(nothing, rays, samples, max_samples=RAYS * SEGMENTS, early_stop_eps=early_stop_eps)
+        got = packed(empty, rays, samples, max_samples=RAYS * SEGMENTS, early_stop_eps=early_stop_eps)
         np.testing.assert_allclose(got.rgb, np.broadcast_to(BACKGROUND, (RAYS, 3)), rtol=1e-6)
         np.testing.assert_array_equal(got.depth, rays.far)
         np.testing.assert_array_equal(got.disparity, 0)
         np.testing.assert_array_equal(got.opacity, 0)
 
 
-def test_an_overflow_is_counted_and_spares_the_rays_that_fit(rays, samples):
+def test_dropped_samples_are_counted_and_other_rays_are_exact(rays, samples):
     got = packed(full_grid(), rays, samples, max_samples=10 * SEGMENTS + 5)
     np.testing.assert_array_equal(got.num_dropped, [0] * 10 + [SEGMENTS - 5] + [SEGMENTS] * (RAYS - 11))
     first = jax.tree.map(lambda leaf: leaf[:10], got)
     assert_close(first, jax.tree.map(lambda leaf: leaf[:10], dense(rays, samples)))
 
 
-@pytest.mark.parametrize("early_stop_eps, capacity", [(0.5, RAYS), (0.1, 100), (1e-3, RAYS * SEGMENTS)])
-def test_what_stops_early_is_within_its_bound_and_drops_nothing(rays, samples, early_stop_eps, max_samples):
+@pytest.mark.parametrize("early_stop_eps, max_samples", [(0.5, RAYS), (0.1, 100), (1e-3, RAYS * SEGMENTS)])
+def test_early_termination_is_within_its_bound_and_drops_nothing(rays, samples, early_stop_eps, max_samples):
     got, want = (
         packed(full_grid(), rays, samples, max_samples=max_samples, early_stop_eps=early_stop_eps),
         dense(rays, samples),
     )
     assert np.abs(got.rgb - want.rgb).max() <= early_stop_eps + 1e-6
     assert np.abs(got.opacity - want.opacity).max() <= early_stop_eps + 1e-6 and not got.num_dropped.any()
-    stopped = got.opacity > 1 - 1e-6
-    assert stopped.any() == (early_stop_eps > 1e-3) and (got.depth <= want.depth + 1e-5)[stopped].all()
-    np.testing.assert_allclose(got.rgb[~stopped], want.rgb[~stopped], atol=1e-6)
+    terminated = got.opacity > 1 - 1e-6
+    assert terminated.any() == (early_stop_eps > 1e-3) and (got.depth <= want.depth + 1e-5)[terminated].all()
+    np.testing.assert_allclose(got.rgb[~terminated], want.rgb[~terminated], atol=1e-6)
 
 
 @pytest.mark.parametrize("max_samples", [1, 30])
-def test_lanes_fewer_than_rays_leave_nothing_out(rays, samples, max_samples):
-    """In all outputs, and whichever lane a ray is in: one takes them all, or seven some each."""
+def test_fewer_slots_than_rays_render_every_ray(rays, samples, max_samples):
+    """All outputs are the same whether one slot takes all rays or seven take some each."""
     grid = checked_grid()
     got = packed(grid, rays, samples, max_samples=max_samples, early_stop_eps=1e-30)
     assert_close(got, packed(grid, rays, samples, max_samples=RAYS * SEGMENTS), atol=2e-6)
 
 
-def test_a_small_pool_asks_for_less_than_all():
-    """Behind a wall nothing is asked once the pool has come to it."""
-    asked = []
+def test_early_termination_evaluates_no_samples_behind_a_wall():
+    evaluated = []
     wall = analytic.slab(1e4, lower=0.0, upper=1.0).scene
 
     def counting(x, viewdirs):
-        jax.debug.callback(lambda x: asked.append(float(x[0, :, 2].min())), x)
+        jax.debug.callback(lambda x: evaluated.append(float(x[0, :, 2].min())), x)
         return wall(x, viewdirs)
 
     one = np.float32([[0.0, 0.0, -1.0]])
@@ -171,7 +170,7 @@ def test_a_small_pool_asks_for_less_than_all():
     seen = jax.jit(lambda: jaxnerf.render_packed(counting, full_grid(), rays, samples, **options))()
     jax.effects_barrier()
     np.testing.assert_allclose(seen.opacity, 1, atol=1e-4)
-    assert len(asked) == 3 and min(asked) > 0.4  # 12 of 200 samples: 10 before the wall, 2 in it
+    assert len(evaluated) == 3 and min(evaluated) > 0.4  # 12 of 200 samples: 10 before the wall, 2 in it
 
 
 def test_packed_weights_are_those_of_each_ray():
@@ -207,7 +206,7 @@ def test_leading_axes_do_not_matter(rays, samples, shape):
     assert_close(got, jax.tree.map(part, dense(rays, samples)))
 
 
-def test_nan_of_a_scene_is_seen_only_where_it_is_asked(rays, samples):
+def test_nan_of_a_scene_shows_only_where_the_scene_is_evaluated(rays, samples):
     grid = checked_grid()
 
     def half_wrong(x, viewdirs):
@@ -229,7 +228,7 @@ def test_nan_of_a_scene_is_seen_only_where_it_is_asked(rays, samples):
 def test_wrong_arguments(rays, samples):
     pairs, grid = dataclasses.replace(samples, rule="gauss"), full_grid()
     for message, call in {
-        "capacity is 0": lambda: jaxnerf.render_packed(scene, grid, rays, samples, max_samples=0),
+        "max_samples is 0": lambda: jaxnerf.render_packed(scene, grid, rays, samples, max_samples=0),
         "gauss": lambda: jaxnerf.render_packed(scene, grid, rays, pairs, max_samples=30),
         "the scene returned": lambda: jaxnerf.render_packed(
             lambda x, viewdirs: (x, x), grid, rays, samples, max_samples=30
@@ -239,7 +238,7 @@ def test_wrong_arguments(rays, samples):
             jax.eval_shape(call)
 
 
-def test_render_rays_takes_it_as_its_renderer(rays):
+def test_render_rays_accepts_it_as_its_renderer(rays):
     def render(scene, rays, samples, *, background=None):
         return jaxnerf.render_packed(
             scene, full_grid(), rays, samples, max_samples=RAYS * SEGMENTS, background=background
@@ -249,13 +248,13 @@ def test_render_rays_takes_it_as_its_renderer(rays):
     def seen(key, rays):
         options = {"num_samples": SEGMENTS, "background": BACKGROUND}
         got = jaxnerf.render_rays(key, scene, rays, render=render, **options)
-        return got, dataclasses.replace(jaxnerf.render_rays(key, scene, rays, **options), weights=None)
+        return without_samples(got), without_samples(jaxnerf.render_rays(key, scene, rays, **options))
 
     got, want = seen(jax.random.key(4), rays)
     assert_same(got, want, atol=2e-6)
 
 
-needed = compiled(
+visible = compiled(
     lambda scene, grid, rays, samples, error=0.02, background=BACKGROUND: packed_module.visible_samples(
         scene, grid, rays, samples, error=error, max_samples=100, background=background
     ),
@@ -269,11 +268,11 @@ def without(samples, kept):
 
 
 @pytest.mark.parametrize("error", [0.002, 0.02, 0.2])
-def test_without_what_is_not_needed_colours_are_within_the_error(rays, samples, error):
+def test_colours_of_the_visible_samples_are_within_the_error(rays, samples, error):
     grid = checked_grid()
-    kept = needed(scene, grid, rays, samples, error=error)
-    asked = np.asarray(is_occupied(grid, rays, samples.t) & (samples.delta > 0))
-    assert not kept[~asked].any() and 0 < kept.sum() < 0.9 * asked.sum()
+    kept = visible(scene, grid, rays, samples, error=error)
+    occupied = np.asarray(is_occupied(grid, rays, samples.t) & (samples.delta > 0))
+    assert not kept[~occupied].any() and 0 < kept.sum() < 0.9 * occupied.sum()
     whole = packed(grid, rays, samples, max_samples=RAYS * SEGMENTS)
     fewer = packed(grid, rays, without(samples, kept), max_samples=RAYS * SEGMENTS)
     off = abs(whole.rgb - fewer.rgb).max()
@@ -281,8 +280,8 @@ def test_without_what_is_not_needed_colours_are_within_the_error(rays, samples, 
 
 
 @compiled
-def judged(density, colour, rays, samples):
-    """Returns what a ball before white needs for an error of 0.002, and its colours with all and so few."""
+def visible_in_ball(density, colour, rays, samples):
+    """Returns a ball's visible samples before white for an error of 0.002, and colours of all and of these."""
 
     def ball(x, viewdirs):
         inside = (x**2).sum(axis=-1) < 1
@@ -296,34 +295,34 @@ def judged(density, colour, rays, samples):
 
 
 def test_white_fog_before_white_is_not_needed_and_a_body_of_one_colour_is(rays, samples):
-    """However thinly its samples share it: one by one, none of them would be missed."""
+    """Also where the body is divided among many samples, each of which could be dropped on its own."""
     for density in (0.05, 0.5):
-        kept, _, _ = judged(density, jnp.ones(3), rays, samples)
+        kept, _, _ = visible_in_ball(density, jnp.ones(3), rays, samples)
         assert not kept.any()
     for density, colour in itertools.product((0.3, 3.0, 30.0, 1e6), ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
-        kept, whole, fewer = judged(density, jnp.float32(colour), rays, samples)
+        kept, whole, fewer = visible_in_ball(density, jnp.float32(colour), rays, samples)
         assert kept.any()
         np.testing.assert_allclose(fewer, whole, atol=0.0021)
 
 
-def test_what_stops_the_light_is_needed_whatever_its_colour(rays, samples):
+def test_opaque_samples_are_needed_whatever_their_colour(rays, samples):
     wall = lambda x, viewdirs: (jnp.full(x.shape[:-1], 1e6), jnp.ones_like(x))  # noqa: E731
-    kept = needed(wall, full_grid(), rays, samples, background=np.ones(3))
+    kept = visible(wall, full_grid(), rays, samples, background=np.ones(3))
     np.testing.assert_array_equal(kept.sum(axis=-1), 1)
     assert kept[:, 0].all()
 
 
 @pytest.mark.parametrize("wrong", [{"max_samples": 0}, {"samples": "gauss"}])
-def test_needed_samples_names_what_it_cannot_pack(rays, samples, wrong):
+def test_visible_samples_names_wrong_arguments(rays, samples, wrong):
     given = {"max_samples": 8, "samples": samples} | wrong
     if given["samples"] == "gauss":
         given["samples"] = dataclasses.replace(samples, rule="gauss")
-    with pytest.raises(ValueError, match="needed_samples"):
+    with pytest.raises(ValueError, match="visible_samples"):
         packed_module.visible_samples(scene, full_grid(), rays, error=0.1, **given)
 
 
 @pytest.mark.parametrize("most", [7, 2**31 - 1])
-def test_long_rays_come_first_whatever_their_number(most):
+def test_long_rays_come_first_whatever_the_number_of_samples(most):
     count = np.random.default_rng(0).integers(0, 8, 100).astype(np.int32)
-    order = early_termination._longest_first(jnp.asarray(count), most)
+    order = packed_module._longest_first(jnp.asarray(count), most)
     np.testing.assert_array_equal(order, np.argsort(-count, kind="stable"))

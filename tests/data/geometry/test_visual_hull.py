@@ -1,4 +1,4 @@
-"""The visual hull, that no matter is lost by it, and the projection it stands on."""
+"""The visual hull contains all matter; the projection that it uses is the inverse of the rays."""
 
 import dataclasses
 import json
@@ -20,7 +20,7 @@ LENSES = [
     ("opencv", [-0.25, 0.06, 0.002, 0.001, 0.01]),
     ("fisheye", [-0.04, 0.01, -0.003, 0.0005]),
 ]
-SHAPE = (65, 65)  # of the rays of an image of up to 64 x 64; the hull, too, projects as many corners
+SHAPE = (65, 65)  # of the rays of an image of up to 64 x 64; the hull projects as many corners
 BOX = [-1.3] * 3, [1.3] * 3
 SIDES = [[4.0, 0, 0], [0, 4, 0], [0, 0, 4], [-4, 0, 0], [0, -4, 0], [0, 0, -4]]
 fast_project, fast_rays = compiled(project), compiled(rays_from_pixels)
@@ -38,10 +38,10 @@ def a_camera(lens="pinhole", distortion=None, eye=(1.0, -2.0, 1.5), size=60, foc
 
 
 def views_of_balls(cameras, sizes, balls):
-    """Returns Views of opaque balls (center [3], radius), a ray through the middle of each pixel."""
+    """Returns Views of opaque balls (center [3], radius), with one ray through the center of each pixel."""
     pixels = []
     for camera, size in zip(cameras, sizes, strict=True):
-        # One compiled shape for all: what is over repeats the first pixels.
+        # A single compiled shape: the remainder repeats the first pixels.
         rays = fast_rays(camera, np.resize(pixel_grid(size, size), (*SHAPE, 2)), near=0.0, far=9.0)
         hit = np.zeros(SHAPE, bool)
         for center, radius in balls:
@@ -70,18 +70,18 @@ def around(count):
 
 
 def cells_with_matter(balls, resolution):
-    """Returns [R, R, R] bool, the cells of BOX that share a point with a ball."""
+    """Returns [R, R, R] bool, the cells of BOX that intersect a ball."""
     edges = np.linspace(-1.3, 1.3, resolution + 1)
     met = np.zeros((resolution,) * 3, bool)
     for center, radius in balls:
-        # The nearest point of a cell, axis by axis.
+        # Squared distances to the nearest point of a cell, along each axis.
         gaps = [np.maximum(0, np.maximum(edges[:-1] - c, c - edges[1:])) ** 2 for c in center]
         met |= gaps[0][:, None, None] + gaps[1][None, :, None] + gaps[2][None, None] < radius**2
     return met
 
 
 @pytest.mark.parametrize("lens, k", LENSES, ids=str)
-def test_project_undoes_rays_from_pixels(lens, k):
+def test_project_is_the_inverse_of_rays_from_pixels(lens, k):
     camera = a_camera(lens, k)
     pixels = np.random.default_rng(0).uniform(0, 60, (*SHAPE, 2)).astype(np.float32)
     depth = np.linspace(0.5, 9, 65 * 65, dtype=np.float32).reshape(SHAPE)
@@ -92,21 +92,21 @@ def test_project_undoes_rays_from_pixels(lens, k):
     np.testing.assert_allclose(along, depth, atol=1e-5)
 
 
-def test_what_no_pixel_sees_is_projected_to_infinity():
+def test_points_that_no_pixel_sees_are_projected_to_infinity():
     camera = a_camera()
     eye, back = camera.to_world[:, 3], camera.to_world[:, 2]
     pixels, depth = fast_project(camera, np.stack([eye + 2 * back, eye, eye - 2 * back]))
     np.testing.assert_allclose(depth, [-2, 0, 2], atol=1e-6)
     np.testing.assert_array_equal(np.isinf(pixels).all(-1), [True, True, False])
     np.testing.assert_allclose(pixels[2], camera.center, atol=1e-4)
-    # r (1 - r^2 / 2) turns back at r = 0.816 and is 0 again at 1.414, in the middle of the image.
+    # r (1 - r^2 / 2) has its maximum at r = 0.816 and is 0 again at 1.414.
     bent = dataclasses.replace(a_camera("opencv", [-0.5, 0, 0, 0]), to_world=np.eye(3, 4, dtype=np.float32))
     pixels, depth = fast_project(bent, np.float32([[0.8, 0, -1], [0.83, 0, -1], [1.41, 0, -1]]))
     np.testing.assert_array_equal(np.isinf(pixels).all(-1), [False, True, True])
     assert (depth == 1).all()
 
 
-def test_slopes_of_project_are_finite():
+def test_gradients_of_project_are_finite():
     x = np.float32([[0.1, 0.2, -1], [0, 0, -1], [0, 0, 0], [1e3, 0, -1e-3], [0, 0, 1], [3, 0, -1]])
     camera = dataclasses.replace(a_camera(*LENSES[2]), to_world=np.eye(3, 4, dtype=np.float32))
 
@@ -117,7 +117,7 @@ def test_slopes_of_project_are_finite():
     assert all_finite(jax.jit(jax.grad(total))(x))
 
 
-def test_project_batch_is_vmap_is_jit_and_wrong_arguments():
+def test_project_batch_equals_vmap_equals_jit_and_wrong_arguments_are_errors():
     camera = a_camera()
     assert_batch_is_vmap_is_jit(lambda x: project(camera, x), jnp.linspace(0, 1, 24).reshape(2, 4, 3))
     with pytest.raises(ValueError, match="project: x has shape"):
@@ -127,7 +127,7 @@ def test_project_batch_is_vmap_is_jit_and_wrong_arguments():
 
 
 def test_a_ball_from_six_sides():
-    """Six cones around a ball of radius 0.6 leave more than the ball, and less than a cube."""
+    """The hull of six views of a ball of radius 0.6 is larger than the ball and smaller than a cube."""
     balls = [((0.0, 0.0, 0.0), 0.6)]
     views = views_of_balls([a_camera(eye=eye, size=64, focal=60.0) for eye in SIDES], [64] * 6, balls)
     valid = visual_hull(views, *BOX, resolution=64)
@@ -141,10 +141,10 @@ def test_a_ball_from_six_sides():
 
 @pytest.mark.parametrize("lens, k, resolution", [(*LENSES[0], 30), (*LENSES[0], 64), (*LENSES[2], 64)], ids=str)
 def test_no_matter_is_lost(lens, k, resolution):
-    """Small balls and a large one, in images of different sizes, some of which show the box in part."""
+    """Balls of different sizes, in images of different sizes, some of which show only a part of the box."""
     balls = [((0.5, -0.2, 0.3), 0.5), ((-0.9, 0.8, -0.7), 0.06), ((-0.2, -0.4, -1.0), 0.1)]
-    sizes = [64] * 24 if k else [64, 50, 33, 47] * 6  # another size compiles the lens anew
-    wide = (0.8, 1.2, 2.5, 1.4)  # focal over size: the third sees no more than the middle
+    sizes = [64] * 24 if k else [64, 50, 33, 47] * 6  # a lens is compiled for each size
+    wide = (0.8, 1.2, 2.5, 1.4)  # focal / size; the third shows only the center
     cameras = [
         a_camera(lens, k, eye=eye, size=size, focal=wide[i % 4] * size)
         for i, (eye, size) in enumerate(zip(around(24), sizes, strict=True))
@@ -155,26 +155,26 @@ def test_no_matter_is_lost(lens, k, resolution):
     assert valid.mean() < 3 * cells_with_matter(balls, resolution).mean()
 
 
-def test_what_no_view_sees_whole_stays_possible():
+def test_cells_that_no_view_sees_completely_stay_valid():
     views = views_of_balls([a_camera(eye=(4.0, 0, 0), size=64, focal=110.0)], [64], [])
     valid = visual_hull(views, *BOX, resolution=32)
-    assert not valid[:, 14:18, 14:18].any()  # all along its axis
+    assert not valid[:, 14:18, 14:18].any()  # along the camera's axis
     assert valid[20:, 0].all() and valid[20:, -1].all()  # beside its image
     behind = visual_hull(views, [3.9, -0.1, -0.1], [5.0, 0.1, 0.1], resolution=8)
     assert behind.all()  # around and behind the camera
 
 
-def test_pixels_outside_the_mask_tell_nothing():
+def test_pixels_outside_the_mask_are_ignored():
     views = views_of_balls([a_camera(eye=(4.0, 0, 0), size=64, focal=40.0)], [64], [])
     assert not visual_hull(views, *BOX, resolution=16).any()
-    masked = dataclasses.replace(views, mask=np.arange(4096) % 64 < 32)  # the left half counts
+    masked = dataclasses.replace(views, mask=np.arange(4096) % 64 < 32)  # only the left half is used
     valid = visual_hull(masked, *BOX, resolution=16)
     assert not valid[:, :4].any() and valid[:, 10:].all()
 
 
-def test_wrong_arguments():
+def test_wrong_arguments_are_errors():
     views = views_of_balls([a_camera(eye=eye, size=64, focal=40.0) for eye in SIDES], [64] * 6, [])
-    with pytest.raises(ValueError, match=r"6 views leave none of 8\^3 cells possible from \[-1.3"):
+    with pytest.raises(ValueError, match=r"6 views show all of 8\^3 cells from \[-1.3"):
         hull_bounds(views, *BOX, resolution=8)
     opaque = dataclasses.replace(views, pixels=views.pixels[:, :3])
     for function in (visual_hull, hull_bounds):
@@ -186,15 +186,15 @@ def test_wrong_arguments():
 
 
 @pytest.mark.scenes("lego")
-def test_every_pixel_of_unseen_lego_meets_the_hull(scenes_dir, tmp_path):
-    scene = json.loads((scenes_dir / "lego" / "transforms_train.json").read_text())
-    scene["frames"] = scene["frames"][::3]  # reading all takes longest
-    (tmp_path / "transforms_train.json").write_text(json.dumps(scene))
+def test_rays_of_lego_test_pixels_with_alpha_hit_the_hull_of_the_training_views(scenes_dir, tmp_path):
+    content = json.loads((scenes_dir / "lego" / "transforms_train.json").read_text())
+    content["frames"] = content["frames"][::3]  # reading the images takes most of the time
+    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
     (tmp_path / "train").symlink_to(scenes_dir / "lego" / "train")
-    train = blender.load_views(tmp_path, split="train")
+    train = blender.load_blender(tmp_path, split="train")
     valid = visual_hull(train, *BOX, resolution=128)
     assert 0.03 < valid.mean() < 0.2
-    test = blender.load_views(scenes_dir / "lego", split="test")
+    test = blender.load_blender(scenes_dir / "lego", split="test")
     pixels = np.asarray(pixel_grid(800, 800)[::16, ::16]).reshape(-1, 2)
     t = np.linspace(2, 6, 400, dtype=np.float32)[None]  # half a cell apart
     for index in range(0, len(test.offset), 9):

@@ -1,20 +1,17 @@
-"""Worlds of captures, bounds along axes, .npy files of unknown origin, and which format counts."""
+"""Normalised worlds of datasets, and bounds along the cameras' axes."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import captures
 from jaxnerf import Camera
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.geometry.poses import gaze_center
-from jaxnerf.data.readers import base, npy
 from jaxnerf.data.readers.base import Capture, Frame
 
 
 def capture_of(stack, **options):
-    """Returns a Capture of a stack of cameras, without photographs."""
+    """Returns a Capture of a stack of cameras, without image files."""
     frames = []
     for index, pose in enumerate(np.asarray(stack.to_world, np.float64)):
         camera = Camera(
@@ -29,7 +26,7 @@ def capture_of(stack, **options):
 
 
 def assert_similar(before, after, back):
-    """Fails unless `back` takes the poses and points of a capture to those of another, as a similarity."""
+    """Checks that `back` is a similarity that maps the poses and points of `after` to those of `before`."""
     scale = np.cbrt(np.linalg.det(back[:3, :3]))
     turn = back[:3, :3] / scale
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
@@ -41,7 +38,7 @@ def assert_similar(before, after, back):
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0, 0, -1), (1, -1, 0.2)])
-def test_centered_cameras_stand_upright_at_distance_one(up):
+def test_centered_cameras_are_upright_at_distance_one(up):
     stack = captures.orbit(12)
     axis = np.array(up) / np.linalg.norm(up)
     spare = np.cross(axis, [0.3, 0.5, 0.8])
@@ -58,11 +55,11 @@ def test_centered_cameras_stand_upright_at_distance_one(up):
     found = world.poses_of(after)
     np.testing.assert_allclose(gaze_center(found), 0, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(found[:, :, 3], axis=-1), 1, rtol=1e-4)
-    np.testing.assert_allclose(found[:, 2, 0], 0, atol=1e-5)  # all hold the horizon level
+    np.testing.assert_allclose(found[:, 2, 0], 0, atol=1e-5)  # all horizons are level
     assert found[:, 2, 1].mean() > 0
 
 
-def test_a_world_that_is_upright_is_not_turned():
+def test_an_upright_world_is_not_rotated():
     _, back = world.center(capture_of(captures.orbit(12)))
     assert np.abs(back[:3, :3] / np.cbrt(np.linalg.det(back[:3, :3])) - np.eye(3)).max() < 1e-5
     box = (np.full(3, -2.0), np.full(3, 2.0))
@@ -72,7 +69,7 @@ def test_a_world_that_is_upright_is_not_turned():
     assert (inside >= moved.box[0] - 1e-9).all() and (inside <= moved.box[1] + 1e-9).all()
 
 
-def test_recentering_keeps_the_capture_and_sets_the_nearest_bound():
+def test_recentering_is_a_similarity_and_sets_the_nearest_bound():
     stack = captures.front(9)
     before = capture_of(stack)
     before = before._replace(frames=tuple(f._replace(bounds=(2.0 + i, 20.0)) for i, f in enumerate(before.frames)))
@@ -82,20 +79,20 @@ def test_recentering_keeps_the_capture_and_sets_the_nearest_bound():
     np.testing.assert_allclose(world.poses_of(after)[:, :, 3].mean(0), 0, atol=1e-9)
 
 
-def test_who_looks_forward():
+def test_looks_forward():
     assert world.looks_forward(capture_of(captures.front(9)))
     assert not world.looks_forward(capture_of(captures.orbit(9)))
 
 
-def test_cameras_that_all_stand_where_they_look_are_an_error():
+def test_cameras_at_the_point_that_they_look_at_are_an_error():
     stack = captures.orbit(4)
     poses = np.array(stack.to_world)
     poses[:, :, 3] = 0
-    with pytest.raises(ValueError, match="all 4 cameras stand where they look at"):
+    with pytest.raises(ValueError, match="all 4 cameras are at the point that they look at"):
         world.center(capture_of(Camera(to_world=poses, focal=stack.focal, center=stack.center, height=9, width=9)))
 
 
-def test_bounds_hold_what_the_points_say():
+def test_bounds_enclose_the_points():
     stack = captures.orbit(6)
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
     plain = capture_of(stack, points=points)
@@ -109,71 +106,15 @@ def test_bounds_hold_what_the_points_say():
     assert bounds.with_bounds(few).frames[0].bounds == bounds.with_bounds(plain).frames[0].bounds
 
 
-def test_bounds_without_points_begin_where_others_see_and_end_with_the_box():
+def test_bounds_without_points_begin_at_the_frusta_of_others_and_end_at_the_box():
     box = (np.full(3, -1.5), np.full(3, 1.5))
     for options, farthest in (({}, 40.1), ({"box": box}, 4 + 1.5 * 3**0.5 + 0.1)):
         for frame in bounds.with_bounds(capture_of(captures.orbit(12), **options)).frames:
             near, far = frame.bounds
-            assert 0 < near < 3.5 and 5 < far < farthest  # from behind a camera others see what is before it
+            assert 0 < near < 3.5 and 5 < far < farthest  # other cameras see the space in front of each
 
 
-def test_given_bounds_stay():
+def test_existing_bounds_are_kept():
     plain = capture_of(captures.orbit(4))
     given = plain._replace(frames=tuple(frame._replace(bounds=(1.0, 2.0)) for frame in plain.frames))
     assert bounds.with_bounds(given) is given
-
-
-def test_npy_reads_what_numpy_wrote(tmp_path):
-    path = tmp_path / "a.npy"
-    for array in (
-        np.arange(6.0).reshape(2, 3),
-        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
-        np.float32(3),
-    ):
-        np.save(path, array)
-        np.testing.assert_array_equal(npy.read_npy(path, "numbers"), array)
-
-
-def test_npy_unpickles_nothing(tmp_path):
-    path = tmp_path / "a.npy"
-    np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(ValueError, match="a.npy: unreadable .Python objects, which are never unpickled."):
-        npy.read_npy(path, "numbers")
-    with pytest.raises(ValueError, match="b.npy: no such file, wanted numbers"):
-        npy.read_npy(tmp_path / "b.npy", "numbers")
-
-
-@settings(deadline=None, max_examples=150)
-@given(data=st.data())
-def test_a_damaged_npy_is_an_array_or_one_line(tmp_path_factory, data):
-    path = tmp_path_factory.mktemp("npy") / "a.npy"
-    np.save(path, np.arange(17.0 * 3).reshape(3, 17))
-    content = bytearray(path.read_bytes())
-    if data.draw(st.booleans()):
-        content = content[: data.draw(st.integers(0, len(content) - 1))]
-    else:
-        for _ in range(data.draw(st.integers(1, 4))):
-            content[data.draw(st.integers(0, 200))] ^= 1 << data.draw(st.integers(0, 7))
-    path.write_bytes(content)
-    try:
-        assert npy.read_npy(path, "floats").nbytes <= len(content)
-    except ValueError as error:
-        assert "a.npy: unreadable" in str(error) and "\n" not in str(error)
-
-
-def test_which_format_counts(tmp_path):
-    with pytest.raises(ValueError, match="holds no capture"):
-        base.formats_in(tmp_path)
-    for name, found in (
-        ("poses_bounds.npy", ["llff"]),
-        ("sparse/0/cameras.bin", ["llff"]),
-        ("transforms.json", ["transforms", "llff"]),
-        ("transforms_train.json", ["blender", "transforms", "llff"]),
-    ):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("")
-        assert base.formats_in(tmp_path) == found
-    for name in ("images.bin", "points3D.bin"):
-        (tmp_path / "sparse/0" / name).write_text("")
-    assert base.formats_in(tmp_path) == ["blender", "transforms", "colmap", "llff"]

@@ -1,4 +1,4 @@
-"""Smaller copies of photographs: which is which, how small they are, and the factor that fits."""
+"""Downscaled copies of images: their assignment, their scale, and the factors that they allow."""
 
 import dataclasses
 
@@ -37,31 +37,31 @@ def a_capture(folder, names, kind="png", size=(8, 16), format="transforms"):
 NAMES = ("a", "b", "c")
 
 
-def test_a_camera_without_a_size_shrinks_with_the_copy(tmp_path):
+def test_a_camera_without_a_size_is_scaled_for_the_copy(tmp_path):
     put(tmp_path / "images", NAMES)
     put(tmp_path / "images_2", NAMES, 4, 8, seed=50)
-    views = load_images.load_views(a_capture(tmp_path / "images", NAMES, size=None), factor=2, hold=9)
+    views = load_images.load_capture(a_capture(tmp_path / "images", NAMES, size=None), factor=2, hold=9)
     np.testing.assert_array_equal(views.pixels[:32], image(51, 4, 8).reshape(-1, 3))
     np.testing.assert_allclose(views.cameras.focal, [[5, 5]] * 2)
     np.testing.assert_allclose(views.cameras.center, [[4, 2]] * 2)
 
 
-def test_a_folder_is_as_small_as_its_images_are(tmp_path):
-    """Frames in images_2 with cameras of that size are not shrunk; a camera may be for a larger image."""
+def test_the_scale_of_a_folder_is_measured_on_its_images(tmp_path):
+    """Frames in images_2 are not shrunk if their cameras have that size; a camera may be of a larger image."""
     put(tmp_path / "images_2", NAMES, 4, 8)
     own = a_capture(tmp_path / "images_2", NAMES, size=(4, 8))
-    assert load_images.load_views(own, hold=9).size.tolist() == [[4, 8]] * 2
-    assert load_images.load_views(own, factor=2, hold=9).size.tolist() == [[2, 4]] * 2
+    assert load_images.load_capture(own, hold=9).size.tolist() == [[4, 8]] * 2
+    assert load_images.load_capture(own, factor=2, hold=9).size.tolist() == [[2, 4]] * 2
     larger = a_capture(tmp_path / "images_2", NAMES, size=(8, 16))
-    views = load_images.load_views(larger, factor=2, hold=9)
+    views = load_images.load_capture(larger, factor=2, hold=9)
     assert views.size.tolist() == [[4, 8]] * 2
     np.testing.assert_allclose(views.cameras.focal, [[5, 5]] * 2)
     assert downscaled_copies.factor_for(larger, 8) == (2, 16)
     with pytest.raises(ValueError, match="2 times smaller than their cameras, data.factor is 1"):
-        load_images.load_views(larger, hold=9)
+        load_images.load_capture(larger, hold=9)
 
 
-def test_copies_pair_by_name_and_else_by_order(tmp_path):
+def test_copies_are_assigned_by_name_or_else_by_order(tmp_path):
     put(tmp_path / "images", NAMES)
     put(tmp_path / "images_2", ("z", *NAMES), 4, 8, kind="jpg", seed=50)
     found, rest = downscaled_copies.choose_copies(a_capture(tmp_path / "images", NAMES).frames, 2)
@@ -71,28 +71,25 @@ def test_copies_pair_by_name_and_else_by_order(tmp_path):
     assert [frame.image.name for frame in found] == ["0.png", "1.png", "2.png"] and rest == 1
 
 
-def test_another_set_of_images_is_no_copy(tmp_path):
-    """One name off: pairing by order would give each view its neighbour's photograph."""
+def test_a_folder_of_other_images_is_no_copy(tmp_path):
+    """Names are shifted by one, so assignment by order gives each view its neighbour's image."""
     put(tmp_path / "images", NAMES)
     put(tmp_path / "images_2", ("b", "c", "d"), 4, 8)
     found, rest = downscaled_copies.choose_copies(a_capture(tmp_path / "images", NAMES).frames, 2)
     assert [frame.image.parent.name for frame in found] == ["images"] * 3 and rest == 2
 
 
-def test_folders_with_other_names_and_other_kinds_of_images(tmp_path):
+def test_folders_with_other_names_and_images_of_other_formats(tmp_path):
     put(tmp_path / "images_undistorted", NAMES)
-    assert (
-        load_images.load_views(a_capture(tmp_path / "images_undistorted", NAMES), hold=9).size.tolist() == [[8, 16]] * 2
-    )
+    views = load_images.load_capture(a_capture(tmp_path / "images_undistorted", NAMES), hold=9)
+    assert views.size.tolist() == [[8, 16]] * 2
     put(tmp_path / "images", NAMES, kind="bmp")
     put(tmp_path / "images_2", ("x", "y", "w"), 4, 8)
-    assert (
-        load_images.load_views(a_capture(tmp_path / "images", NAMES, kind="bmp"), factor=2, hold=9).size.tolist()
-        == [[4, 8]] * 2
-    )
+    views = load_images.load_capture(a_capture(tmp_path / "images", NAMES, kind="bmp"), factor=2, hold=9)
+    assert views.size.tolist() == [[4, 8]] * 2
 
 
-def test_a_mask_for_the_original_shrinks_with_the_copy(tmp_path):
+def test_a_mask_of_the_original_is_shrunk_for_the_copy(tmp_path):
     put(tmp_path / "images", NAMES)
     put(tmp_path / "images_2", NAMES, 4, 8)
     mask = np.ones((8, 16), bool)
@@ -100,14 +97,14 @@ def test_a_mask_for_the_original_shrinks_with_the_copy(tmp_path):
     captures.write_image(tmp_path / "mask.png", np.repeat(np.uint8(255 * mask)[..., None], 3, -1))
     capture = a_capture(tmp_path / "images", NAMES)
     capture = capture._replace(frames=tuple(frame._replace(mask=tmp_path / "mask.png") for frame in capture.frames))
-    views = load_images.load_views(capture, factor=2, hold=9)
-    wanted = np.ones((4, 8), bool)
-    wanted[1, 2] = False
-    np.testing.assert_array_equal(views.mask[:32].reshape(4, 8), wanted)
+    views = load_images.load_capture(capture, factor=2, hold=9)
+    expected = np.ones((4, 8), bool)
+    expected[1, 2] = False
+    np.testing.assert_array_equal(views.mask[:32].reshape(4, 8), expected)
 
 
 @pytest.mark.parametrize("turn", [3, 6])
-def test_pixels_stay_as_stored_where_the_cameras_count_them_so(tmp_path, turn):
+def test_exif_orientation_is_ignored_if_cameras_refer_to_stored_pixels(tmp_path, turn):
     from PIL import Image
 
     exif = Image.Exif()
@@ -115,14 +112,14 @@ def test_pixels_stay_as_stored_where_the_cameras_count_them_so(tmp_path, turn):
     (tmp_path / "images").mkdir()
     Image.fromarray(image(0)).save(tmp_path / "images" / "a.png", exif=exif)
     capture = a_capture(tmp_path / "images", ("a",))
-    frame = capture.frames[0]._replace(turned=False)
-    stored = load_images.load_views(capture._replace(frames=(frame,), splits={"train": (0,)}))
+    frame = capture.frames[0]._replace(follow_exif=False)
+    stored = load_images.load_capture(capture._replace(frames=(frame,), splits={"train": (0,)}))
     np.testing.assert_array_equal(stored.pixels, image(0).reshape(-1, 3))
     assert read_image(frame.image).shape == ((8, 16, 3) if turn == 3 else (16, 8, 3))
 
 
 @pytest.mark.parametrize(
-    "format, size, width, wanted",
+    "format, size, width, expected",
     [
         ("blender", (512, 512), 200, 2),
         ("blender", (800, 800), 200, 4),
@@ -130,14 +127,14 @@ def test_pixels_stay_as_stored_where_the_cameras_count_them_so(tmp_path, turn):
         ("transforms", (100, 150), 800, 1),
     ],
 )
-def test_the_factor_for_a_width_is_one_that_works(tmp_path, format, size, width, wanted):
+def test_the_factor_for_a_width_is_valid(tmp_path, format, size, width, expected):
     capture = a_capture(tmp_path, NAMES, size=size, format=format)
     small = Frame("a", tmp_path / "a.png", dataclasses.replace(capture.frames[0].camera))
     put(tmp_path, ("a",), *size)
-    assert downscaled_copies.factor_for(capture._replace(frames=(small,)), width) == (wanted, size[1])
+    assert downscaled_copies.factor_for(capture._replace(frames=(small,)), width) == (expected, size[1])
 
 
-def test_the_factor_is_a_multiple_of_what_lies_there(tmp_path):
+def test_the_factor_is_a_multiple_of_the_scale_of_existing_copies(tmp_path):
     put(tmp_path / "images_4", NAMES, 10, 20)
     put(tmp_path / "images_8", NAMES, 5, 10)
     capture = a_capture(tmp_path / "images_4", NAMES, size=(40, 80))

@@ -1,4 +1,4 @@
-"""From photographs to Views: splits, sizes, bits, alpha, masks, orientation, lenses, smaller copies."""
+"""Views of a Capture: splits, sizes, bits, alpha, masks, orientation, lenses, downscaled copies."""
 
 import dataclasses
 
@@ -45,10 +45,10 @@ def a_capture(folder, images, cameras=None, masks=None, splits=None, **options):
     return Capture("test", folder, tuple(frames), splits=splits, **options)
 
 
-def test_pixels_bounds_and_cameras_are_the_files(tmp_path):
+def test_pixels_bounds_and_cameras_are_those_of_the_files(tmp_path):
     images = [pixels(index) for index in range(9)]
     capture = a_capture(tmp_path, images)
-    test, train = (load_images.load_views(capture, split=split) for split in ("test", "train"))
+    test, train = (load_images.load_capture(capture, split=split) for split in ("test", "train"))
     assert test.names == ("view0", "view8") and len(train.names) == 7
     np.testing.assert_array_equal(test.pixels, np.concatenate([images[0], images[8]]).reshape(-1, 3))
     np.testing.assert_array_equal(test.size, [[HEIGHT, WIDTH]] * 2)
@@ -63,11 +63,11 @@ def test_pixels_bounds_and_cameras_are_the_files(tmp_path):
     )
     np.testing.assert_allclose(cameras.focal, [[10, 11]] * 2)
     assert test.pixels.dtype == np.uint8 and test.mask is None and test.background is None
-    np.testing.assert_array_equal(load_images.load_views(capture, split="val").pixels, test.pixels)
+    np.testing.assert_array_equal(load_images.load_capture(capture, split="val").pixels, test.pixels)
 
 
 @pytest.mark.parametrize(
-    "splits, split, wanted",
+    "splits, split, expected",
     [
         ({"train": (0, 2), "test": (1,)}, "train", [0, 2]),
         ({"train": (0, 2), "test": (1,)}, "val", [1]),
@@ -77,12 +77,12 @@ def test_pixels_bounds_and_cameras_are_the_files(tmp_path):
         (None, "test", [0]),
     ],
 )
-def test_who_is_in_a_split(tmp_path, splits, split, wanted):
+def test_split_indices(tmp_path, splits, split, expected):
     capture = a_capture(tmp_path, [pixels(index) for index in range(3)], splits=splits)
-    assert load_images.split_indices(capture, split).tolist() == wanted
+    assert load_images.split_indices(capture, split).tolist() == expected
 
 
-def test_an_unknown_or_empty_split_is_said(tmp_path):
+def test_an_unknown_or_empty_split_is_an_error(tmp_path):
     capture = a_capture(tmp_path, [pixels(0)], splits={"train": (0,)})
     with pytest.raises(ValueError, match="split is 'all'"):
         load_images.split_indices(capture, "all")
@@ -92,25 +92,25 @@ def test_an_unknown_or_empty_split_is_said(tmp_path):
 
 def test_sizes_and_cameras_may_differ(tmp_path):
     images = [pixels(0), pixels(1, 4, 10), pixels(2, 5, 5)]
-    views = load_images.load_views(a_capture(tmp_path, images), hold=9)
+    views = load_images.load_capture(a_capture(tmp_path, images), hold=9)
     np.testing.assert_array_equal(views.size, [[4, 10], [5, 5]])
     np.testing.assert_array_equal(views.offset, [0, 40])
     assert views.cameras.height is None and views.cameras.width is None
     np.testing.assert_array_equal(views.pixels[40:], images[2].reshape(-1, 3))
 
 
-def test_a_factor_averages_and_cuts_the_rest(tmp_path):
+def test_a_factor_averages_squares_and_crops_the_rest(tmp_path):
     image = pixels(0, 7, 10)
-    views = load_images.load_views(a_capture(tmp_path, [image] * 2), factor=3, hold=9)
+    views = load_images.load_capture(a_capture(tmp_path, [image] * 2), factor=3, hold=9)
     mean = image[:6, :9].reshape(2, 3, 3, 3, 3).mean((1, 3)) / 255
     np.testing.assert_allclose(views.pixels / 65535, mean.reshape(-1, 3), atol=1e-5)
     np.testing.assert_allclose(views.cameras.focal, [[10 / 3, 11 / 3]])
     np.testing.assert_allclose(views.cameras.center, [[1.5, 3.25 / 3]])
     with pytest.raises(ValueError, match="too small for factor 20"):
-        load_images.load_views(a_capture(tmp_path, [image] * 2), factor=20)
+        load_images.load_capture(a_capture(tmp_path, [image] * 2), factor=20)
 
 
-def test_the_largest_fitting_folder_of_smaller_copies_is_used(tmp_path):
+def test_the_smallest_copies_that_a_factor_allows_are_used(tmp_path):
     images = [pixels(index, 8, 16) for index in range(2)]
     capture = a_capture(tmp_path, images)
     for number, seed in ((2, 50), (3, 60)):
@@ -118,78 +118,78 @@ def test_the_largest_fitting_folder_of_smaller_copies_is_used(tmp_path):
         for index in range(2):
             name = f"renamed{index}.png"
             iio.imwrite(tmp_path / f"images_{number}" / name, pixels(seed + index, 8 // number, 16 // number))
-    half = load_images.load_views(capture, factor=2, hold=9)
+    half = load_images.load_capture(capture, factor=2, hold=9)
     np.testing.assert_array_equal(half.pixels, pixels(51, 4, 8).reshape(-1, 3))
     np.testing.assert_allclose(half.cameras.focal, [[5, 5.5]])
-    quarter = load_images.load_views(capture, factor=4, hold=9)
+    quarter = load_images.load_capture(capture, factor=4, hold=9)
     mean = pixels(51, 4, 8).reshape(2, 2, 4, 2, 3).mean((1, 3)) / 255
     np.testing.assert_allclose(quarter.pixels / 65535, mean.reshape(-1, 3), atol=1e-5)
-    whole = load_images.load_views(capture, hold=9)
+    whole = load_images.load_capture(capture, hold=9)
     np.testing.assert_array_equal(whole.pixels, images[1].reshape(-1, 3))
     (tmp_path / "images").rename(tmp_path / "images_8")
     frames = tuple(f._replace(image=tmp_path / "images_8" / f.image.name) for f in capture.frames)
-    assert load_images.load_views(capture._replace(frames=frames), hold=9).size.tolist() == [[8, 16]]
+    assert load_images.load_capture(capture._replace(frames=frames), hold=9).size.tolist() == [[8, 16]]
 
 
-def test_an_image_of_another_size_than_its_camera_is_said(tmp_path):
+def test_an_image_whose_size_is_not_its_cameras_is_an_error(tmp_path):
     capture = a_capture(tmp_path, [pixels(0), pixels(1, 6, 7)], cameras=[a_camera()] * 2)
     with pytest.raises(ValueError, match=r"view1.png: is 7 x 6, its camera is for 8 x 6"):
-        load_images.load_views(capture)
+        load_images.load_capture(capture)
 
 
-def test_a_camera_for_a_larger_photograph_shrinks_with_it(tmp_path):
+def test_the_camera_of_a_larger_image_is_scaled(tmp_path):
     camera = a_camera(4 * HEIGHT + 1, 4 * WIDTH - 1)
     capture = a_capture(tmp_path, [pixels(0)] * 2, cameras=[camera] * 2)
-    views = load_images.load_views(capture, factor=4, hold=9)
+    views = load_images.load_capture(capture, factor=4, hold=9)
     np.testing.assert_allclose(views.cameras.focal, [[10 * 8 / 31, 11 * 6 / 25]], rtol=1e-6)
 
 
-def test_masks_follow_the_pixels(tmp_path):
+def test_masks_are_shrunk_with_the_pixels(tmp_path):
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[2, 3] = False
     capture = a_capture(tmp_path, [pixels(0), pixels(1), pixels(2)], masks=[None, mask, None])
-    views = load_images.load_views(capture, hold=9)
+    views = load_images.load_capture(capture, hold=9)
     np.testing.assert_array_equal(views.mask, np.concatenate([mask.ravel(), np.ones(HEIGHT * WIDTH, bool)]))
-    small = load_images.load_views(capture, hold=9, factor=2)
-    wanted = np.ones((3, 4), bool)
-    wanted[1, 1] = False
-    np.testing.assert_array_equal(small.mask[:12], wanted.ravel())
+    small = load_images.load_capture(capture, hold=9, factor=2)
+    expected = np.ones((3, 4), bool)
+    expected[1, 1] = False
+    np.testing.assert_array_equal(small.mask[:12], expected.ravel())
     iio.imwrite(tmp_path / "mask1.png", np.zeros((3, 3), np.uint8))
-    with pytest.raises(ValueError, match="mask1.png: is 3 x 3, wanted 8 x 6 as view1.png"):
-        load_images.load_views(capture, hold=9)
+    with pytest.raises(ValueError, match="mask1.png: is 3 x 3, expected 8 x 6 as view1.png"):
+        load_images.load_capture(capture, hold=9)
 
 
-def test_alpha_of_some_makes_the_rest_opaque(tmp_path):
+def test_images_without_alpha_become_opaque_beside_others_with_alpha(tmp_path):
     images = [pixels(0), pixels(1, channels=4), pixels(2)]
     capture = a_capture(tmp_path, images)
-    views = load_images.load_views(capture, hold=9, background=(1.0, 1.0, 1.0))
+    views = load_images.load_capture(capture, hold=9, background=(1.0, 1.0, 1.0))
     assert views.pixels.shape[-1] == 4 and views.background == (1.0, 1.0, 1.0)
     np.testing.assert_array_equal(views.pixels[: HEIGHT * WIDTH], images[1].reshape(-1, 4))
     assert (views.pixels[HEIGHT * WIDTH :, 3] == 255).all()
-    plain = load_images.load_views(capture, hold=9)
+    plain = load_images.load_capture(capture, hold=9)
     assert plain.pixels.shape[-1] == 3 and plain.background is None
 
 
 @pytest.mark.parametrize("turn", range(1, 9))
-def test_exif_orientation_is_followed_unless_the_camera_says_otherwise(tmp_path, turn):
+def test_exif_orientation_is_followed_unless_only_the_stored_size_fits_the_camera(tmp_path, turn):
     stored, exif = pixels(0, 4, 7), Image.Exif()
     exif[0x0112] = turn
     path = tmp_path / "turned.png"
     Image.fromarray(stored).save(path, exif=exif)
     upright = np.asarray(ImageOps.exif_transpose(Image.open(path)))
     np.testing.assert_array_equal(read_image(path), upright)
-    np.testing.assert_array_equal(read_image(path, stored=upright.shape[:2]), upright)
+    np.testing.assert_array_equal(read_image(path, camera_size=upright.shape[:2]), upright)
     assert image_size(path) == upright.shape[1::-1]
     if turn >= 5:
-        np.testing.assert_array_equal(read_image(path, stored=(4, 7)), stored)
+        np.testing.assert_array_equal(read_image(path, camera_size=(4, 7)), stored)
 
 
-def test_a_mask_is_what_is_bright(tmp_path):
+def test_a_mask_is_true_where_the_image_is_bright(tmp_path):
     iio.imwrite(tmp_path / "mask.png", np.uint8([[0, 127, 128, 255]]))
     assert read_mask(tmp_path / "mask.png").tolist() == [[False, False, True, True]]
 
 
-def test_lenses_of_one_scene():
+def test_cameras_of_several_lenses_are_stacked():
     opencv = a_camera(distortion=np.array([0.1, 0.2, 0.3, 0.4]), lens="opencv")
     five = a_camera(distortion=np.arange(5.0), lens="opencv")
     fisheye = a_camera(distortion=np.arange(4.0), lens="fisheye")
@@ -204,7 +204,7 @@ def test_lenses_of_one_scene():
 
 @settings(deadline=None, max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), kind=st.sampled_from(["png", "jpg", "webp", "png16"]))
-def test_a_damaged_image_is_an_image_or_one_line(tmp_path, data, kind):
+def test_a_damaged_image_is_read_or_a_one_line_error(tmp_path, data, kind):
     path = tmp_path / f"view.{kind[:4].removesuffix('16')}"
     write_image(path, pixels(0, 20, 30, dtype=np.uint16 if kind == "png16" else np.uint8))
     content = bytearray(path.read_bytes())

@@ -1,4 +1,4 @@
-"""The Blender reader: what it returns, and that every bad input is named."""
+"""The Blender reader: its results, and errors that name the invalid input."""
 
 import json
 import math
@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from captures import write_png16
-from jaxnerf.data.images.image_files import average_blocks, read_image, to_straight
-from jaxnerf.data.readers.blender import load_views
+from jaxnerf.data.images.image_files import average_tiles, read_image, to_straight
+from jaxnerf.data.readers.blender import load_blender
 
 _POSE = [[1.0, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
 
@@ -19,8 +19,8 @@ def _pixels(seed, shape=(12, 8, 4), dtype=np.uint8):
 
 
 @pytest.fixture
-def scene(tmp_path):
-    """A function that changes and writes the JSON of a good scene of two RGBA frames."""
+def dataset(tmp_path):
+    """Returns a function that changes and writes the JSON file of a valid dataset of two RGBA frames."""
     (tmp_path / "train").mkdir()
     for index in range(2):
         Image.fromarray(_pixels(index)).save(tmp_path / "train" / f"r_{index}.png")
@@ -35,8 +35,8 @@ def scene(tmp_path):
     return write
 
 
-def test_returns_every_frame_untouched_at_factor_1(scene):
-    views = load_views(scene())
+def test_factor_1_returns_every_frame_unchanged(dataset):
+    views = load_blender(dataset())
     assert views.pixels.dtype == np.uint8 and views.background == (1.0, 1.0, 1.0)
     np.testing.assert_array_equal(views.pixels, np.concatenate([_pixels(k).reshape(-1, 4) for k in range(2)]))
     np.testing.assert_array_equal(views.offset, [0, 96])
@@ -50,16 +50,16 @@ def test_returns_every_frame_untouched_at_factor_1(scene):
     np.testing.assert_array_equal(views.far, [6, 6])
 
 
-def test_file_path_may_carry_its_extension_or_no_dot(scene):
+def test_file_path_may_carry_its_extension_or_no_dot(dataset):
     def change(content):
         content["frames"][0]["file_path"] = "train/r_0.png"
         content.update(w=8, h=12)
 
-    assert load_views(scene(change)).names == ("r_0", "r_1")
+    assert load_blender(dataset(change)).names == ("r_0", "r_1")
 
 
-def test_factor_scales_pixels_and_camera_together(scene):
-    views = load_views(scene(), factor=4)
+def test_factor_scales_pixels_and_camera_together(dataset):
+    views = load_blender(dataset(), factor=4)
     assert views.pixels.shape == (12, 4) and views.pixels.dtype == np.uint16
     np.testing.assert_allclose(views.cameras.focal, 1 / math.tan(0.4), rtol=1e-6)
     np.testing.assert_array_equal(views.cameras.center, [[1, 1.5]] * 2)
@@ -75,28 +75,28 @@ def test_shrinking_commutes_with_compositing(dtype, background):
         values = straight / np.iinfo(straight.dtype).max
         return values[..., :3] * values[..., 3:] + np.array(background) * (1 - values[..., 3:])
 
-    wanted = over(pixels).reshape(8, 5, 12, 5, 3).mean((1, 3))
-    found = over(average_blocks(pixels, 5, background=background))
-    assert np.abs(found - wanted).max() < 1e-5
+    expected = over(pixels).reshape(8, 5, 12, 5, 3).mean((1, 3))
+    found = over(average_tiles(pixels, 5, background=background))
+    assert np.abs(found - expected).max() < 1e-5
 
 
-def test_hidden_colour_does_not_bleed_over_an_edge():
+def test_invisible_colour_does_not_bleed_over_an_edge():
     pixels = np.zeros((2, 2, 4), np.uint8)
-    pixels[:, 0] = 200, 100, 0, 255  # beside it: transparent black
-    shrunk = average_blocks(pixels, 2)[0, 0] / 65535
+    pixels[:, 0] = 200, 100, 0, 255  # the other column is transparent black
+    shrunk = average_tiles(pixels, 2)[0, 0] / 65535
     np.testing.assert_allclose(shrunk, [200 / 255, 100 / 255, 0, 0.5], atol=2e-5)
 
 
-def test_straight_alpha_is_finite_where_nothing_covers():
+def test_straight_alpha_is_finite_where_alpha_is_0():
     np.testing.assert_array_equal(to_straight(np.zeros((1, 3)), np.zeros(1), background=(1, 1, 1)), [[0] * 4])
 
 
-def test_rgb_is_taken_only_without_a_background(scene, tmp_path):
+def test_rgb_files_are_read_only_without_a_background(dataset, tmp_path):
     for index in range(2):
         Image.fromarray(_pixels(index)[..., :3]).save(tmp_path / "train" / f"r_{index}.png")
-    assert load_views(scene(), background=None).pixels.shape == (192, 3)
+    assert load_blender(dataset(), background=None).pixels.shape == (192, 3)
     with pytest.raises(ValueError, match=r"r_0\.png: has no alpha.*background=None"):
-        load_views(tmp_path)
+        load_blender(tmp_path)
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -140,7 +140,7 @@ def _pose(row, column, value):
         (_set("camera_angle_x", 0), "camera_angle_x is 0"),
         (_set("camera_angle_x", "wide"), "camera_angle_x is 'wide'"),
         (_set("camera_angle_x", 10**400), "camera_angle_x is 1000"),
-        (_set("w", 9), r"r_0\.png: is 8 x 12, wanted w = 9"),
+        (_set("w", 9), r"r_0\.png: is 8 x 12, expected w = 9"),
         (_set("h", "12"), "h is '12'"),
         (lambda content: content["frames"][1].pop("file_path"), "frame 1: has no file_path"),
         (lambda content: content["frames"][1].pop("transform_matrix"), "frame 1: has no transform_matrix"),
@@ -148,7 +148,7 @@ def _pose(row, column, value):
         (_frame("file_path", "./train/r_9"), r"frame 1: .*r_9\.png does not exist"),
         (_frame("file_path", "train/../../r_1"), "frame 1: file_path .* leaves the folder"),
         (_frame("file_path", "/etc/passwd"), "frame 1: file_path .* leaves the folder"),
-        (_frame("file_path", "."), "frame 1: file_path '.' leaves the folder"),  # would read ../<folder>.png
+        (_frame("file_path", "."), "frame 1: file_path '.' leaves the folder"),  # it would read ../<folder>.png
         (_frame("file_path", "train/a\nb"), "frame 1: file_path is"),
         (_frame("transform_matrix", _POSE[:3]), r"frame 1: .*shape \(3, 4\)"),
         (_frame("transform_matrix", [[1, 2], [3]]), "frame 1: .*unequal length"),
@@ -161,9 +161,9 @@ def _pose(row, column, value):
         (_pose(3, 3, 2.0), "frame 1: .*last row"),
     ],
 )
-def test_bad_json_is_named(scene, change, message):
+def test_errors_of_the_json_file(dataset, change, message):
     with pytest.raises(ValueError, match=message) as caught:
-        load_views(scene(change))
+        load_blender(dataset(change))
     assert "\n" not in str(caught.value)
     assert "transforms_train.json" in str(caught.value) or ".png" in str(caught.value)
 
@@ -183,46 +183,46 @@ def test_bad_json_is_named(scene, change, message):
         ({"background": (255, 255, 255)}, "background is"),
     ],
 )
-def test_bad_arguments_are_named(scene, arguments, message):
+def test_errors_of_the_arguments(dataset, arguments, message):
     with pytest.raises(ValueError, match=message):
-        load_views(scene(), **arguments)
+        load_blender(dataset(), **arguments)
 
 
-def test_bad_files_are_named(scene, tmp_path):
-    scene()
+def test_errors_of_the_files(dataset, tmp_path):
+    dataset()
     second = tmp_path / "train" / "r_1.png"
     whole = second.read_bytes()
     for body in (whole[: len(whole) // 2], whole[:30], b"", b"no image"):
         second.write_bytes(body)
         with pytest.raises(ValueError, match=r"r_1\.png: unreadable") as caught:
-            load_views(tmp_path)
+            load_blender(tmp_path)
         assert "\n" not in str(caught.value)
     Image.fromarray(_pixels(1, (12, 12, 4))).save(second)
-    with pytest.raises(ValueError, match=r"r_1\.png: is 12 x 12 uint8.*wanted 8 x 12 uint8 as r_0\.png"):
-        load_views(tmp_path)
+    with pytest.raises(ValueError, match=r"r_1\.png: is 12 x 12 uint8.*expected 8 x 12 uint8 as r_0\.png"):
+        load_blender(tmp_path)
     write_png16(second, _pixels(1, dtype=np.uint16))
     with pytest.raises(ValueError, match=r"r_1\.png: is 8 x 12 uint16"):
-        load_views(tmp_path)
+        load_blender(tmp_path)
     for text in ("{", "[1]", "\xff"):
         (tmp_path / "transforms_train.json").write_bytes(text.encode("latin-1"))
         with pytest.raises(ValueError, match=r"transforms_train\.json: (malformed|holds)"):
-            load_views(tmp_path)
+            load_blender(tmp_path)
     with pytest.raises(ValueError, match="the folder does not exist"):
-        load_views(tmp_path / "nowhere")
+        load_blender(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="folder is None"):
-        load_views(None)
+        load_blender(None)
 
 
 @pytest.mark.scenes("lego")
 def test_the_real_lego(scenes_dir):
-    test = load_views(scenes_dir / "lego", split="test")
+    test = load_blender(scenes_dir / "lego", split="test")
     assert test.pixels.shape == (25 * 800 * 800, 4) and test.pixels.dtype == np.uint8
     np.testing.assert_allclose(test.cameras.focal, 1111.111, rtol=1e-6)
-    train = load_views(scenes_dir / "lego", factor=8)
+    train = load_blender(scenes_dir / "lego", factor=8)
     assert train.pixels.shape == (100 * 100 * 100, 4) and len(train.names) == 100
     np.testing.assert_allclose(train.cameras.focal, 138.8889, rtol=1e-6)
     alpha = train.pixels[:, 3]
     assert 0.3 < (alpha == 0).mean() < 0.9 and 0.1 < (alpha == 65535).mean()
     np.testing.assert_allclose(np.linalg.norm(train.cameras.to_world[:, :, 3], axis=-1), 4.0311, rtol=1e-3)
     with pytest.raises(ValueError, match=r"transforms_test\.json, transforms_train\.json"):
-        load_views(scenes_dir / "lego", split="val")
+        load_blender(scenes_dir / "lego", split="val")

@@ -1,4 +1,4 @@
-"""COLMAP models: binary and text alike, pycolmap's numbers, every lens, and what is wrong with a file."""
+"""The COLMAP reader: equal results of binary and text, pycolmap's numbers, every lens, and errors of files."""
 
 import struct
 import tracemalloc
@@ -19,7 +19,7 @@ from jaxnerf.data.readers.validation import check_inside
 NAMES = ("side/c 1.jpg", "b.png", "a.jpg")
 BROWN = (0.05, -0.02, 0.003, -0.004)
 ANGLES = (0.04, 0.03, 0.02, 0.01)
-LENSES = [  # COLMAP's number and name, what follows its centre, our lens and distortion
+LENSES = [  # COLMAP's number and name, parameters after its centre, lens and distortion of Camera
     (0, "SIMPLE_PINHOLE", (), "pinhole", None),
     (1, "PINHOLE", (), "pinhole", None),
     (2, "SIMPLE_RADIAL", BROWN[:1], "opencv", (0.05, 0, 0, 0)),
@@ -35,7 +35,7 @@ LENSES = [  # COLMAP's number and name, what follows its centre, our lens and di
 
 
 def model():
-    """Returns cameras, images and points, their ids in no order; -1 is an observation of no point."""
+    """Returns cameras, images and points, their ids unordered; -1 is an observation without a point."""
     rng = np.random.default_rng(0)
     cameras = [
         (7, 1, "PINHOLE", 64, 48, (90.5, 91.25, 32.0, 24.0)),
@@ -83,18 +83,18 @@ def text(cameras, images, points):
     return {"cameras.txt": first.encode(), "images.txt": second.encode(), "points3D.txt": third.encode()}
 
 
-def put(folder, contents, *, base="sparse/0", photographs=NAMES):
+def put(folder, contents, *, base="sparse/0", images=NAMES):
     (folder / base).mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
         (folder / base / name).write_bytes(content)
-    for name in photographs:
+    for name in images:
         (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / "images" / name).touch()
     return folder
 
 
 def to_world(motion):
-    """Returns camera -> world [3, 4] in our axes by another way than the reader's."""
+    """Returns camera -> world [3, 4] in the axes of Camera, computed differently than by the reader."""
     (w, *axis), to_camera = motion[:4], np.eye(4)
     axis = np.array(axis)
     across = np.cross(axis, np.eye(3)).T  # across @ x = axis x x
@@ -130,22 +130,22 @@ def test_a_small_model_is_read_as_it_was_written(tmp_path, write):
         np.testing.assert_array_equal(found, np.reshape(kept, (-1, 5)))
 
 
-def test_binary_and_text_and_what_pycolmap_makes_of_them_agree(tmp_path):
+def test_binary_text_and_pycolmaps_text_agree(tmp_path):
     want = colmap.read_capture(put(tmp_path, binary(*model())))
     pycolmap.Reconstruction(str(want.source)).write_text(str(want.source))
     for file in want.source.glob("*.bin"):
         file.unlink()
     from_pycolmap = colmap.read_capture(tmp_path)
-    assert {file.name for file in want.source.iterdir()} > {"rigs.txt", "frames.txt"}  # they do no harm
+    assert {file.name for file in want.source.iterdir()} > {"rigs.txt", "frames.txt"}  # ignored
     assert_same(from_pycolmap, want)
     assert_same(colmap.read_capture(put(tmp_path, text(*model()))), want)
     put(tmp_path, {name: b"garbage" for name in text(*model())})
-    assert_same(colmap.read_capture(put(tmp_path, binary(*model()))), want)  # binary comes first
+    assert_same(colmap.read_capture(put(tmp_path, binary(*model()))), want)  # binary files take precedence
 
 
 @pytest.mark.parametrize("number, name, rest, lens, distortion", LENSES, ids=[row[1] for row in LENSES])
-def test_every_lens_is_colmap_s(tmp_path, number, name, rest, lens, distortion):
-    """The same pixels as COLMAP's own, half a pixel included."""
+def test_every_lens_agrees_with_colmap(tmp_path, number, name, rest, lens, distortion):
+    """Projections are COLMAP's, including the position of pixel centres."""
     known = pycolmap.Camera.create_from_model_name(1, name, 90.0, 64, 48)
     count = len(known.params) - len(rest) - 2
     known.params = [*(90.0, 95.0)[:count], 31.0, 25.0, *rest]
@@ -169,16 +169,16 @@ def test_every_lens_is_colmap_s(tmp_path, number, name, rest, lens, distortion):
     "number, params, message",
     [
         (6, (90, 95, 31, 25, *BROWN, 0.01, 0, 0.1, 0), r"FULL_OPENCV has k4, k5, k6 = .*image_undistorter"),
-        (7, (90, 95, 31, 25, 0.1), "FOV is none of our lenses.*image_undistorter"),
-        (10, (90, 95, 31, 25, *[0.1] * 8), "THIN_PRISM_FISHEYE is none of our lenses.*image_undistorter"),
-        (17, (64, 48), "EQUIRECTANGULAR is none of our lenses"),
-        (99, (), "model number 99, wanted 0 to 17.*image_undistorter"),
+        (7, (90, 95, 31, 25, 0.1), "FOV is not supported.*image_undistorter"),
+        (10, (90, 95, 31, 25, *[0.1] * 8), "THIN_PRISM_FISHEYE is not supported.*image_undistorter"),
+        (17, (64, 48), "EQUIRECTANGULAR is not supported"),
+        (99, (), "model number 99, expected 0 to 17.*image_undistorter"),
         (1, (0, 95, 31, 25), "focal length"),
         (1, (90, np.nan, 31, 25), "focal length"),
         (1, (90, 95, np.inf, 25), "finite"),
     ],
 )
-def test_a_camera_that_is_none_of_ours_is_named(tmp_path, number, params, message):
+def test_unsupported_cameras_are_errors(tmp_path, number, params, message):
     cameras, images, points = model()
     cameras[0] = (7, number, "", 64, 48, params)
     with pytest.raises(ValueError, match=f"cameras.bin, camera 7: .*{message}"):
@@ -193,7 +193,7 @@ def test_the_model_is_found(tmp_path, base):
     assert colmap.read_capture(tmp_path).source == tmp_path / base
 
 
-def test_photographs_may_lie_in_the_folder_itself(tmp_path):
+def test_images_may_be_in_the_folder_itself(tmp_path):
     put(tmp_path, text(*model()))
     for file in (tmp_path / "images").iterdir():
         file.rename(tmp_path / file.name)
@@ -202,7 +202,7 @@ def test_photographs_may_lie_in_the_folder_itself(tmp_path):
 
 
 @pytest.mark.parametrize("write", [binary, text])
-def test_of_several_models_the_one_with_most_images_is_read_and_said(tmp_path, write):
+def test_of_several_models_the_one_with_most_images_is_read_and_noted(tmp_path, write):
     cameras, images, points = model()
     put(tmp_path, write(cameras, images[:2], points))
     put(tmp_path, write(cameras, images, points), base="sparse/1")
@@ -210,29 +210,29 @@ def test_of_several_models_the_one_with_most_images_is_read_and_said(tmp_path, w
     capture = colmap.read_capture(tmp_path)
     assert capture.source == colmap.find_model(tmp_path) == tmp_path / "sparse" / "1"
     assert len(capture.frames) == 3
-    assert len(capture.notes) == 1 and capture.notes[0].endswith("left out beside it: 0, 10")
+    assert len(capture.notes) == 1 and capture.notes[0].endswith("other models skipped: 0, 10")
 
 
-def test_photographs_that_are_missing_are_left_out_and_named(tmp_path):
+def test_missing_images_are_skipped_and_noted(tmp_path):
     cameras, images, points = model()
     images = [(index, *images[0][1:3], f"{index:02}.jpg", images[0][4]) for index in range(12)]
     contents = binary(cameras, images, points)
-    capture = colmap.read_capture(put(tmp_path, contents, photographs=[f"{k:02}.jpg" for k in range(6)]))
+    capture = colmap.read_capture(put(tmp_path, contents, images=[f"{k:02}.jpg" for k in range(6)]))
     assert [frame.name for frame in capture.frames] == [f"{k:02}" for k in range(6)]
     names = "'06.jpg', '07.jpg', '08.jpg', '09.jpg', '10.jpg', ..."
-    assert len(capture.notes) == 1 and f"lacks 6 of 12 photographs of {tmp_path}" in capture.notes[0]
+    assert len(capture.notes) == 1 and f"lacks 6 of 12 images of {tmp_path}" in capture.notes[0]
     assert names in capture.notes[0]
     (tmp_path / "images" / "00.jpg").unlink()
-    with pytest.raises(ValueError, match="images: lacks 7 of 12 photographs .* wanted at least half"):
+    with pytest.raises(ValueError, match="images: lacks 7 of 12 images .* expected at least half"):
         colmap.read_capture(tmp_path)
 
 
-def test_points_may_be_thinned_or_none_but_not_another_model_s(tmp_path):
+def test_points_may_be_deleted_but_not_another_models(tmp_path):
     cameras, images, points = model()
     capture = colmap.read_capture(put(tmp_path, binary(cameras, images, points[:1])))
     assert [len(frame.seen) for frame in capture.frames] == [1, 0, 0] and len(capture.points) == 1
     assert len(capture.notes) == 1 and "lacks the points of 4 observations" in capture.notes[0]
-    with pytest.raises(ValueError, match="points3D.bin: has none of the points that images.bin shows"):
+    with pytest.raises(ValueError, match="points3D.bin: has none of the points that images.bin refers to"):
         colmap.read_capture(put(tmp_path, binary(cameras, images, [(4, *points[0][1:])])))
     images = [(*image[:4], []) for image in images]
     put(tmp_path, binary(cameras, images, []) | {"points3D.bin": struct.pack("<Q", 0)})
@@ -262,7 +262,7 @@ def entry(kind, index, field, value):
 @pytest.mark.parametrize(
     "parts, message",
     [
-        (entry(0, 1, 0, 7), "cameras.*camera 7: stands there twice"),
+        (entry(0, 1, 0, 7), "cameras.*camera 7: occurs twice"),
         (entry(0, 0, 3, 0), "cameras.*camera 7: is 0 x 48"),
         (entry(0, 0, 4, 2**40), "cameras.*camera 7: is 64 x 1099511627776"),
         (entry(1, 0, 1, (0.5,) * 3 + (0.6,) + (0,) * 3), "images.*image 10, 'side/c 1.jpg': .*length 1.054"),
@@ -277,7 +277,7 @@ def entry(kind, index, field, value):
         ((model()[0], [], model()[2]), "images.*holds no image"),
     ],
 )
-def test_what_is_wrong_with_the_numbers_is_said(tmp_path, parts, message):
+def test_errors_of_the_numbers(tmp_path, parts, message):
     for write in (text, binary):
         with pytest.raises(ValueError, match=message) as caught:
             colmap.read_capture(put(tmp_path, write(*parts)))
@@ -287,29 +287,29 @@ def test_what_is_wrong_with_the_numbers_is_said(tmp_path, parts, message):
 @pytest.mark.parametrize(
     "name, content, message",
     [
-        ("cameras.txt", b"7 PINHOLE 64", "line 1: is '7 PINHOLE 64', wanted CAMERA_ID"),
+        ("cameras.txt", b"7 PINHOLE 64", "line 1: is '7 PINHOLE 64', expected CAMERA_ID"),
         ("cameras.txt", b"# x\n7 FISH 64 48 1", "line 2, camera 7: model 'FISH'"),
-        ("cameras.txt", b"7 PINHOLE 64 48 90 90 32", "line 1: is '90 90 32', wanted 4 PARAMS of PINHOLE"),
+        ("cameras.txt", b"7 PINHOLE 64 48 90 90 32", "line 1: is '90 90 32', expected 4 PARAMS of PINHOLE"),
         (
             "cameras.txt",
             b"7 PINHOLE 64 48 90 90 32 24 1",
-            "line 1: is '1', wanted 4 PARAMS of PINHOLE and no",
+            "line 1: is '1', expected 4 PARAMS of PINHOLE and no",
         ),
         ("cameras.txt", b"", "has camera 7, which cameras.txt lacks"),
         ("images.txt", b"\xff\xfe", "is no UTF-8 text"),
         ("images.txt", b"", "holds no image"),
-        ("images.txt", b"1 1 0 0 0 0 0 0 7\n", "line 1: .* wanted IMAGE_ID .* NAME"),
+        ("images.txt", b"1 1 0 0 0 0 0 0 7\n", "line 1: .* expected IMAGE_ID .* NAME"),
         ("images.txt", b"1 1 0 0 0 0 0 0 7 a.jpg\n1 2", "line 1: .* in threes on the next line"),
         ("images.txt", b"1 1 0 0 0 0 0 0 7 a.jpg\n1 2 x", "line 1: .* in threes on the next line"),
         ("images.txt", b"1 1 0 0 0 0 0 0 7 a.jpg\n1 2 " + b"9" * 20, "line 1: .* in threes"),
-        ("points3D.txt", b"5 1 2 3 4 5 6", "line 1: is '5 1 2 3 4 5 6', wanted POINT3D_ID"),
+        ("points3D.txt", b"5 1 2 3 4 5 6", "line 1: is '5 1 2 3 4 5 6', expected POINT3D_ID"),
         ("points3D.txt", b"9" * 20 + b" 1 2 3 4 5 6 7", "line 1: is '9"),
         ("points3D.txt", b"-5 1 2 3 4 5 6 7", "negative id"),
-        ("points3D.txt", b"", "has none of the points that images.txt shows"),
+        ("points3D.txt", b"", "has none of the points that images.txt refers to"),
         ("points3D.txt", None, "No such file"),
     ],
 )
-def test_what_is_wrong_with_a_text_is_said(tmp_path, name, content, message):
+def test_errors_of_a_text_file(tmp_path, name, content, message):
     put(tmp_path, text(*model()))
     path = tmp_path / "sparse" / "0" / name
     path.unlink() if content is None else path.write_bytes(content)
@@ -318,13 +318,13 @@ def test_what_is_wrong_with_a_text_is_said(tmp_path, name, content, message):
     assert name in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_folder_without_a_model_is_said(tmp_path):
-    with pytest.raises(ValueError, match="wanted a COLMAP model; correct the folder"):
+def test_a_folder_without_a_model_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="expected a COLMAP model; correct the folder"):
         colmap.read_capture(tmp_path)
 
 
 def read_damaged(folder, name, content):
-    """Returns whether a model reads with one file so; what it raises is one line that names the file."""
+    """Returns whether a model with one changed file is read; checks that an error is one line with the file's name."""
     path = folder / "sparse" / "0" / name
     whole = path.read_bytes()
     try:
@@ -345,13 +345,13 @@ WHOLE = binary(*model()) | text(*model())
 
 @pytest.fixture(scope="module", params=[".bin", ".txt"])
 def damaged(request, tmp_path_factory):
-    """(folder, extension) of a model whose files a test may damage one after the other."""
+    """Returns (folder, extension) of a model whose files a test may damage one after the other."""
     contents = {name: content for name, content in WHOLE.items() if name.endswith(request.param)}
     return put(tmp_path_factory.mktemp("damaged"), contents), request.param
 
 
 def test_a_file_that_ends_early_or_late_is_an_error(damaged):
-    """In text only inside a line: nobody can tell which lines once followed."""
+    """A text file that ends after a complete line is not detected."""
     folder, extension = damaged
     for name, whole in WHOLE.items():
         if name.endswith(extension):
@@ -364,7 +364,7 @@ def test_a_file_that_ends_early_or_late_is_an_error(damaged):
 
 @settings(deadline=None, max_examples=150)
 @given(data=st.data())
-def test_flipped_bytes_read_or_are_an_error(damaged, data):
+def test_changed_bytes_are_read_or_an_error(damaged, data):
     folder, extension = damaged
     name = data.draw(st.sampled_from([name for name in WHOLE if name.endswith(extension)]))
     content = bytearray(WHOLE[name])
@@ -383,7 +383,7 @@ def test_garbage_is_an_error_or_empty(damaged, data, garbage):
 
 
 def counts():
-    """Yields every (file, byte) where a count stands in the binary files."""
+    """Yields (file, byte) of every count in the binary files."""
     yield from ((name, 0) for name in ("cameras.bin", "images.bin", "points3D.bin"))
     images, at = model()[1], 8
     for image in images:
@@ -394,11 +394,11 @@ def counts():
 
 
 @pytest.mark.parametrize("count", [2**64 - 1, 2**63, 2**40, 10**6])
-def test_a_count_is_not_believed(tmp_path, count):
+def test_a_wrong_count_is_an_error_and_allocates_nothing(tmp_path, count):
     folder = put(tmp_path, binary(*model()))
     for name, at in counts():
         content = WHOLE[name][:at] + struct.pack("<Q", count) + WHOLE[name][at + 8 :]
-        assert struct.unpack_from("<Q", WHOLE[name], at)[0] < 5, "no count stands here"
+        assert struct.unpack_from("<Q", WHOLE[name], at)[0] < 5, "this is no count"
         tracemalloc.start()
         assert not read_damaged(folder, name, content)
         _, peak = tracemalloc.get_traced_memory()
@@ -407,13 +407,13 @@ def test_a_count_is_not_believed(tmp_path, count):
 
 
 def real_can(scenes_dir):
-    """Returns the reader's and pycolmap's view of the real can."""
+    """Returns the reader's and pycolmap's model of the real can."""
     folder = scenes_dir / "can"
     return colmap.read_capture(folder), pycolmap.Reconstruction(str(folder / "sparse" / "0"))
 
 
 @pytest.mark.scenes("can")
-def test_the_real_can_is_pycolmap_s_to_1e_9(scenes_dir):
+def test_the_real_can_agrees_with_pycolmap_to_1e_9(scenes_dir):
     capture, known = real_can(scenes_dir)
     assert len(capture.frames) == 71 and capture.notes == ()
     ids = sorted(known.points3D)
@@ -436,8 +436,8 @@ def test_the_real_can_is_pycolmap_s_to_1e_9(scenes_dir):
 
 
 @pytest.mark.scenes("can")
-def test_the_real_can_s_points_project_to_where_they_were_seen(scenes_dir):
-    """Poses, lens, axes and pixel centres at once: a slip in any is half a pixel or many."""
+def test_the_real_cans_points_project_to_their_observations(scenes_dir):
+    """A mistake in poses, lens, axes or pixel centres moves the projections by half a pixel or more."""
     capture, known = real_can(scenes_dir)
     see = jax.jit(jax.vmap(project, in_axes=(0, None)))
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(frame.camera for frame in capture.frames))

@@ -1,9 +1,11 @@
-"""LLFF captures: cameras, hold-out, sizes, and what is wrong with a folder."""
+"""The LLFF reader: cameras, splits, sizes, and errors of a folder."""
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from jaxnerf.data.geometry import world
+from jaxnerf.data.images import load_images
 from jaxnerf.data.readers import llff
 
 HEIGHT, WIDTH, FOCAL = 8, 12, 10.0
@@ -30,13 +32,18 @@ def rows(count=9):
     return np.concatenate([matrices.reshape(count, 15), bounds], axis=-1)
 
 
+def load_llff(folder, **options):
+    capture, _ = world.recenter(llff.read_capture(folder))
+    return load_images.load_capture(capture, **options)
+
+
 def pixels(index, height=HEIGHT, width=WIDTH):
     return np.random.default_rng(index).integers(0, 256, (height, width, 3), np.uint8)
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """A whole capture of nine views."""
+    """A dataset of nine views."""
     (tmp_path / "images").mkdir()
     for index in range(9):
         iio.imwrite(tmp_path / "images" / f"view{index}.png", pixels(index))
@@ -44,20 +51,20 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_every_eighth_view_is_held_out_and_pixels_are_the_files(folder):
-    train, test = (llff.load_views(folder, split=split) for split in ("train", "test"))
+def test_every_eighth_view_is_held_out_and_pixels_are_those_of_the_files(folder):
+    train, test = (load_llff(folder, split=split) for split in ("train", "test"))
     assert test.names == ("view0", "view8")
     assert train.names == tuple(f"view{index}" for index in range(1, 8))
     np.testing.assert_array_equal(test.pixels, np.concatenate([pixels(0), pixels(8)]).reshape(-1, 3))
     np.testing.assert_array_equal(test.offset, [0, HEIGHT * WIDTH])
     np.testing.assert_array_equal(test.size, [[HEIGHT, WIDTH]] * 2)
     assert test.background is None
-    np.testing.assert_array_equal(llff.load_views(folder, split="val").pixels, test.pixels)
+    np.testing.assert_array_equal(load_llff(folder, split="val").pixels, test.pixels)
 
 
-def test_cameras_are_the_files_but_for_one_motion_and_one_scale(folder):
-    """The nearest bound comes to 1 / 0.75; distances and turns between cameras stay as they were."""
-    train, test = (llff.load_views(folder, split=split) for split in ("train", "test"))
+def test_cameras_are_the_files_up_to_a_similarity(folder):
+    """The nearest bound becomes 1 / 0.75; relative rotations and relative distances do not change."""
+    train, test = (load_llff(folder, split=split) for split in ("train", "test"))
     order = [1, 2, 3, 4, 5, 6, 7, 0, 8]
     found = np.concatenate([train.cameras.to_world, test.cameras.to_world]).astype(np.float64)
     given, scale = poses(9)[order], 1 / (2.0 * 0.75)
@@ -70,15 +77,15 @@ def test_cameras_are_the_files_but_for_one_motion_and_one_scale(folder):
     np.testing.assert_allclose(found[:, :, 3].mean(0), 0, atol=1e-6)
     back = found[:, :, 2].mean(0)
     np.testing.assert_allclose(back / np.linalg.norm(back), [0, 0, 1], atol=1e-6)
-    assert abs(found[:, 0, 1].sum()) < 1e-5  # the mean up has no part to the right
+    assert abs(found[:, 0, 1].sum()) < 1e-5  # the mean up is normal to x
     np.testing.assert_allclose(test.near, [1 / 0.75, 10 * scale], rtol=1e-6)
     np.testing.assert_allclose(test.far, [20 * scale, 28 * scale], rtol=1e-6)
     np.testing.assert_allclose(train.cameras.focal, np.full((7, 2), FOCAL))
     np.testing.assert_allclose(train.cameras.center, np.tile([WIDTH / 2, HEIGHT / 2], (7, 1)))
 
 
-def test_a_factor_averages_or_takes_the_smaller_folder(folder):
-    half = llff.load_views(folder, split="test", factor=2)
+def test_a_factor_averages_or_selects_the_downscaled_folder(folder):
+    half = load_llff(folder, split="test", factor=2)
     mean = pixels(8).reshape(4, 2, 6, 2, 3).mean((1, 3)) / 255
     np.testing.assert_allclose(half.pixels[24:] / 65535, mean.reshape(-1, 3), atol=1e-5)
     np.testing.assert_allclose(half.cameras.focal, FOCAL / 2)
@@ -86,12 +93,12 @@ def test_a_factor_averages_or_takes_the_smaller_folder(folder):
     (folder / "images_2").mkdir()
     for index in range(9):
         iio.imwrite(folder / "images_2" / f"view{index}.png", pixels(50 + index, 4, 6))
-    there = llff.load_views(folder, split="test", factor=2)
+    there = load_llff(folder, split="test", factor=2)
     np.testing.assert_array_equal(there.pixels[:24], pixels(50, 4, 6).reshape(-1, 3))
     np.testing.assert_allclose(there.cameras.focal, FOCAL / 2)
 
 
-def spoil(array, row, column, value):
+def changed(array, row, column, value):
     array = array.copy()
     array[row, column] = value
     return array
@@ -100,54 +107,54 @@ def spoil(array, row, column, value):
 @pytest.mark.parametrize(
     "content, message",
     [
-        (rows()[:, :16], r"wanted floats \[N, 17\]"),
-        (rows()[0], r"wanted floats \[N, 17\]"),
-        (rows()[:0], r"wanted floats \[N, 17\]"),
+        (rows()[:, :16], r"expected floats \[N, 17\]"),
+        (rows()[0], r"expected floats \[N, 17\]"),
+        (rows()[:0], r"expected floats \[N, 17\]"),
         (np.array([{"poses": 1}], dtype=object), "unreadable"),
         (rows(8), "has 9 images, poses_bounds.npy has 8"),
-        (spoil(rows(), 3, 16, 1.0), "wanted 0 < near < far"),
-        (spoil(rows(), 3, 15, -1.0), "wanted 0 < near < far"),
-        (spoil(rows(), 4, 2, np.nan), "row 4 is not finite"),
-        (spoil(rows(), 5, 0, 3.0), "row 5.*rotation"),
+        (changed(rows(), 3, 16, 1.0), "expected 0 < near < far"),
+        (changed(rows(), 3, 15, -1.0), "expected 0 < near < far"),
+        (changed(rows(), 4, 2, np.nan), "row 4 is not finite"),
+        (changed(rows(), 5, 0, 3.0), "row 5.*rotation"),
     ],
 )
-def test_what_is_wrong_with_the_poses_is_said(folder, content, message):
+def test_errors_of_the_poses(folder, content, message):
     np.save(folder / "poses_bounds.npy", content, allow_pickle=True)
     with pytest.raises(ValueError, match=message) as caught:
-        llff.load_views(folder)
+        load_llff(folder)
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     "factor, message", [(9, "12 x 8, too small for factor 9"), (0, "whole number"), (1.5, "whole")]
 )
-def test_a_factor_that_does_not_fit_is_said(folder, factor, message):
+def test_invalid_factors_are_errors(folder, factor, message):
     with pytest.raises(ValueError, match=message):
-        llff.load_views(folder, factor=factor)
+        load_llff(folder, factor=factor)
 
 
-def test_what_is_wrong_with_the_files_is_said(folder):
+def test_errors_of_the_files(folder):
     with pytest.raises(ValueError, match="split is 'all'"):
-        llff.load_views(folder, split="all")
+        load_llff(folder, split="all")
     iio.imwrite(folder / "images" / "view3.png", pixels(3, 8, 10))
     with pytest.raises(ValueError, match="view3.png: is 10 x 8, its camera is for 12 x 8"):
-        llff.load_views(folder)
+        load_llff(folder)
     (folder / "images" / "view3.png").write_bytes(b"no image")
     with pytest.raises(ValueError, match="view3.png: unreadable"):
-        llff.load_views(folder)
+        load_llff(folder)
     with pytest.raises(ValueError, match="split 'train' of 9 images is empty"):
-        llff.load_views(folder, hold=1)
+        load_llff(folder, hold=1)
     (folder / "poses_bounds.npy").write_bytes(b"\x93NUMPY")
     with pytest.raises(ValueError, match="poses_bounds.npy: unreadable"):
-        llff.load_views(folder)
+        load_llff(folder)
     (folder / "poses_bounds.npy").unlink()
     with pytest.raises(ValueError, match="poses_bounds.npy: no such file"):
-        llff.load_views(folder)
+        load_llff(folder)
 
 
 @pytest.mark.scenes("fern")
 def test_the_real_fern(scenes_dir):
-    train, test = (llff.load_views(scenes_dir / "fern", split=split, factor=8) for split in ("train", "test"))
+    train, test = (load_llff(scenes_dir / "fern", split=split, factor=8) for split in ("train", "test"))
     assert (len(train.names), len(test.names)) == (17, 3)
     assert (train.cameras.height, train.cameras.width) == (378, 504)
     assert train.pixels.shape == (17 * 378 * 504, 3)

@@ -1,4 +1,4 @@
-"""Captures of nerfstudio and instant-ngp: cameras, lenses, splits, points, and what is wrong with a file."""
+"""The transforms.json reader: cameras, lenses, splits, points, and errors of files."""
 
 import copy
 import json
@@ -21,13 +21,13 @@ from jaxnerf.data.readers.transforms import read_capture
 
 @pytest.fixture(scope="session")
 def shots():
-    """Eight Shots of one pinhole, with random pixels."""
+    """Returns eight Shots of one pinhole camera, with random pixels."""
     return captures.noise(captures.orbit(8))
 
 
 @pytest.fixture
-def scene(tmp_path, shots):
-    """A function that changes and writes the JSON of a good capture."""
+def dataset(tmp_path, shots):
+    """Returns a function that changes and writes the JSON file of a valid dataset."""
     content = captures.write_transforms(tmp_path, shots)
 
     def write(change=lambda content: None):
@@ -40,7 +40,7 @@ def scene(tmp_path, shots):
 
 
 def assert_cameras(capture, shots):
-    """Fails unless a capture's cameras are those of the shots, to the last bit of float32."""
+    """Checks that the cameras of a Capture are those of the shots, bit for bit."""
     assert len(capture.frames) == len(shots)
     for frame, shot in zip(capture.frames, shots, strict=True):
         camera = frame.camera
@@ -51,15 +51,15 @@ def assert_cameras(capture, shots):
             shot.camera.width,
         )
         for key in ("to_world", "focal", "center", "distortion"):
-            found, wanted = getattr(camera, key), getattr(shot.camera, key)
-            assert (found is None) == (wanted is None)
+            found, expected = getattr(camera, key), getattr(shot.camera, key)
+            assert (found is None) == (expected is None)
             if found is not None:
                 assert found.dtype == np.float64
-                np.testing.assert_array_equal(found, wanted)
+                np.testing.assert_array_equal(found, expected)
 
 
-def test_a_plain_capture_comes_back(scene, shots):
-    capture = read_capture(scene())
+def test_a_plain_dataset_is_read_back(dataset, shots):
+    capture = read_capture(dataset())
     assert capture.format == "transforms" and capture.source.name == "transforms.json"
     assert_cameras(capture, shots)
     assert capture.splits is None and capture.points is None and capture.box is None and capture.notes == ()
@@ -79,18 +79,18 @@ def test_sizes_and_cameras_may_differ_from_frame_to_frame(tmp_path):
 
 
 @pytest.mark.parametrize("lens", ["opencv", "fisheye"])
-def test_the_lens_read_sees_what_is_in_the_file(tmp_path, lens):
-    """The photograph on disk is the built-in scene through the camera that was read, and no pinhole's."""
+def test_the_scene_rendered_with_the_cameras_that_are_read_equals_the_images(tmp_path, lens):
+    """Outside the masks they are equal bit for bit, and an image of a pinhole differs."""
     stack = captures.orbit(2, lens=lens, distance=4.0 if lens == "opencv" else 2.4)
     shots = captures.shoot(stack)
     captures.write_transforms(tmp_path, shots, bits=16, rgba=True, masks=True)
     capture = read_capture(tmp_path)
     read = jax.tree.map(lambda *leaves: np.float32(leaves), *(frame.camera for frame in capture.frames))
     seen = synthetic.render_views(read).reshape(2, 24, 32, 4)
-    for frame, wanted in zip(capture.frames, seen, strict=True):
+    for frame, expected in zip(capture.frames, seen, strict=True):
         mask = np.asarray(Image.open(frame.mask)) > 0
         np.testing.assert_array_equal(mask, captures.hidden(24, 32))
-        equal = (read_image(frame.image) == wanted).all(axis=-1)
+        equal = (read_image(frame.image) == expected).all(axis=-1)
         assert equal[mask].all() and not equal[~mask].any()
     if lens == "opencv":
         straight = captures.shoot(captures.orbit(2, focal=stack.focal[0]))
@@ -98,17 +98,17 @@ def test_the_lens_read_sees_what_is_in_the_file(tmp_path, lens):
         assert np.abs(off).max() > 0.3
 
 
-def test_frames_are_sorted_by_name_and_named_below_their_folder(scene):
-    capture = read_capture(scene(lambda content: content["frames"].reverse()))
+def test_frames_are_sorted_by_name_and_named_below_their_folder(dataset):
+    capture = read_capture(dataset(lambda content: content["frames"].reverse()))
     assert [frame.name for frame in capture.frames] == [f"{index:03d}" for index in range(8)]
-    folder = scene()
+    folder = dataset()
     (folder / "images" / "b").mkdir()
     os.rename(folder / "images" / "000.png", folder / "images" / "b" / "0.0.png")
 
     def nested(content):
         content["frames"][0]["file_path"] = "images/b/0.0.png"
 
-    names = [frame.name for frame in read_capture(scene(nested)).frames]
+    names = [frame.name for frame in read_capture(dataset(nested)).frames]
     assert names == [f"{index:03d}" for index in range(1, 8)] + ["b/0.0"]
 
 
@@ -121,8 +121,8 @@ def test_file_paths_may_lack_extension_or_begin_with_a_dot(tmp_path, shots, kind
     assert_cameras(read_capture(tmp_path), shots)
 
 
-def test_the_size_is_the_images_where_it_is_needed_and_not_stated(tmp_path, shots):
-    """A turned photograph counts as it is looked at."""
+def test_the_size_is_the_images_if_it_is_needed_and_not_stated(tmp_path, shots):
+    """The size is that of the upright image."""
     content = captures.write_transforms(tmp_path, shots, kind="jpg", orientation=6)
     with Image.open(tmp_path / "images" / "000.jpg") as image:
         assert image.size == (24, 32)
@@ -137,14 +137,14 @@ def test_the_size_is_the_images_where_it_is_needed_and_not_stated(tmp_path, shot
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read_capture(tmp_path).frames[0].camera
     assert camera.height is None and camera.width is None and camera.focal.tolist() == [50, 50]
-    content |= {"w": 64}  # half a size: the other half is the image's
+    content |= {"w": 64}  # only the width is stated; the height is the image's
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read_capture(tmp_path).frames[0].camera
     assert (camera.height, camera.width) == (24, 64)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_the_turned_png_of_the_generator_is_turned_back(tmp_path, shots, bits):
+def test_the_generator_writes_the_exif_orientation(tmp_path, shots, bits):
     paths = captures.write_images(tmp_path, shots[:1], bits=bits, rgba=True, orientation=6)
     with Image.open(tmp_path / paths[0]) as image:
         assert image.size == (24, 32) and image.getexif()[0x0112] == 6
@@ -168,14 +168,14 @@ ANGLE = 2 * math.atan(16 / 40)  # of a focal of 40 px at a width of 32
         ({"camera_angle_x": 1}, {"fl_x": 30}, [30, 30]),
     ],
 )
-def test_focal_is_the_frames_then_the_files_then_the_angles(scene, whole, own, focal):
+def test_the_focal_length_is_the_frames_then_the_files_then_from_angles(dataset, whole, own, focal):
     def change(content):
         del content["fl_x"], content["fl_y"]
         content |= whole
         content["frames"][1] |= own
         content["frames"][1]["cx"] = 12.5
 
-    camera = read_capture(scene(change)).frames[1].camera
+    camera = read_capture(dataset(change)).frames[1].camera
     np.testing.assert_allclose(camera.focal, focal, rtol=1e-12)
     assert camera.center.tolist() == [12.5, 12]
 
@@ -198,46 +198,44 @@ def test_focal_is_the_frames_then_the_files_then_the_angles(scene, whole, own, f
             "fisheye",
             [1, 2, 3, 4],
         ),
-        ({"camera_model": "OPENCV_FISHEYE"}, "fisheye", [0, 0, 0, 0]),  # equidistant, and no pinhole
+        ({"camera_model": "OPENCV_FISHEYE"}, "fisheye", [0, 0, 0, 0]),  # equidistant, which differs from a pinhole
         ({"is_fisheye": True, "k2": 0.2}, "fisheye", [0, 0.2, 0, 0]),
         ({"is_fisheye": False, "k2": 0.2}, "opencv", [0, 0.2, 0, 0]),
     ],
 )
 @pytest.mark.parametrize("own", [True, False])
-def test_lenses(scene, stated, lens, distortion, own):
+def test_lenses(dataset, stated, lens, distortion, own):
     def change(content):
         del content["camera_model"]
         for level in content["frames"] if own else [content]:
             level |= stated
         content |= {"k1": 7.0} if own and "k1" in stated else {}
 
-    camera = read_capture(scene(change)).frames[2].camera
+    camera = read_capture(dataset(change)).frames[2].camera
     assert camera.lens == lens
     assert camera.distortion is None if distortion is None else camera.distortion.tolist() == distortion
 
 
-def test_frames_without_a_file_are_left_out_in_one_line(scene):
-    folder = scene()
+def test_frames_without_a_file_are_skipped_with_one_note(dataset):
+    folder = dataset()
     for index in (1, 3):
         (folder / "images" / f"{index:03d}.png").unlink()
     capture = read_capture(folder)
     assert [frame.name for frame in capture.frames] == ["000", "002", "004", "005", "006", "007"]
-    assert len(capture.notes) == 1 and capture.notes[0].endswith(
-        "2 of 8 frames have no file and are left out: 001, 003"
-    )
+    assert len(capture.notes) == 1 and capture.notes[0].endswith("2 of 8 frames have no file and are skipped: 001, 003")
 
     def named(content):
         content["test_filenames"] = ["images/004.png", "images/001.png"]
 
     with pytest.raises(ValueError, match=r"test_filenames has 'images/001.png', which has no file"):
-        read_capture(scene(named))
+        read_capture(dataset(named))
     for index in (0, 2, 4):
         (folder / "images" / f"{index:03d}.png").unlink()
     with pytest.raises(ValueError, match="5 of 8 frames have no file .*000, 001, 002, 003, 004\\)"):
-        read_capture(scene())
+        read_capture(dataset())
 
 
-def test_splits_are_the_files_own(tmp_path, shots):
+def test_splits_are_those_of_the_file(tmp_path, shots):
     content = captures.write_transforms(tmp_path, shots, splits={"train": [5, 1, 2, 1], "test": [0], "val": []})
     assert read_capture(tmp_path).splits == {"train": (1, 2, 5), "test": (0,)}
     content["frames"].reverse()
@@ -245,7 +243,7 @@ def test_splits_are_the_files_own(tmp_path, shots):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     capture = read_capture(tmp_path)
     assert capture.splits == {"train": (1, 2, 5), "test": (0,), "val": (7,)}
-    # What is left out moves the indices, not the frames.
+    # A skipped frame shifts the indices of the others.
     (tmp_path / "images" / "003.png").unlink()
     capture = read_capture(tmp_path)
     assert [capture.frames[index].name for index in capture.splits["train"]] == ["001", "002", "005"]
@@ -258,35 +256,35 @@ def test_masks_are_all_or_none(tmp_path, shots):
     (tmp_path / "masks" / "005.png").unlink()
     with pytest.raises(ValueError, match=r"frame 5: mask 'masks/005.png' does not exist"):
         read_capture(tmp_path)
-    (tmp_path / "images" / "005.png").unlink()  # a frame that is left out needs none
+    (tmp_path / "images" / "005.png").unlink()  # a skipped frame needs no mask
     assert len(read_capture(tmp_path).frames) == 7
     del content["frames"][3]["mask_path"]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="frame 3: has no mask_path, as others have"):
+    with pytest.raises(ValueError, match="frame 3: has no mask_path, other frames have"):
         read_capture(tmp_path)
 
 
-def test_depth_files_are_not_used_and_that_is_said(scene):
+def test_depth_files_are_ignored_with_a_note(dataset):
     def change(content):
         for frame in content["frames"][:3]:
             frame["depth_file_path"] = "depth/0.png"
 
-    assert read_capture(scene(change)).notes[0].endswith("depth files of 3 frames are not used")
+    assert read_capture(dataset(change)).notes[0].endswith("depth files of 3 frames are not used")
 
 
-def test_the_world_is_the_files_own(scene, shots):
+def test_the_world_is_that_of_the_file(dataset, shots):
     def change(content):
         content["applied_transform"] = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 5]]
         content["applied_scale"] = 3.0
         content["orientation_override"] = "up"
 
-    assert_cameras(read_capture(scene(change)), shots)
+    assert_cameras(read_capture(dataset(change)), shots)
 
 
 @pytest.mark.parametrize("order", ["<", ">", None])
-def test_points_come_from_the_ply(scene, order):
+def test_points_of_the_ply_file(dataset, order):
     points = np.random.default_rng(0).normal(size=(20, 3))
-    folder = scene(lambda content: content.update(ply_file_path="./cloud.ply"))
+    folder = dataset(lambda content: content.update(ply_file_path="./cloud.ply"))
     captures.write_ply(folder / "cloud.ply", points, order=order)
     capture = read_capture(folder)
     np.testing.assert_array_equal(capture.points, points)
@@ -301,7 +299,7 @@ def test_points_come_from_the_ply(scene, order):
     assert "cloud.ply does not exist" in read_capture(folder).notes[0]
 
 
-def test_what_is_no_ply_of_points_is_named(tmp_path):
+def test_errors_of_a_ply_file(tmp_path):
     path = tmp_path / "cloud.ply"
     head = b"ply\nformat ascii 1.0\ncomment made here\n"
     xyz = b"property float x\nproperty float y\nproperty float z\n"
@@ -327,18 +325,18 @@ def test_what_is_no_ply_of_points_is_named(tmp_path):
     assert read_points(path).shape == (0, 3)
 
 
-def test_the_box_is_instant_ngps_cube(scene):
+def test_the_box_is_the_cube_of_instant_ngp(dataset):
     def change(content):
         content |= {"aabb_scale": 2, "scale": 0.5, "offset": [0.5, 0.25, 1.0]}
 
-    lower, upper = read_capture(scene(change)).box
+    lower, upper = read_capture(dataset(change)).box
     for x, edge in ((lower, -0.5), (upper, 1.5)):  # of side 2 around 0.5
         np.testing.assert_allclose((x * 0.5 + [0.5, 0.25, 1.0])[[1, 2, 0]], edge)
-    lower, upper = read_capture(scene(lambda content: content.update(aabb_scale=4))).box
+    lower, upper = read_capture(dataset(lambda content: content.update(aabb_scale=4))).box
     np.testing.assert_allclose(upper, 2 / 0.33)
     np.testing.assert_allclose(lower, -2 / 0.33)
-    assert read_capture(scene(lambda content: content.update(scale=0.5))).box is None
-    capture = read_capture(scene(lambda content: content.update(aabb_scale=1, aabb=[[0] * 3, [1] * 3])))
+    assert read_capture(dataset(lambda content: content.update(scale=0.5))).box is None
+    capture = read_capture(dataset(lambda content: content.update(aabb_scale=1, aabb=[[0] * 3, [1] * 3])))
     assert capture.box is None and "aabb_scale is not used" in capture.notes[0]
 
 
@@ -360,29 +358,29 @@ def _frame(key, value):
             lambda content: content.pop("fl_x") and content.pop("fl_y"),
             "frame 0: has no fl_x or camera_angle_x",
         ),
-        (_set("fl_x", 0), r"transforms.json: fl_x is 0, wanted px"),
+        (_set("fl_x", 0), r"transforms.json: fl_x is 0, expected px"),
         (_set("fl_x", -30.0), "fl_x is -30.0"),
         (_set("fl_x", math.nan), "fl_x is nan"),
         (_set("fl_x", "40"), "fl_x is '40'"),
         (_set("fl_x", 10**300), "fl_x is 1000"),
         (_frame("fl_y", []), r"frame 1: fl_y is \[\]"),
         (_frame("cx", math.inf), "frame 1: cx is inf"),
-        (_frame("camera_angle_x", 39.6), "frame 1: camera_angle_x is 39.6, wanted radians"),
-        (_set("w", 32.5), "w is 32.5, wanted whole pixels"),
+        (_frame("camera_angle_x", 39.6), "frame 1: camera_angle_x is 39.6, expected radians"),
+        (_set("w", 32.5), "w is 32.5, expected whole pixels"),
         (_set("h", 0), "h is 0"),
         (_set("h", True), "h is True"),
         (_set("w", 1e9), "w is 1000000000.0"),
         (_set("k1", None), "k1 is None"),
-        (_set("k4", 0.1), "k4 is 0.1, wanted 0, as a perspective lens"),
+        (_set("k4", 0.1), "k4 is 0.1, expected 0, as a perspective lens"),
         (_set("distortion_params", [0.1]), r"distortion_params is \[0.1\]"),
         (_set("distortion_params", [0, 0, 0, 0, 0, "x"]), "p2 is 'x'"),
-        (_set("camera_model", "EQUIRECTANGULAR"), "camera_model is 'EQUIRECTANGULAR', wanted SIMPLE_PINHOLE"),
+        (_set("camera_model", "EQUIRECTANGULAR"), "camera_model is 'EQUIRECTANGULAR', expected SIMPLE_PINHOLE"),
         (_set("camera_model", "ORTHOPHOTO"), "camera_model is 'ORTHOPHOTO'"),
         (_set("camera_model", ["OPENCV"]), r"camera_model is \['OPENCV'\]"),
-        (_set("is_fisheye", True), "is_fisheye is True, wanted what camera_model PINHOLE says"),
+        (_set("is_fisheye", True), "is_fisheye is True, expected the value that camera_model PINHOLE implies"),
         (_set("is_fisheye", 1), "is_fisheye is 1"),
-        (_set("equirectangular", True), "has equirectangular, wanted SIMPLE_PINHOLE"),
-        (lambda c: c.update(camera_model="OPENCV_FISHEYE", p1=0.1), "p1 is 0.1, wanted 0, as a fisheye"),
+        (_set("equirectangular", True), "has equirectangular, expected SIMPLE_PINHOLE"),
+        (lambda c: c.update(camera_model="OPENCV_FISHEYE", p1=0.1), "p1 is 0.1, expected 0, as a fisheye"),
         (lambda content: content["frames"][1].pop("file_path"), "frame 1: has no file_path"),
         (_frame("file_path", 7), "frame 1: file_path is 7"),
         (_frame("file_path", ""), "frame 1: file_path is ''"),
@@ -413,18 +411,18 @@ def _frame(key, value):
         (lambda content: content.update(aabb_scale=1, offset=[0, 0]), r"offset is \[0, 0\]"),
     ],
 )
-def test_what_is_wrong_is_named(scene, change, message):
+def test_errors_of_the_json_file(dataset, change, message):
     with pytest.raises(ValueError, match=message) as caught:
-        read_capture(scene(change))
+        read_capture(dataset(change))
     assert "\n" not in str(caught.value) and "transforms.json" in str(caught.value)
 
 
-def test_bad_files_are_named(scene):
+def test_errors_of_the_files(dataset):
     with pytest.raises(ValueError, match="folder is None"):
         read_capture(None)
-    folder = scene(lambda content: content.pop("cx"))
-    read_capture(folder)  # the size is stated, so no image is opened
-    folder = scene(lambda content: content.pop("cx") and content.pop("w"))
+    folder = dataset(lambda content: content.pop("cx"))
+    read_capture(folder)  # the size is stated, so no image is read
+    folder = dataset(lambda content: content.pop("cx") and content.pop("w"))
     (folder / "images" / "002.png").write_bytes(b"no image")
     with pytest.raises(ValueError, match="002.png: unreadable"):
         read_capture(folder)
@@ -452,14 +450,14 @@ VALUES = st.recursive(
 
 
 def _places(value, path=()):
-    """Returns the path of every value in a tree of JSON."""
+    """Returns the path of every value in a JSON tree."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path, *(place for key, inner in items for place in _places(inner, (*path, key)))]
 
 
 @settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_any_value_anywhere_reads_or_is_one_line(fuzzed, data):
+def test_random_json_values_are_read_or_a_one_line_error(fuzzed, data):
     folder, content = fuzzed
     changed = copy.deepcopy(content)
     for _ in range(data.draw(st.integers(1, 2))):
@@ -483,7 +481,7 @@ def test_any_value_anywhere_reads_or_is_one_line(fuzzed, data):
 
 @pytest.fixture(scope="session")
 def fuzzed(tmp_path_factory, shots):
-    """A small capture with an entry of every kind."""
+    """Returns the folder and content of a small dataset with an entry of every kind."""
     folder = tmp_path_factory.mktemp("fuzzed")
     extra = {
         **{
@@ -510,7 +508,7 @@ def test_the_real_fox(scenes_dir):
     capture = read_capture(scenes_dir / "fox")
     assert len(capture.frames) == 50 and capture.frames[0].name == "0001" and capture.splits is None
     (note,) = capture.notes
-    assert "17 of 67 frames have no file and are left out: 0005, " in note and note.endswith(" and 12 more")
+    assert "17 of 67 frames have no file and are skipped: 0005, " in note and note.endswith(" and 12 more")
     camera = capture.frames[0].camera
     assert camera.lens == "opencv" and (camera.height, camera.width) == (1920, 1080)
     assert camera.focal.tolist() == [1375.52, 1374.49] and camera.center.tolist() == [554.558, 965.268]

@@ -1,1 +1,1 @@
-"""What can go wrong around a run, at length: scripts run by hand. tests/test_faults.py has them in short."""
+"""Faults around a run, as scripts that are run by hand; tests/training/test_faults.py has the short versions."""

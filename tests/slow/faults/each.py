@@ -1,8 +1,8 @@
-"""Each fault by itself, on real processes and disks; a line says what came of it.
+"""Provokes each fault on real processes and disks, and prints a line about its outcome.
 
-    sudo python tests/faults/each.py --out=FOLDER
+    sudo python tests/slow/faults/each.py --out=FOLDER
 
-Root is needed to mount the disks that get full or read-only.
+Root mounts the disks that become full or read-only.
 """
 
 import argparse
@@ -22,12 +22,12 @@ import numpy as np
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-from jaxnerf.training import build, workdir  # noqa: E402
+from jaxnerf.training import auto_config, build, workdir  # noqa: E402
 from jaxnerf.training.checkpoint import Checkpoints  # noqa: E402
 from jaxnerf.training.metric_log import read_rows  # noqa: E402
 from jaxnerf.training.state import create_state  # noqa: E402
 
-OPTIONS = {"save_every": 10, "log_every": 1, "keep": 1000}
+OPTIONS = {"save_every": 10, "log_every": 1, "max_to_keep": 1000}
 TRAIN = ("--config=configs/smoke.py", *(f"--config.train.{name}={value}" for name, value in OPTIONS.items()))
 FOREVER = (*TRAIN, "--config.train.max_steps=1000000")
 
@@ -35,16 +35,16 @@ FOREVER = (*TRAIN, "--config.train.max_steps=1000000")
 def main(out):
     out = pathlib.Path(out)
     out.mkdir(parents=True)
-    logging.disable()  # of orbax, which tells of each file that it cannot read
+    logging.disable()  # orbax logs each file that it cannot read
     for fault in (damage, second, signals, full_disk, read_only, devices):
         for line in fault(out):
             print(f"{fault.__name__:9}  {line}", flush=True)
 
 
 def damage(out):
-    """Every file of a checkpoint cut, removed, or with one bit changed: true numbers or the one before."""
+    """Truncates, removes or changes a bit in each file of a checkpoint: it is restored exactly or skipped."""
     finish("train", out / "run", *TRAIN)
-    wanted = jax.device_put(state(out / "run", 20))
+    expected = jax.device_put(state(out / "run", 20))
     names = [path for path in (out / "run/checkpoints/20").rglob("*") if path.is_file()]
     for kind in (cut, os.remove, change):
         steps = []
@@ -52,27 +52,27 @@ def damage(out):
             copy = shutil.copytree(out / "run", out / "damaged")
             kind(copy / name.relative_to(out / "run"))
             try:
-                found, said = Checkpoints(copy, max_to_keep=3).load_newest(wanted)
+                found, said = Checkpoints(copy, max_to_keep=3).load_newest(expected)
                 assert len(said) == (int(found.step) == 10), said
                 if not said:
-                    jax.tree.map(np.testing.assert_array_equal, found, wanted)
+                    jax.tree.map(np.testing.assert_array_equal, found, expected)
                 steps.append(int(found.step))
-            except ValueError as error:  # both in one breath: named, and both still there
+            except ValueError as error:  # also the one before cannot be read: both stay
                 assert "checkpoints/20" in str(error) and Checkpoints(copy).steps() == [10, 20]
                 steps.append(None)
             shutil.rmtree(copy)
-        yield f"{kind.__name__} in one of {len(names)} files: went on from steps {steps}"
+        yield f"{kind.__name__} in one of {len(names)} files: continued from steps {steps}"
 
 
 def second(out):
-    """A second training is refused, evaluation beside the first is not."""
+    """A second training is an error; evaluation during training works."""
     with training(out / "two") as (process, _):
         code, err = finish("train", out / "two", *FOREVER)
         assert code == 1 and f"process {process.pid} on " in err[-1], err
         yield f"exit {code}, {err[-1]}"
         code, err = finish("eval", out / "two", "--step", str(wait_for(out / "two", process, 10)))
         assert code == 0, err
-        yield f"eval beside it: exit {code}"
+        yield f"eval during training: exit {code}"
 
 
 def signals(out):
@@ -80,7 +80,7 @@ def signals(out):
         with training(out / f"signal{int(number)}") as (process, folder):
             process.send_signal(number)
             err = process.communicate(timeout=300)[1].splitlines()
-            assert process.returncode == 0 and "saved; the same command goes on" in err[-1], err
+            assert process.returncode == 0 and "saved; the same command continues" in err[-1], err
             yield f"{number.name} in training: exit 0, {err[-1]}"
     folder = out / "scored"
     process = start("train", folder, *TRAIN, "--config.eval.at_end")
@@ -114,9 +114,9 @@ def full_disk(out):
         os.remove(place / "filler")
         end = before[-1] + 10
         code, err = finish("train", folder, *TRAIN, f"--config.train.max_steps={end}")
-        assert code == 0 and any(line.startswith(f"steps       {before[-1]} of") for line in err), err
+        assert code == 0 and any(line.split()[:2] == ["steps", str(before[-1])] for line in err), err
         assert [row["step"] for row in read_rows(folder)] == list(range(1, end + 1))
-        yield f"with room again: went on from {before[-1]}"
+        yield f"with free space again: continued from {before[-1]}"
 
 
 def read_only(out):
@@ -131,19 +131,19 @@ def read_only(out):
 
 
 def devices(out):
-    """Four devices, then two, then one, against one and against four all the way."""
-    shares = {"mixed": (4, 2, 1), "one": (1, 1, 1), "four": (4, 4, 4)}
-    for name, counts in shares.items():
+    """Trains on four devices, then two, then one, and compares with one and with four throughout."""
+    runs_of_counts = {"mixed": (4, 2, 1), "one": (1, 1, 1), "four": (4, 4, 4)}
+    for name, counts in runs_of_counts.items():
         for end, count in zip((20, 40, 60), counts, strict=True):
             os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={count}"
             code, err = finish("train", out / name, *TRAIN, f"--config.train.max_steps={end}")
             assert code == 0, err
-    params = {name: jax.tree.leaves(state(out / name, 60).params) for name in shares}
+    params = {name: jax.tree.leaves(state(out / name, 60).params) for name in runs_of_counts}
     for name in ("one", "four"):
         pairs = zip(params["mixed"], params[name], strict=True)
         largest = max(float(np.abs(a - b).max()) for a, b in pairs)
         assert largest < 1e-5
-        yield f"4, then 2, then 1, against {name} all the way, 60 steps: parameters within {largest:.1e}"
+        yield f"4, then 2, then 1, against {name} throughout, 60 steps: parameters within {largest:.1e}"
 
 
 def start(program, folder, *flags):
@@ -152,7 +152,7 @@ def start(program, folder, *flags):
 
 
 def finish(program, folder, *flags):
-    """Returns the exit code and the lines of what was said."""
+    """Returns the exit code and the lines of stderr."""
     process = start(program, folder, *flags)
     said = process.communicate(timeout=600)[1]
     assert "Traceback" not in said, said
@@ -161,7 +161,7 @@ def finish(program, folder, *flags):
 
 @contextlib.contextmanager
 def training(folder):
-    """Gives a process that trains without an end, past its first checkpoint, and its workdir."""
+    """Yields a process that trains until it is stopped and has saved a checkpoint, and its workdir."""
     process = start("train", folder, *FOREVER)
     try:
         wait_for(folder, process, 12)
@@ -195,7 +195,7 @@ def fill(place):
 
 
 def state(folder, step):
-    experiment = build.build(workdir.read_config(folder))
+    experiment = build.build(auto_config.resolve_for_device(workdir.read_config(folder))[0])
     like = create_state(experiment.model, experiment.optimizer, experiment.seed)
     return jax.device_get(Checkpoints(folder).load(step, like))
 

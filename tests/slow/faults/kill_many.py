@@ -1,10 +1,10 @@
-"""Kills a training again and again at random moments, and asks whether it ends as one that was left alone.
+"""Kills a training run again and again at random moments, and compares its end with an undisturbed run.
 
-    python tests/faults/kill_many.py --kills=50 --seed=0 --out=FOLDER
+    python tests/slow/faults/kill_many.py --kills=50 --seed=0 --out=FOLDER
 
-Each start gets SIGKILL while it reads, compiles, takes steps or writes a checkpoint, by chance. It must go on
-from the newest checkpoint that was whole, and in the end every number of the state, and every row of the
-metrics but its clock, must be that of a run without a kill, bit for bit.
+Each start gets SIGKILL at a random moment while it reads, compiles, takes steps or writes a checkpoint. It must
+continue from the newest complete checkpoint. In the end every number of the state, and every row of the metrics
+except its times, must equal that of a run without a kill, bit for bit.
 """
 
 import argparse
@@ -22,7 +22,7 @@ import numpy as np
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-from jaxnerf.training import build, workdir  # noqa: E402
+from jaxnerf.training import auto_config, build, workdir  # noqa: E402
 from jaxnerf.training.checkpoint import Checkpoints  # noqa: E402
 from jaxnerf.training.metric_log import read_rows  # noqa: E402
 from jaxnerf.training.state import create_state  # noqa: E402
@@ -32,7 +32,7 @@ CLOCKS = ("seconds", "compile_seconds", "rays_per_second")
 
 
 def main(*, kills, seed, out, config="configs/smoke.py", flags=(), say=print):
-    """Runs the test; raises an AssertionError that says what was lost. Returns the steps that were redone."""
+    """Runs the test; raises an AssertionError that says what was lost. Returns the number of repeated steps."""
     random_, out = random.Random(seed), pathlib.Path(out)
     killed, whole = out / "killed", out / "whole"
     started, starting, lost, phases = time.time(), 4.0, 0, {}
@@ -47,13 +47,13 @@ def main(*, kills, seed, out, config="configs/smoke.py", flags=(), say=print):
         process.wait()
         resumed, after = _resumed(log), max(Checkpoints(killed).steps(), default=0)
         reached = max([row["step"] for row in read_rows(killed)], default=0)
-        assert resumed in (None, before), f"went on from {resumed}, though {before} was whole"
+        assert resumed in (None, before), f"continued from {resumed}, though {before} was complete"
         assert after >= before, f"checkpoint {before} is gone"
         redone = max(reached - after, 0)
         assert redone <= SAVE_EVERY, f"{redone} steps are lost, a checkpoint is written every {SAVE_EVERY}"
         if phase == "steps":
             with (killed / "metrics.jsonl").open("a") as file:
-                file.write('{"step": 12, "sec')  # as a kill within a write leaves it
+                file.write('{"step": 12, "sec')  # as a process killed while writing leaves it
         lost, phases[phase] = lost + redone, phases.get(phase, 0) + 1
         came = f"from {'-' if resumed is None else resumed:>4} to {reached:4d}, saved {after:4d}"
         say(f"kill {number:2d}  {seconds:5.1f} s  {phase:9}  {came}")
@@ -61,7 +61,7 @@ def main(*, kills, seed, out, config="configs/smoke.py", flags=(), say=print):
     for folder in (killed, whole):
         process, log = _start(folder, config, end, flags)
         assert process.wait() == 0, log.read_text()
-    say(f"{kills} kills in {time.time() - started:.0f} s: {phases}; {end} steps, {lost} taken twice")
+    say(f"{kills} kills in {time.time() - started:.0f} s: {phases}; {end} steps, {lost} repeated")
     say(_compare(killed, whole, end))
     return lost
 
@@ -79,7 +79,7 @@ def _start(folder, config, max_steps, flags):
 
 
 def _wait(process, folder, log, aim, random_, starting):
-    """Waits for a random moment of what is aimed at; returns the seconds until the first step, if it came."""
+    """Waits for a random moment of the phase; returns the seconds until the first step, if there was one."""
     if aim == "starting":
         time.sleep(random_.uniform(0.0, starting))
         return None
@@ -99,12 +99,12 @@ def _wait(process, folder, log, aim, random_, starting):
 def _phase(folder, log):
     text = log.read_text()
     if "dB" not in text:
-        return "compiling" if "views " in text else "reading"
+        return "compiling" if "dataset " in text else "reading"
     return "saving" if _writing(folder) else "steps"
 
 
 def _writing(folder):
-    """Returns whether a checkpoint of this start is half written."""
+    """Returns whether a checkpoint is being written."""
     return any(folder.glob("checkpoints/*-tmp*"))
 
 
@@ -114,7 +114,7 @@ def _resumed(log):
 
 
 def _compare(killed, whole, end):
-    """Returns a line that says what was found the same; AssertionError where something differs."""
+    """Returns a line about what is equal; raises AssertionError if something differs."""
     a, b = (_state(folder, end) for folder in (killed, whole))
     assert jax.tree.structure(a) == jax.tree.structure(b)
     leaves = list(zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
@@ -128,11 +128,11 @@ def _compare(killed, whole, end):
     left = [path.name for path in killed.rglob("*") if "tmp" in path.name or "unreadable" in path.name]
     assert not left and not (killed / "running").exists(), left
     numbers = sum(x.size for x, _ in leaves)
-    return f"the same bit for bit as without a kill: {numbers:,} numbers of the state, {end} rows of metrics"
+    return f"bit-exact with the undisturbed run: {numbers:,} numbers of the state, {end} rows of metrics"
 
 
 def _state(folder, step):
-    experiment = build.build(workdir.read_config(folder))
+    experiment = build.build(auto_config.resolve_for_device(workdir.read_config(folder))[0])
     like = create_state(experiment.model, experiment.optimizer, experiment.seed)
     return jax.device_get(Checkpoints(folder).load(step, like))
 

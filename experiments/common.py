@@ -1,0 +1,274 @@
+"""Short runs that are trained once, compiled steps, timings, tables and plots: what the studies share."""
+
+import copy
+import functools
+import importlib
+import json
+import math
+import os
+import pathlib
+import re
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from absl import flags
+from ml_collections import ConfigDict
+
+from jaxnerf.data import dataset
+from jaxnerf.runtime.atomic_files import partial_file, write_text
+from jaxnerf.runtime.devices import split_positions
+from jaxnerf.training import auto_config, build
+from jaxnerf.training.state import create_state
+from jaxnerf.training.step import make_train_step
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+REFERENCE_GFLOPS = 93.0  # matrix product of the machine that the project's limits in seconds refer to
+_SCORED = "scored.json"  # in the workdir of a run that is trained to its end and scored
+_MATRIX_SIDE = 1024
+README = flags.DEFINE_string("readme", None, "Markdown file in which the tables of this study are replaced.")
+
+
+def configuration(base: str, overrides: Mapping[str, Any] | Sequence = (), *, seed: int = 0):
+    """Returns the config of that name with {"section.field": value} and the seed replaced."""
+    config = importlib.import_module(f"jaxnerf.configs.{base}").get_config()
+    return changed(config, {**dict(overrides), "seed": seed})
+
+
+def changed(config, overrides: Mapping[str, Any]):
+    """Returns a copy of a config with {"section.field": value} replaced."""
+    config = copy.deepcopy(config)
+    config.update_from_flattened_dict(overrides)
+    return config
+
+
+def run(config, folder, *, split: str | None = None) -> dict[str, Any] | None:
+    """Trains a run to its end and scores it; resumes an interrupted run and does not repeat a finished one.
+
+    Args:
+        config: of the run.
+        folder: its workdir.
+        split: to score; the config's eval.split when None.
+
+    Returns:
+        The content of results.json, or None if Ctrl-C stopped the training, which was saved.
+
+    Raises:
+        ValueError: as `train_and_evaluate`, and if the folder holds a finished run with another config.
+    """
+    done = finished(config, folder, split=split)
+    if done is not None:
+        return done
+    from jaxnerf.evaluation import evaluate, restore
+
+    if not evaluate.train_and_evaluate(config, folder, views=load_split(config, "train")):
+        return None
+    views = load_split(config, split or config.eval.split)
+    results = evaluate.score_run(restore.restore_run(folder), folder, split=split, overwrite=True, views=views)
+    origin = {"config": _plain(config), "split": split}
+    write_text(pathlib.Path(folder) / _SCORED, json.dumps({"origin": origin, "results": results}) + "\n")
+    jax.clear_caches()  # no other run has this step and this renderer
+    return results
+
+
+def finished(config, folder, *, split: str | None = None) -> dict[str, Any] | None:
+    """Returns the results of a finished run, or None; raises ValueError if that run has another config."""
+    path = pathlib.Path(folder) / _SCORED
+    if not path.exists():
+        return None
+    kept = json.loads(path.read_text())
+    origin = {"config": _plain(config), "split": split}
+    if kept["origin"] != origin:
+        old, new = _flat(kept["origin"]), _flat(origin)
+        key = next(key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key))
+        raise ValueError(
+            f"{folder}: holds a finished run with {key} {old.get(key)!r}, expected {new.get(key)!r}; "
+            "give another folder, or the old settings"
+        )
+    return kept["results"]
+
+
+def load_split(config, split: str):
+    """Returns the Views of a split, read once for all runs on them."""
+    return _load_split(json.dumps(config.data.to_dict(), sort_keys=True), split)
+
+
+@functools.lru_cache(maxsize=6)
+def _load_split(data, split):
+    return dataset.load_split(ConfigDict(json.loads(data)), split)
+
+
+def _plain(config):
+    """Returns a config as JSON holds it, without the place of the dataset."""
+    plain = json.loads(config.to_json_best_effort())
+    return plain | {"data": {key: value for key, value in plain["data"].items() if key != "dir"}}
+
+
+def _flat(tree, prefix=""):
+    if not isinstance(tree, dict):
+        return {prefix[:-1]: tree}
+    flat = {}
+    for name, part in tree.items():
+        flat.update(_flat(part, f"{prefix}{name}."))
+    return flat
+
+
+class Step(NamedTuple):
+    """A compiled training step on one device, to be timed and counted.
+
+    Attributes:
+        config: resolved.
+        run: (state, data, positions) -> (state, metrics); consumes the state.
+        state: at step 0.
+        data: TrainData.
+        positions: [microbatches, rays] int32.
+        count_flops: () -> FLOPs of the step without updates of the grid, the whole batch as one microbatch:
+            XLA counts the body of a loop once, however often it runs.
+    """
+
+    config: Any
+    run: Any
+    state: Any
+    data: Any
+    positions: Any
+    count_flops: Callable[[], float]
+
+
+def compile_step(config, views=None) -> Step:
+    """Compiles the training step of a config; views are those of the split "train", read when None."""
+    config, views, _ = auto_config.resolve(config, load_split(config, "train") if views is None else views)
+    config, _ = auto_config.resolve_for_device(config)
+    experiment = build.build(config)
+    valid, data = experiment.prepare(views)
+    state = create_state(experiment.model, experiment.optimizer, experiment.seed, valid)
+    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
+    positions = jnp.asarray(split_positions(config.train.batch_size, 1, config.train.microbatch_size)[0])
+
+    def count_flops():
+        no_updates = data._replace(cells=None if data.cells is None else data.cells[:0])
+        return jax.jit(step).lower(state, no_updates, positions.reshape(1, -1)).compile().cost_analysis()["flops"]
+
+    run = jax.jit(step, donate_argnums=0).lower(state, data, positions).compile()
+    return Step(config, run, state, jax.device_put(data), positions, count_flops)
+
+
+def spread(values: Sequence[float]) -> tuple[float, float]:
+    """Returns mean and standard deviation over seeds; the deviation of a single value is NaN."""
+    return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else math.nan
+
+
+def differences(scores: Mapping[int, float], others: Mapping[int, float]) -> list[float]:
+    """Returns score - other for the seeds that both {seed: score} have, by ascending seed."""
+    return [scores[seed] - others[seed] for seed in sorted(scores.keys() & others.keys())]
+
+
+def describe_machine() -> str:
+    """Returns what timings depend on."""
+    cores = len(os.sched_getaffinity(0))
+    return f"{jax.devices()[0].device_kind}, {cores} core(s), XLA_FLAGS={os.environ.get('XLA_FLAGS', '')!r}"
+
+
+def matrix_gflops(repeats: int = 12) -> float:
+    """Returns the median GFLOP/s of the product of two float32 matrices on this machine now."""
+    matrix = jnp.full((_MATRIX_SIDE, _MATRIX_SIDE), 1 / _MATRIX_SIDE)
+    product = jax.jit(lambda a, b: jnp.dot(a, b, precision="highest"))
+    return 2 * _MATRIX_SIDE**3 / 1e9 / statistics.median(times(lambda: product(matrix, matrix), repeats))
+
+
+def comparable(seconds: float, gflops: float) -> float:
+    """Returns the seconds that the machine of REFERENCE_GFLOPS would take."""
+    return seconds * gflops / REFERENCE_GFLOPS
+
+
+def times(call: Callable[[], Any], repeats: int) -> list[float]:
+    """Returns the seconds of repeated calls, after one that may compile and that warms the caches."""
+    jax.block_until_ready(call())
+    return [seconds(call) for _ in range(repeats)]
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    """Returns the seconds until the result of a call is ready."""
+    started = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - started
+
+
+def read_json(path: pathlib.Path) -> dict[str, Any]:
+    """Returns the content of a JSON file, or {} if there is none."""
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def write_json(path: pathlib.Path, content: Any) -> None:
+    """Writes a JSON file whole or not at all; its folder is made if missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Returns the lines of a table."""
+    return ["| " + " | ".join(cells) + " |" for cells in (heads, ["---"] * len(heads), *rows)]
+
+
+def publish(lines: Sequence[str], name: str) -> None:
+    """Prints the lines of a study; with --readme replaces the table of that name in the file, too."""
+    print("\n".join(lines))
+    if README.value:
+        replace(pathlib.Path(README.value), lines, name)
+
+
+def replace(path: pathlib.Path, lines: Sequence[str], name: str) -> None:
+    """Replaces the lines between <!-- name --> and <!-- end of name --> (or <!-- /name -->) in a file.
+
+    Raises:
+        ValueError: if the file lacks these marks.
+    """
+    text = path.read_text()
+    marks = rf"(<!-- {re.escape(name)} -->\n).*?(<!-- (?:end of |/){re.escape(name)} -->)"
+    found = re.search(marks, text, re.DOTALL)
+    if not found:
+        raise ValueError(
+            f"{path}: lacks the lines <!-- {name} --> and <!-- end of {name} -->; add them where the table belongs"
+        )
+    write_text(path, text[: found.end(1)] + "\n".join(lines) + "\n" + text[found.start(2) :])
+
+
+def pyplot():
+    """Returns matplotlib.pyplot, or None, reported on stderr, where matplotlib is missing."""
+    try:
+        import matplotlib
+    except ImportError:
+        print("No plot, which needs matplotlib: pip install matplotlib", file=sys.stderr)
+        return None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def save_figure(figure, path: pathlib.Path) -> None:
+    """Writes a figure as PNG, whole or not at all, and closes it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with partial_file(path) as partial:
+        figure.savefig(partial, format="png", dpi=100)
+    pyplot().close(figure)
+    print(f"wrote {path}")
+
+
+def chosen(flag: str, names: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Returns the names that a flag lists; raises ValueError for one that is not known."""
+    names = [name.strip() for name in names]
+    wrong = [name for name in names if name not in known]
+    if wrong:
+        raise ValueError(f"{flag} contains {wrong[0]!r}, expected some of {', '.join(known)}")
+    return names
+
+
+def seeds_of(flag: str, values: Sequence[str], *, least: int = 1) -> list[int]:
+    """Returns the different seeds that a flag lists, in its order; raises ValueError if there are too few."""
+    if not all(value.strip().isdigit() for value in values) or len(set(values)) < least:
+        raise ValueError(f"{flag} is {','.join(values)!r}, expected at least {least} integers such as 0,1,2")
+    return list(dict.fromkeys(int(value) for value in values))

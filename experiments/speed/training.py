@@ -1,0 +1,143 @@
+"""The part "training" of speed_vs_error.py: curves of PSNR against seconds of training."""
+
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import common
+
+from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.training import metric_log, workdir
+
+
+def _curve(config, seconds, **overrides):
+    return {"config": config, "overrides": overrides, "seconds": seconds}
+
+
+# Without a grid the small network has samples 0.03 apart where rays go from 2 to 6, and the octaves that
+# auto_config infers from these images where the box is known.
+_DENSE = {"sampler": "hierarchical", "sampling.num_fine": 0, "sampling.num_coarse": 133, "fine.num_freqs": 7}
+# Where no space is known to be empty: no alpha, and the same octaves and sample distance with and without a grid.
+_EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "occupancy.use_alpha": False, "fine.num_freqs": 7}
+_EMBEDDED["occupancy.step_size"] = 0.03
+_FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.background": "none"}
+_FERN |= {"occupancy.use_alpha": False, "occupancy.step_size": 2 / 133, "fine.num_freqs": 7}
+_FOX = {"data.format": "transforms", "data.dir": "fox"}
+# No update ever empties a cell, nothing is occluded, and the same buffer takes all samples of fewer rays.
+_NO_UPDATES = {
+    "occupancy.update_every": 10**8,
+    "occupancy.max_optical_depth": 0.0,
+    "occupancy.long_steps_until": 0,
+    "occupancy.pool_samples_per_ray": 243.0,
+    "train.batch_size": 43,
+}
+# The learning rate that lego_mlp_fast.py had before Muon.
+_ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4}
+_PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
+CURVES = {
+    "grid": _curve("lego_fast", (15, 30, 45, 60, 90, 120, 180, 300)),
+    "grid without alpha": _curve("lego_fast", (30, 60, 90, 180, 300), **{"occupancy.use_alpha": False}),
+    "grid 200": _curve("lego_fast", (30, 60, 100, 180, 360), **{"data.factor": 4}),
+    "grid 400": _curve("lego_fast", (60, 150, 300, 600), **{"data.factor": 2}),
+    "small network": _curve("lego_mlp_fast", (30, 60, 120, 240, 480)),
+    "small network by Adam": _curve("lego_mlp_fast", (30, 60, 120, 240, 480), **_ADAM),
+    "small network everywhere": _curve("lego_mlp_fast", (120, 480), **_DENSE),
+    "embedded": _curve("lego_mlp_fast", (60, 180), **_EMBEDDED),
+    "embedded everywhere": _curve("lego_mlp_fast", (60, 180), **_EMBEDDED | _DENSE),
+    "fern": _curve("lego_mlp_fast", (120, 300), **_FERN),
+    "fern everywhere": _curve("lego_mlp_fast", (120, 300), **_FERN | _DENSE),
+    "fox": _curve("capture", (60, 120), **_FOX),
+    "fox everywhere": _curve("capture", (60, 120), **_FOX | _NO_UPDATES),
+    "dense": _curve("lego_small", (60, 120, 300, 600)),
+    "paper": _curve("default", (600, 1800), **_PAPER),
+    "paper skipping": _curve("default", (600, 1800), **_PAPER, **{"sampler": "occupancy"}),
+}
+SEEDED = "grid"  # the curve that is measured with several seeds
+
+
+def measure(
+    kept: dict[str, Any],
+    save: Callable[[dict], None],
+    folder: pathlib.Path,
+    names: Sequence[str],
+    seeds: Sequence[int],
+    seconds: Sequence[float] = (),
+) -> bool:
+    """Trains curves to each of their times and scores the test views there; kept points are not repeated.
+
+    Args:
+        kept: what an earlier call saved, {} at first; it is extended.
+        save: called with kept after each score.
+        folder: of the workdirs.
+        names: of CURVES.
+        seeds: of the curve SEEDED; the others take the first.
+        seconds: in place of the curves' own.
+
+    Returns:
+        Whether all curves were completed (False: interrupted by Ctrl-C).
+    """
+    kept.setdefault("machine", common.describe_machine())
+    for name in names:
+        plan = CURVES[name]
+        described = {"config": plan["config"], "overrides": plan["overrides"]}
+        curve = kept.setdefault("curves", {}).setdefault(name, {**described, "runs": {}})
+        if {key: curve[key] for key in described} != described:
+            raise ValueError(f"{name}: was measured with {curve['overrides']}; give another --out")
+        for seed in seeds if name == SEEDED else seeds[:1]:
+            points = curve["runs"].setdefault(str(seed), [])
+            where = folder / workdir_name(name, seed)
+            for time_limit in sorted(seconds or plan["seconds"]):
+                if points and (time_limit <= points[-1]["time_limit"] or points[-1]["ended"]):
+                    continue
+                point = run_to(time_limit, configuration(name, seed), where, points[-1] if points else None)
+                if point is None:
+                    return False
+                points.append(point)
+                save(kept)
+                print(f"{name}, seed {seed}: {point['psnr']:.2f} dB in {point['seconds']:.0f} s", flush=True)
+    return True
+
+
+def configuration(name: str, seed: int = 0):
+    """Returns the config of a curve."""
+    return common.configuration(CURVES[name]["config"], CURVES[name]["overrides"], seed=seed)
+
+
+def workdir_name(name: str, seed: int) -> str:
+    """Returns the name of a curve's workdir."""
+    return f"{name.replace(' ', '_')}-{seed}"
+
+
+def run_to(time_limit: float, config, where: pathlib.Path, before: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Returns the scores of a run after so many seconds of training, or None if it was interrupted.
+
+    Args:
+        time_limit: seconds of training in all.
+        config: of the run.
+        where: its workdir.
+        before: the point from which the run resumes, or None. Comparable seconds add up over the pieces, each
+            scaled by the machine's speed just before and after it.
+    """
+    config.train.max_seconds = float(time_limit)
+    fresh = not metric_log.read_rows(where)
+    speed, started = [common.matrix_gflops()], time.perf_counter()
+    if not train_and_evaluate(config, where):
+        return None
+    wall = time.perf_counter() - started
+    speed.append(common.matrix_gflops())
+    result = evaluate(where, overwrite=True)
+    trained, compiling = result["training_seconds"], result["compile_seconds"]
+    last = before or {"seconds": 0.0, "comparable": 0.0, "compile_seconds": compiling, "setup_seconds": None}
+    piece = trained - last["seconds"]
+    return {
+        "time_limit": time_limit,
+        "ended": result["step"] >= workdir.read_config(where).train.max_steps,
+        "seconds": trained,
+        "comparable": last["comparable"] + common.comparable(piece, sum(speed) / 2),
+        "gflops": speed,
+        "compile_seconds": last["compile_seconds"],  # of the first start
+        "setup_seconds": wall - trained - compiling if fresh else last["setup_seconds"],
+        "rays": result["rays_seen"],
+        **{key: result[key] for key in ("step", "psnr", "ssim", "seconds_per_frame", "views", "parameters")},
+    }

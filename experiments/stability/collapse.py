@@ -1,0 +1,154 @@
+"""Counts how often a training collapses to an image of one colour, with and without reinitialization.
+
+    python experiments/stability/collapse.py [--seeds=20] [--steps=600] [--out=runs/collapse] [--readme=README.md]
+
+Trains the embedded scene with a network that tends to die (ReLU density, eight narrow layers without a skip, a high
+learning rate), each seed with train.max_reinits=0 and with the default. Prints one row per run, then the table;
+--out keeps both as collapse.json. With --readme the table between <!-- collapse --> and <!-- end of collapse --> is
+replaced. A run has collapsed when its network is dead at the end; see jaxnerf/training/dead_networks.py.
+"""
+
+import hashlib
+import json
+import pathlib
+import statistics
+import sys
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+from absl import flags
+
+sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
+import common
+
+from jaxnerf import pixel_grid, psnr
+from jaxnerf.evaluation.evaluate import reference
+from jaxnerf.runtime import cli
+from jaxnerf.training import auto_config, build, dead_networks
+from jaxnerf.training.state import create_state
+
+HEADS = ("train.max_reinits", "runs", "dead at the end", "reinitialized", "found at step", "PSNR", "worst")
+_SEEDS = flags.DEFINE_integer("seeds", 20, "Number of runs with each setting.", lower_bound=1)
+_STEPS = flags.DEFINE_integer("steps", 600, "Steps of a run.", lower_bound=1)
+_OUT = flags.DEFINE_string("out", None, "Folder of collapse.json.")
+
+
+def main(argv: list[str]) -> None:
+    """Runs all seeds with both settings and reports."""
+    del argv
+    study = Study(_STEPS.value)
+    rows = []
+    for seed in range(_SEEDS.value):
+        for allowed in (0, common.configuration("default").train.max_reinits):
+            rows.append(study.run(seed, allowed))
+            print(json.dumps(rows[-1]), flush=True)
+    lines = common.markdown(HEADS, [summary(group) for group in by_setting(rows)]) + ["", unaffected(rows)]
+    if _OUT.value:
+        common.write_json(pathlib.Path(_OUT.value) / "collapse.json", {"rows": rows, "table": lines})
+    common.publish(lines, "collapse")
+
+
+def fragile_config(steps: int):
+    """Returns a config with which networks tend to die."""
+    return common.configuration(
+        "default",
+        {
+            "data.size": 40,
+            "fine.depth": 8,
+            "fine.width": 32,
+            "fine.skip_layer": 8,
+            "fine.num_freqs": 5,
+            "fine.use_viewdirs": False,
+            "sampling.num_coarse": 16,
+            "sampling.num_fine": 0,
+            "train.batch_size": 128,
+            "train.max_steps": steps,
+            "train.lr_steps": steps,
+            "train.lr_init": 0.06,
+            "train.lr_final": 0.001,
+        },
+    )
+
+
+class Study:
+    """The runs of one config, compiled once: the seed is an argument of the step."""
+
+    def __init__(self, steps: int):
+        config = fragile_config(steps)
+        self._step = common.compile_step(config)
+        config, _ = auto_config.resolve_for_device(self._step.config)
+        self._experiment = build.build(config)
+        self._views = self._experiment.load_split("test")
+        model = self._experiment.model
+        self._render = jax.jit(lambda params, rays: model.view(params, None, rays).rgb)
+
+    def run(self, seed: int, allowed: int) -> dict[str, Any]:
+        """Trains a seed and returns its metrics.
+
+        Args:
+            seed: of the initial parameters and the rays.
+            allowed: train.max_reinits.
+        """
+        options = SimpleNamespace(**{**vars(self._experiment.train), "max_reinits": allowed})
+        experiment = self._experiment._replace(seed=seed, train=options)
+        reinitialize = dead_networks.make_reinitializer(experiment, f"seed {seed}")
+        state = create_state(experiment.model, experiment.optimizer, seed)
+        data = self._step.data._replace(seed=np.uint32(seed))
+        started, found, counted = time.perf_counter(), [], 0
+        for step in range(1, options.max_steps + 1):
+            state, metrics = reinitialize(step, *self._step.run(state, data, self._step.positions))
+            if step % dead_networks.CHECK_EVERY == 0 and int(metrics["num_reinits"]) > counted:
+                found, counted = [*found, step], int(metrics["num_reinits"])
+        leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state.params)]
+        return {
+            "seed": seed,
+            "max_reinits": allowed,
+            "psnr": self._score(state.params),
+            "dead": dead_networks.dead_networks(metrics),
+            "num_reinits": counted,
+            "found": found,
+            "seconds": time.perf_counter() - started,
+            "parameters": hashlib.sha256(b"".join(leaves)).hexdigest(),
+        }
+
+    def _score(self, params):
+        values = []
+        for index, (height, width) in enumerate(np.asarray(self._views.size)):
+            rays = self._experiment.view_rays(self._views, index, pixel_grid(height, width))
+            values.append(float(psnr(self._render(params, rays), reference(self._views, index))))
+        return statistics.mean(values)
+
+
+def by_setting(rows: list[dict]) -> tuple[list[dict], list[dict]]:
+    """Returns the rows of the runs without and with reinitialization."""
+    return [row for row in rows if not row["max_reinits"]], [row for row in rows if row["max_reinits"]]
+
+
+def summary(rows: list[dict]) -> tuple[str, ...]:
+    """Returns the cells of the runs with one setting."""
+    scores, found = [row["psnr"] for row in rows], [step for row in rows for step in row["found"]]
+    return (
+        str(rows[0]["max_reinits"]),
+        str(len(rows)),
+        str(sum(bool(row["dead"]) for row in rows)),
+        f"{sum(row['num_reinits'] for row in rows)} times in {sum(row['num_reinits'] > 0 for row in rows)} runs",
+        f"{statistics.median(found):g} (first {min(found)}, last {max(found)})" if found else "-",
+        f"{statistics.median(scores):.2f} dB",
+        f"{min(scores):.2f} dB",
+    )
+
+
+def unaffected(rows: list[dict]) -> str:
+    """Returns a sentence about the runs in which no network died."""
+    pairs = [pair for pair in zip(*by_setting(rows), strict=True) if not pair[1]["num_reinits"]]
+    equal = sum(a["parameters"] == b["parameters"] for a, b in pairs)
+    return (
+        f"Of {len(pairs)} runs in which no network died, {equal} end with the same parameters both ways, bit for bit."
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,263 @@
+"""The distortion loss (arXiv:2111.12077, Eq. 15): closed forms, gradients, degenerate rays, dense and packed."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.extend.core import jaxprs_in_params
+
+import jaxnerf
+from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compiled, full_grid, rays_past_origin
+from jaxnerf.core.losses import mse_loss
+from jaxnerf.core.occupancy.grid import mask_samples
+from jaxnerf.core.types import without_samples
+
+KEPT, FINITE_FAR, INFINITE_FAR = 0.7, (1.0, 7.0), (1.5, np.inf)
+
+
+def make_batch(near, far):
+    near, far = jnp.broadcast_arrays(jnp.float32(near), jnp.float32(far))
+    vectors = jnp.zeros((*near.shape, 3))
+    rays = jaxnerf.Rays(origins=vectors, directions=vectors, viewdirs=vectors, near=near, far=far)
+    return jaxnerf.Batch(rays=rays, rgb=vectors)
+
+
+def make_rendering(weights, t, delta, rule="segments"):
+    """Returns a Rendering that has weights and samples; losses of the weights read nothing else."""
+    samples = jaxnerf.Samples(t=t, delta=delta, rule=rule)
+    names = ("rgb", "opacity", "depth", "disparity", "num_dropped")
+    return jaxnerf.Rendering(weights=weights, samples=samples, **dict.fromkeys(names, weights[..., 0]))
+
+
+def distortion(weights, t, delta, near=0.0, far=1.0, rule="segments"):
+    """Returns the loss of one ray, or of rays [B]."""
+    batch = make_batch(jnp.broadcast_to(near, weights.shape[:-1]), far)
+    return jaxnerf.distortion_loss([make_rendering(weights, t, delta, rule)], batch)
+
+
+compiled_distortion = compiled(distortion, "rule")
+loss_and_gradient = compiled(jax.value_and_grad(distortion, argnums=(0, 1, 2)))
+
+
+def double_sum(weights, t, delta, near, far, rule="segments"):
+    """Returns Eq. 15 of one ray as it is printed, in float64 and in quadratic time."""
+    weights, t, delta = np.float64(weights), np.float64(t), np.float64(delta)
+    used = delta > 0
+    weights, t, delta = weights[used], t[used], delta[used]
+    if rule == "points":
+        delta = np.minimum(delta, np.maximum(far - t, 0))
+    lower = t if rule == "points" else t - delta / 2
+    if np.isinf(far):
+        s, lengths = 1 - near / t, near / np.maximum(lower, near) - near / (lower + delta)
+    else:
+        s, lengths = (t - near) / (far - near), delta / (far - near)
+    pairs = weights[:, None] * weights[None] * np.abs(s[:, None] - s[None])
+    return pairs.sum() + (weights**2 * lengths).sum() / 3
+
+
+def random_samples(seed, count, near, far):
+    """Returns weights, t and delta [count] float32 of adjacent segments on one ray, some of them unused."""
+    rng = np.random.default_rng(seed)
+    edges = np.sort(rng.uniform(0, 1, count + 1))
+    edges = near / (1 - 0.9 * edges) if np.isinf(far) else near + edges * (far - near)
+    t, delta = (edges[1:] + edges[:-1]) / 2, np.diff(edges) * (rng.uniform(size=count) < KEPT)
+    weights = rng.dirichlet(np.ones(count)) * rng.uniform()
+    return np.float32(weights), np.float32(t), np.float32(delta)
+
+
+def test_two_samples():
+    weights, t, delta = np.float32([0.3, 0.5]), np.float32([2.0, 3.5]), np.float32([0.4, 0.8])
+    pair, own = 2 * 0.3 * 0.5 * 1.5 / 4, (0.3**2 * 0.4 + 0.5**2 * 0.8) / 4 / 3
+    np.testing.assert_allclose(compiled_distortion(weights, t, delta, near=1, far=5), pair + own, rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 17, 300])
+def test_equal_weights_on_an_even_grid_have_the_mean_distance_of_two_points(count):
+    """Two uniform random points in [0, 1] are 1/3 apart on average, whatever the number of samples."""
+    t, delta = np.float32((np.arange(count) + 0.5) / count), np.full(count, 1 / count, np.float32)
+    np.testing.assert_allclose(compiled_distortion(np.full(count, 1 / count, np.float32), t, delta), 1 / 3, rtol=1e-6)
+
+
+def test_a_single_sample_counts_only_its_own_length():
+    one = np.float32([0.6])
+    np.testing.assert_allclose(
+        compiled_distortion(one, np.float32([3]), np.float32([2]), 1, 6), 0.36 * 2 / 5 / 3, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("count", [10, 100, 1000])
+def test_a_peak_costs_less_the_narrower_it_is(count):
+    weights = np.zeros(count, np.float32)
+    weights[count // 3] = 1
+    t, delta = np.float32((np.arange(count) + 0.5) / count), np.full(count, 1 / count, np.float32)
+    np.testing.assert_allclose(compiled_distortion(weights, t, delta), 1 / (3 * count), rtol=1e-5)
+
+
+@pytest.mark.parametrize("near, far", [FINITE_FAR, INFINITE_FAR])
+@pytest.mark.parametrize("rule", ["segments", "points"])
+def test_the_linear_sum_is_the_double_sum(near, far, rule):
+    for seed, count in ((0, 1), (1, 2), (2, 33), (3, 200)):
+        given = random_samples(seed, count, near, far)
+        want = double_sum(*given, near, far, rule)
+        np.testing.assert_allclose(compiled_distortion(*given, near, far, rule=rule), want, rtol=2e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("near, far", [FINITE_FAR, INFINITE_FAR])
+def test_the_gradient_is_that_of_the_double_sum(near, far):
+    given = random_samples(4, 40, near, far)
+    slopes = loss_and_gradient(*given, near, far)[1]
+    used = given[2] > 0
+    for place, slope in enumerate(slopes):
+        for index in np.flatnonzero(used)[::5]:
+            step = 1e-5 * given[1][index]
+            low, high = ([np.float64(value) for value in given] for _ in range(2))
+            low[place][index] -= step
+            high[place][index] += step
+            want = (double_sum(*high, near, far) - double_sum(*low, near, far)) / (2 * step)
+            np.testing.assert_allclose(slope[index], want, rtol=1e-3, atol=2e-6)
+        assert not np.any(slope[~used])
+
+
+def nan_where_unused(weights, t, delta):
+    return weights, np.where(delta > 0, t, np.float32(np.nan)), delta
+
+
+@pytest.mark.parametrize(
+    "name, near, far, change",
+    [
+        ("an empty ray", 1.0, 7.0, lambda w, t, d: (0 * w, t, d)),
+        ("no used sample", 1.0, 7.0, lambda w, t, d: (w, t, 0 * d)),
+        ("NaN where nothing is used", 1.0, 7.0, nan_where_unused),
+        ("near equals far", 3.0, 3.0, lambda w, t, d: (w, 0 * t + 3, 0 * d)),
+        ("near equals far, positive lengths", 3.0, 3.0, lambda w, t, d: (w, t, d)),
+        ("infinite far", 1.0, np.inf, nan_where_unused),
+        ("infinite far and last segment", 1.0, np.inf, lambda w, t, d: (w, t, np.append(d[:-1], np.float32(np.inf)))),
+        ("infinite far from 0 on", 0.0, np.inf, lambda w, t, d: (w, t, d)),
+        ("coincident samples", 1.0, 7.0, lambda w, t, d: (w, 0 * t + 2, d)),
+    ],
+)
+def test_degenerate_rays_have_finite_losses_and_gradients(name, near, far, change):
+    given = tuple(np.float32(value) for value in change(*random_samples(5, 24, 1.0, 7.0)))
+    value, slopes = loss_and_gradient(*given, near, far)
+    assert all_finite((value, slopes[0], slopes[1])), name
+    assert np.isfinite(slopes[2][np.isfinite(given[2])]).all() and value >= 0
+    if name in ("an empty ray", "no used sample", "near equals far", "near equals far, positive lengths"):
+        assert value == 0 and not np.any(slopes[1])
+
+
+@pytest.mark.parametrize("far", [7.0, np.inf])
+def test_the_last_delta_of_points_ends_with_the_ray(far):
+    """A last delta of 1e10, as in the released codes, counts up to far."""
+    t = np.float32([1.5, 2.0, 4.0, 6.0])
+    weights, delta = np.float32([0.1, 0.2, 0.3, 0.1]), np.float32([0.5, 2.0, 2.0, 1e10])
+    got = compiled_distortion(weights, t, delta, 1.5, far, rule="points")
+    np.testing.assert_allclose(got, double_sum(weights, t, delta, 1.5, far, "points"), rtol=1e-5)
+
+
+def test_nan_weights_show():
+    weights, t, delta = random_samples(6, 8, 1.0, 7.0)
+    delta[3] = 1.0
+    weights[3] = np.nan
+    assert np.isnan(compiled_distortion(weights, t, delta, 1, 7))
+
+
+RAYS, SEGMENTS = 24, 40
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("rule", ["segments", "points"])
+def test_dense_and_packed_renderings_have_the_same_loss(masked, rule):
+    """Also in value and gradient where the occupancy grid skips samples, or the buffer has unused slots."""
+    rays = rays_past_origin(0, RAYS)
+    edges = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=SEGMENTS)
+    segments = jaxnerf.samples_from_edges(jax.random.key(1), edges)
+    samples = segments if rule == "segments" else jaxnerf.samples_from_points(segments.t)
+    grid = checked_grid() if masked else full_grid()
+    samples, _ = mask_samples(grid, rays, samples)
+    batch = jaxnerf.Batch(rays=rays, rgb=np.zeros((RAYS, 3), np.float32))
+
+    def scene(scale, x, viewdirs):
+        return scale * jnp.exp(-2 * (x**2).sum(axis=-1)), jax.nn.sigmoid(x)
+
+    def dense(scene):
+        return jaxnerf.render_samples(scene, rays, samples)
+
+    def packed(scene):
+        return jaxnerf.render_packed(scene, None, rays, samples, max_samples=RAYS * SEGMENTS + 7)
+
+    def loss_and_slope(render):
+        def total(scale):
+            losses = jaxnerf.distortion_loss([render(lambda x, viewdirs: scene(scale, x, viewdirs))], batch)
+            return losses.sum(), losses
+
+        return jax.jit(jax.value_and_grad(total, has_aux=True))(jnp.float32(4.0))
+
+    ((_, want), want_slope), ((_, got), slope) = loss_and_slope(dense), loss_and_slope(packed)
+    assert got.shape == (RAYS,) and np.max(want) > 1e-3
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(slope, want_slope, rtol=1e-4)
+
+
+def test_batch_is_vmap_is_jit():
+    parts = [random_samples(seed, 30, 1.0, 7.0) for seed in range(5)]
+    given = [np.stack(values) for values in zip(*parts, strict=True)]
+    assert_batch_is_vmap_is_jit(lambda *given: distortion(*given, 1.0, 7.0), *given)
+
+
+def largest_intermediate(function, *given):
+    """Returns the size of the largest array in the jaxpr of a function and of all that it calls."""
+
+    def sizes(jaxpr):
+        for equation in jaxpr.eqns:
+            yield from (variable.aval.size for variable in equation.outvars)
+            for inner in jaxprs_in_params(equation.params):
+                yield from sizes(inner)
+
+    return max(sizes(jax.make_jaxpr(function)(*given).jaxpr))
+
+
+@pytest.mark.parametrize("layout", ["dense", "packed"])
+def test_time_and_memory_are_linear_in_the_number_of_samples(layout):
+    def function(weights, t, delta):
+        if layout == "dense":
+            return jax.grad(lambda weights: distortion(weights, t, delta, 1.0, 7.0))(weights)
+        index = jnp.arange(weights.size, dtype=jnp.int32) // 100
+        samples = jaxnerf.PackedSamples(weights=weights, t=t, delta=delta, ray_index=index, used=delta > 0)
+        batch = make_batch(jnp.ones(weights.size // 100), 7.0)
+
+        def total(weights):
+            rendering = make_rendering(weights, t, delta)
+            rendering = dataclasses.replace(
+                rendering, weights=None, samples=dataclasses.replace(samples, weights=weights)
+            )
+            return jaxnerf.distortion_loss([rendering], batch).sum()
+
+        return jax.grad(total)(weights)
+
+    flops = []
+    for count in (2000, 8000):
+        given = random_samples(0, count, 1.0, 7.0)
+        assert largest_intermediate(function, *given) <= 20 * count
+        flops.append(jax.jit(function).lower(*given).compile().cost_analysis()["flops"])
+    assert flops[1] < 5 * flops[0]  # 16 where it is quadratic
+
+
+def test_a_rendering_without_samples_is_an_error():
+    weights, t, delta = random_samples(0, 4, 1.0, 7.0)
+    rendering = make_rendering(weights, t, delta)
+    for incomplete in (without_samples(rendering), dataclasses.replace(rendering, weights=None)):
+        with pytest.raises(ValueError, match="distortion_loss: the rendering has no samples"):
+            jaxnerf.distortion_loss([incomplete], make_batch(1.0, 7.0))
+
+
+def test_mse_is_the_sum_over_all_renderings():
+    rng = np.random.default_rng(0)
+    colours = jnp.asarray(rng.uniform(size=(3, 5, 3)), jnp.float32)
+    weights = np.zeros((5, 1), np.float32)
+    outputs = [dataclasses.replace(make_rendering(weights, weights, weights), rgb=rgb) for rgb in colours[:2]]
+    batch = dataclasses.replace(make_batch(np.ones(5), 2.0), rgb=colours[2])
+    want = sum(((rgb - colours[2]) ** 2).mean(axis=-1) for rgb in colours[:2])
+    np.testing.assert_allclose(mse_loss(outputs, batch), want, rtol=1e-6)
+    np.testing.assert_allclose(mse_loss(outputs[1:], batch).mean(), ((colours[1] - colours[2]) ** 2).mean(), rtol=1e-6)

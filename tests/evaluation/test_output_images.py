@@ -1,0 +1,67 @@
+"""The images that evaluation writes: contact sheets, depths, straight alpha."""
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from jaxnerf import Rendering
+from jaxnerf.evaluation import output_images
+
+
+def write_sheet(folder, image):
+    row = output_images.contact_sheet_row(np.ones((2, 2, 3)), image)
+    output_images.write_contact_sheet(folder / "sheet.png", [row])
+
+
+@pytest.mark.parametrize("far", [6.0, np.inf])
+def test_a_contact_sheet_shows_near_depths_bright_and_infinity_black(tmp_path, far):
+    depth = np.array([[2.0, 4.0], [5.0, far]], np.float32)
+    image = Rendering(
+        rgb=np.zeros((2, 2, 3)),
+        opacity=np.ones((2, 2)),
+        depth=depth,
+        disparity=np.full((2, 2), np.inf),  # as where a sample lies at t = 0
+        weights=None,
+        num_dropped=np.zeros((2, 2), np.int32),
+    )
+    with np.errstate(all="raise"):
+        write_sheet(tmp_path, image)
+    sheet = iio.imread(tmp_path / "sheet.png")
+    assert sheet.shape == (2, 10, 3)
+    shades = sheet[:, 8:, 0].ravel()
+    assert shades[0] == 255 and shades[3] == 0 and shades[0] > shades[1] > shades[2]
+
+
+def test_a_contact_sheet_of_infinite_depths_is_black(tmp_path):
+    flat = np.zeros((2, 2))
+    image = Rendering(
+        rgb=np.zeros((2, 2, 3)),
+        opacity=flat,
+        depth=flat + np.inf,
+        disparity=flat,
+        weights=None,
+        num_dropped=flat,
+    )
+    write_sheet(tmp_path, image)
+    assert iio.imread(tmp_path / "sheet.png")[:, 8:].max() == 0
+
+
+def test_straight_alpha_recovers_a_known_colour_over_any_background():
+    opacity = np.array([[0.0, 0.5, 1.0, 1e-4]])
+    own = np.array([0.2, 0.4, 0.6])
+    for background in (None, (1.0, 0.5, 0.0)):
+        behind = np.zeros(3) if background is None else np.array(background)
+        rgb = opacity[..., None] * own + (1 - opacity[..., None]) * behind
+        found = output_images.straight_alpha(rgb, opacity, background)[0]
+        np.testing.assert_array_equal(found[[0, 3]], 0)
+        np.testing.assert_allclose(found[1], [51, 102, 153, 128], atol=1.01)
+        np.testing.assert_array_equal(found[2], [51, 102, 153, 255])
+
+
+def test_depth_images_show_infinity_black_and_a_range_of_98_percent():
+    depth = np.array([[1.0, 2.0, np.inf], [4.0, 0.0, 1e30]])
+    assert output_images.depth_image(depth, 1.0, 4.0).tolist() == [[255, 85, 0], [0, 255, 0]]
+    assert output_images.depth_range([np.full((9, 9), np.inf)]) == (1.0, 2.0)
+    near, far = output_images.depth_range([np.repeat(np.linspace(2, 4, 1001), 17)] * 2)
+    assert (near, far) == pytest.approx((2.02, 3.98), abs=1e-3)
+    assert output_images.depth_image(np.full((2, 2), 3.0), 3.0, 3.0).tolist() == [[0, 0], [0, 0]]

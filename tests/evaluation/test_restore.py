@@ -1,0 +1,51 @@
+"""Restored runs: where their dataset is found."""
+
+import pytest
+
+import captures
+from jaxnerf.evaluation.restore import restore_run
+from jaxnerf.training import auto_config, workdir
+from runs import smoke_config
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """The parent of a dataset "scene" of noise, which holds nothing else."""
+    folder = tmp_path / "data" / "scene"
+    folder.mkdir(parents=True)
+    captures.write_transforms(folder, captures.noise(captures.orbit(9)))
+    return folder.parent
+
+
+def start_run(folder):
+    """Makes a workdir as training does, and returns its config."""
+    config = smoke_config()
+    config.data.update({"dir": "scene", "format": "auto"})
+    resolved = auto_config.resolve(config).config
+    workdir.claim(folder, resolved)
+    return workdir.read_config(folder)
+
+
+def test_a_run_finds_a_dataset_of_a_relative_path_from_any_current_folder(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(scene)
+    assert start_run(tmp_path / "run").data.dir == str(scene / "scene")
+    monkeypatch.chdir(tmp_path)
+    assert len(restore_run(tmp_path / "run").experiment.load_split("train").offset) == 7
+
+
+def test_a_name_below_jaxnerf_scenes_stays_a_name(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAXNERF_SCENES", str(scene))
+    assert start_run(tmp_path / "run").data.dir == "scene"
+    monkeypatch.setenv("JAXNERF_SCENES", str(scene.rename(tmp_path / "moved")))
+    assert len(restore_run(tmp_path / "run").experiment.load_split("train").offset) == 7
+
+
+def test_another_folder_of_the_same_dataset_replaces_that_of_the_run(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(scene)
+    start_run(tmp_path / "run")
+    moved = scene.rename(tmp_path / "moved")
+    with pytest.raises(ValueError, match="scene"):
+        restore_run(tmp_path / "run").experiment.load_split("train")
+    run = restore_run(tmp_path / "run", data_dir=str(moved / "scene"))
+    assert len(run.experiment.load_split("train").offset) == 7

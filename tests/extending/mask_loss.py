@@ -1,0 +1,33 @@
+"""An example of losses: one that compares opacity with alpha, and a regularizer of the parameters.
+
+Give them weights in a config file, and train with --plugins=mask_loss:
+
+    config.losses.mask = 0.1
+    config.losses.weight_decay = ((0, 1e-4), (1000, 0.0))  # linear between steps 0 and 1000
+
+Neither needs a change of the training step. A loss whose weight is the number 0 adds no operation to it.
+"""
+
+import jax
+import jax.numpy as jnp
+
+import jaxnerf
+
+
+def mask_loss(outputs, batch):
+    """Computes the squared difference between each ray's opacity and its pixel's alpha [B].
+
+    Args:
+        outputs: the step's Renderings [B], with weights and samples; the one that images show is the last.
+        batch: Batch [B]. `alpha` is None unless `needs` names it below.
+    """
+    return (outputs[-1].opacity - batch.alpha) ** 2
+
+
+def weight_decay(params):
+    """Computes the sum of squares of all parameters: a scalar."""
+    return sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(params))
+
+
+jaxnerf.register_loss("mask", mask_loss, needs=("alpha",))
+jaxnerf.register_loss("weight_decay", weight_decay, on="params")

@@ -1,0 +1,115 @@
+"""The examples of this folder: each adds a part from one file outside the package, and trains with it by name."""
+
+import gabor_field  # noqa: F401
+import mask_loss  # noqa: F401
+import numpy as np
+import pytest
+import tum_reader
+import uniform_sampler  # noqa: F401
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import captures
+import jaxnerf
+from jaxnerf.training.metric_log import read_rows
+from runs import ROOT, SMOKE_FLAGS, smoke_config, start
+
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+STEPS = 6
+
+
+def train(workdir, change):
+    """Trains a few steps of configs/smoke.py with a single network and a change; returns the metrics."""
+    config = smoke_config(max_steps=STEPS, log_every=1)
+    config.sampling.num_fine = 0
+    change(config)
+    assert jaxnerf.train_and_evaluate(config, workdir)
+    rows = read_rows(workdir)
+    assert [row["step"] for row in rows] == list(range(1, STEPS + 1))
+    assert all(np.isfinite(row["loss"]) and row["nonfinite"] == 0 for row in rows)
+    return rows
+
+
+def test_a_field(tmp_path):
+    def use_gabor(config):
+        config.field = "gabor"
+        config.gabor = {"num_features": 16}
+
+    train(tmp_path / "run", use_gabor)
+    params, _ = jaxnerf.restore_run(tmp_path / "run").variables(STEPS)
+    assert params["fine"]["center"].shape == (16, 3)
+    x = np.zeros((2, 3, 3), np.float32)
+    density, rgb = jaxnerf.load_scene(tmp_path / "run")[0](x, x[:, :1])
+    assert density.shape == (2, 3) and rgb.shape == (2, 3, 3)
+
+
+def test_a_sampler(tmp_path):
+    def use_uniform(config):
+        config.sampler = "uniform"
+        config.uniform = {"num_samples": 8}
+
+    train(tmp_path / "run", use_uniform)
+    params, _ = jaxnerf.restore_run(tmp_path / "run").variables(STEPS)
+    assert set(params) == {"fine"}
+
+
+def test_losses(tmp_path):
+    def use_losses(config):
+        config.losses.mask = 0.1
+        config.losses.weight_decay = ((0, 1e-4), (4, 0.0))
+
+    rows = train(tmp_path / "run", use_losses)
+    for row, weight in zip(rows, 1e-4 * np.array([4, 3, 2, 1, 0, 0]) / 4, strict=True):
+        want = row["loss_mse"] + 0.1 * row["loss_mask"] + weight * row["loss_weight_decay"]
+        assert row["loss"] == pytest.approx(want, rel=1e-4)
+
+
+@pytest.fixture(scope="module")
+def tum_folder(tmp_path_factory):
+    """Returns a folder of the format, and the shots that it holds."""
+    folder, shots = tmp_path_factory.mktemp("tum"), captures.shoot(captures.orbit(8))
+    lines = ["# file x y z qx qy qz qw"]
+    for shot in shots:
+        Image.fromarray((shot.pixels // 257).astype(np.uint8)).save(folder / f"{shot.name}.png")
+        rotation = shot.camera.to_world[:, :3] * tum_reader.DOWN_FORWARD_TO_UP_BACKWARD
+        numbers = [*shot.camera.to_world[:, 3], *Rotation.from_matrix(rotation).as_quat()]
+        lines.append(" ".join([f"{shot.name}.png", *map(repr, map(float, numbers))]))
+    (folder / "trajectory.txt").write_text("\n".join(lines))
+    camera = shots[0].camera
+    (folder / "camera.txt").write_text(" ".join(map(repr, map(float, [*camera.focal, *camera.center]))))
+    return folder, shots
+
+
+def test_a_dataset_reader(tum_folder, tmp_path):
+    folder, shots = tum_folder
+    views = jaxnerf.load_dataset(folder, world="file", background="white")
+    kept = [shot for shot in shots if shot.name in views.names]
+    assert len(kept) == 7  # every eighth image is in the split "test"
+    for name in ("to_world", "focal", "center"):
+        want = [getattr(shot.camera, name) for shot in kept]
+        np.testing.assert_allclose(getattr(views.cameras, name), want, atol=1e-5)
+
+    def use_tum(config):
+        config.data.format, config.data.dir = "tum", str(folder)
+
+    train(tmp_path / "run", use_tum)
+
+
+def test_a_wrong_line_is_named(tum_folder, tmp_path):
+    (tmp_path / "camera.txt").write_text("9 9 5 5")
+    (tmp_path / "trajectory.txt").write_text("# file x y z qx qy qz qw\n000.png 1 2 3\n")
+    with pytest.raises(ValueError, match="trajectory.txt: line 2 has 3 numbers, expected 7"):
+        jaxnerf.load_dataset(tmp_path)
+
+
+def test_the_programs_import_plugins(compiled_once, tmp_path):
+    """Training with the sampler works by --plugins, and without it the message names the flag."""
+    flags = [*SMOKE_FLAGS, "--config.sampler=uniform", "--config.train.max_steps=2", f"--workdir={tmp_path / 'run'}"]
+    path = f"{ROOT / 'tests' / 'extending'}:{ROOT}"
+    failed = start("train", *flags, PYTHONPATH=path)
+    _, err = failed.communicate(timeout=120)
+    assert failed.returncode != 0 and "jaxnerf.register_sampler with --plugins=MODULE" in err
+    trained = start("train", "--plugins=uniform_sampler", *flags, PYTHONPATH=path)
+    _, err = trained.communicate(timeout=120)
+    assert trained.returncode == 0, err

@@ -1,0 +1,48 @@
+"""An example of a sampler: one network, evaluated at evenly spread samples between near and far.
+
+Train with it by
+
+    jaxnerf-train --plugins=uniform_sampler --config=quickstart --config.sampler=uniform --workdir=runs/uniform
+
+where uniform_sampler.py is in the current folder or on PYTHONPATH. A config file may set the number of samples:
+`config.uniform = {"num_samples": 256}`.
+"""
+
+import functools
+
+import jaxnerf
+from jaxnerf.core.types import without_samples
+from jaxnerf.models.base import Model
+
+
+def make_uniform_model(context):
+    """Makes the Model from a SamplerContext, which makes fields and holds the config's sections."""
+    field = context.make_field("fine")  # the field that the config names
+    num_samples = context.sections.get("uniform", {}).get("num_samples", 128)
+    render_rays = functools.partial(jaxnerf.render_rays, num_samples=num_samples, background=context.background)
+
+    def init(key):
+        return {"fine": field.init(key)}
+
+    def scene(params, grid):
+        return functools.partial(field.apply, params["fine"])
+
+    def render(keys, params, grid, rays, step):
+        """Renders a training batch: a tuple, whose last Rendering is the one that metrics report."""
+        return (render_rays(keys, scene(params, grid), rays),)
+
+    def view(params, grid, rays):
+        """Renders images: without a key the samples are at fixed places."""
+        return without_samples(render_rays(None, scene(params, grid), rays))
+
+    return Model(
+        init=init,
+        render=render,
+        view=view,
+        scene=scene,
+        samples_per_ray=num_samples,
+        input_layers={"fine": field.input_layers},
+    )
+
+
+jaxnerf.register_sampler("uniform", make_uniform_model)

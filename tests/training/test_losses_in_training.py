@@ -1,0 +1,182 @@
+"""The config's losses in the training step: weights, schedules, absent losses, regularizers, fields of the batch."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import jaxnerf
+from jaxnerf.fields.base import Field
+from jaxnerf.registry import FIELDS, LOSSES
+from jaxnerf.training import auto_config
+from jaxnerf.training.build import build, build_losses
+from jaxnerf.training.state import create_state
+from jaxnerf.training.step import make_train_step
+from runs import PACKED, smoke_config
+
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+RAYS, LEARNING_RATE = 64, 0.1
+
+
+def blob(params, x, viewdirs):
+    """A field of five parameters, which compiles in no time: a Gaussian cloud of one colour."""
+    squares = (x**2).sum(axis=-1)
+    density = jnp.exp(params["log_density"] - squares * jnp.exp(-2 * params["log_width"]))
+    return density, jnp.broadcast_to(jax.nn.sigmoid(params["rgb"]).reshape((1,) * (x.ndim - 1) + (3,)), x.shape)
+
+
+def init_blob(key):
+    return {"log_density": jnp.float32(0.5), "log_width": jnp.float32(0.2), "rgb": jax.random.normal(key, (3,))}
+
+
+@pytest.fixture(autouse=True)
+def registries(monkeypatch):
+    """Forgets after each test what the test has registered."""
+    for registry in (LOSSES, FIELDS):
+        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
+    jaxnerf.register_field("blob", lambda options, box: Field(init_blob, blob))
+
+
+@functools.cache
+def experiment_and_data(packed=False):
+    config = smoke_config()
+    config.update_from_flattened_dict(PACKED)
+    config.field, config.sampling.num_fine = "blob", 0
+    if not packed:
+        config.sampler = "hierarchical"
+    resolved = auto_config.resolve(config)
+    experiment = build(auto_config.resolve_for_device(resolved.config)[0])
+    valid, data = experiment.prepare(resolved.views)
+    return experiment, valid, data
+
+
+def make_step(weights, packed=False):
+    """Returns the training step, by plain gradient descent, and its arguments."""
+    experiment, valid, data = experiment_and_data(packed)
+    losses, optimizer = build_losses(weights), optax.sgd(LEARNING_RATE)
+    extras = tuple(sorted({need for loss in losses for need in loss.needs}))
+    draw = functools.partial(jaxnerf.draw_batch, extras=extras)
+    state = create_state(experiment.model, optimizer, 0, valid)
+    step = make_train_step(
+        experiment.model,
+        optimizer,
+        lambda step, positions, data: draw(data.seed, step, positions, data.views, data.active_pixels),
+        losses,
+    )
+    return step, (state, data, jnp.arange(RAYS)[None])
+
+
+def train(weights, num_steps=1, packed=False):
+    """Returns the state after some steps, and the metrics of each."""
+    step, (state, data, positions) = make_step(weights, packed)
+    step, rows = jax.jit(step), []
+    for _ in range(num_steps):
+        state, metrics = step(state, data, positions)
+        rows.append({name: float(value) for name, value in metrics.items()})
+    return state, rows
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_the_loss_is_the_weighted_sum_by_name(packed):
+    _, (row,) = train({"mse": 2.0, "distortion": 0.3}, packed=packed)
+    assert row["loss_distortion"] > 1e-4
+    assert row["loss"] == pytest.approx(2 * row["loss_mse"] + 0.3 * row["loss_distortion"], rel=1e-5)
+    assert row["loss_mse"] == pytest.approx(row["mse"], rel=1e-5)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_loss_of_weight_0_is_absent_from_the_step(packed):
+    """The step's operations are those of a config without it, one by one; a weight adds operations."""
+
+    def text(weights):
+        step, given = make_step(weights, packed)
+        return jax.jit(step).lower(*given).as_text()
+
+    alone = text({"mse": 1.0})
+    assert text({"mse": 1.0, "distortion": 0.0}) == alone
+    assert len(text({"mse": 1.0, "distortion": 0.1})) > len(alone)
+
+
+def test_a_schedule_is_linear_between_its_points():
+    _, rows = train({"mse": 1.0, "distortion": ((1, 0.0), (3, 0.5))}, num_steps=5)
+    weights = [(row["loss"] - row["loss_mse"]) / row["loss_distortion"] for row in rows]
+    np.testing.assert_allclose(weights, [0, 0, 0.25, 0.5, 0.5], atol=1e-5)
+
+
+def test_a_schedule_with_descending_steps_is_an_error():
+    with pytest.raises(ValueError, match=r"losses.mse is .* expected points \(step, weight\) with ascending steps"):
+        build_losses({"mse": ((3, 1.0), (1, 0.0))})
+
+
+def test_a_regularizer_adds_its_gradient():
+    jaxnerf.register_loss("half_squares", lambda params: optax.tree.norm(params, squared=True) / 2, on="params")
+    plain, _ = train({"mse": 1.0})
+    decayed, (row,) = train({"mse": 1.0, "half_squares": 0.25})
+    start = make_step({"mse": 1.0})[1][0].params
+    assert row["loss_half_squares"] == pytest.approx(float(optax.tree.norm(start, squared=True)) / 2, rel=1e-5)
+    assert row["loss"] == pytest.approx(row["loss_mse"] + 0.25 * row["loss_half_squares"], rel=1e-5)
+    for without, with_it, value in zip(*map(jax.tree.leaves, (plain.params, decayed.params, start)), strict=True):
+        np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.25 * value, atol=1e-6)
+
+
+@pytest.mark.parametrize("needs", [(), ("alpha",), ("image_index", "pixel")])
+def test_a_loss_gets_the_fields_of_the_batch_that_it_needs_and_no_others(needs):
+    found = {}
+
+    def record(outputs, batch):
+        found.update({name: getattr(batch, name) for name in ("alpha", "image_index", "pixel", "depth")})
+        return jnp.zeros(batch.rgb.shape[0])
+
+    jaxnerf.register_loss("record", record, needs=needs)
+    step, given = make_step({"mse": 1.0, "record": 1.0})
+    jax.eval_shape(step, *given)
+    shapes = {"alpha": (RAYS,), "image_index": (RAYS,), "pixel": (RAYS, 2)}
+    assert {name: value.shape for name, value in found.items() if value is not None} == {
+        name: shapes[name] for name in needs
+    }
+
+
+def test_the_fields_of_the_batch_are_those_of_the_drawn_pixels():
+    data = experiment_and_data()[2]
+    extras = ("alpha", "image_index", "pixel")
+    given = (data.seed, 0, jnp.arange(RAYS), data.views, data.active_pixels)
+    batch = jax.jit(lambda *given: jaxnerf.draw_batch(*given, extras=extras)[1])(*given)
+    views = jax.tree.map(np.asarray, data.views)
+    column, row = np.floor(batch.pixel).astype(int).T
+    index = views.offset[batch.image_index] + row * views.size[batch.image_index, 1] + column
+    largest = np.iinfo(views.pixels.dtype).max
+    np.testing.assert_allclose(batch.alpha, views.pixels[index, 3] / largest, atol=1e-6)
+    colours = (
+        views.pixels[index, :3] / largest * np.asarray(batch.alpha)[:, None] + 1 - np.asarray(batch.alpha)[:, None]
+    )
+    np.testing.assert_allclose(batch.rgb, colours, atol=1e-6)
+
+
+def test_an_unknown_loss_names_the_registration():
+    with pytest.raises(ValueError, match="no loss 'depht', expected one of 'mse'.*jaxnerf.register_loss.*--plugins"):
+        build_losses({"mse": 1.0, "depht": 0.1})
+
+
+def test_a_loss_that_needs_what_no_dataset_gives_is_an_error():
+    jaxnerf.register_loss("depth", lambda outputs, batch: batch.depth, needs=("depth",))
+    with pytest.raises(ValueError, match="losses.depth needs depth in the batch"):
+        build_losses({"mse": 1.0, "depth": 0.1})
+
+
+@pytest.mark.parametrize("weights", [{}, {"mse": 0.0}])
+def test_a_config_without_a_loss_of_the_renderings_is_an_error(weights):
+    jaxnerf.register_loss("decay", optax.tree.norm, on="params")
+    with pytest.raises(ValueError, match="no loss of the renderings has a weight"):
+        build_losses({**weights, "decay": 1.0})
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_the_distortion_loss_gathers_the_weights_of_a_ray(packed):
+    """Training with the loss ends with less distortion than training without it, from the same start."""
+    last = [train({"mse": 1.0, "distortion": weight}, 12, packed)[1][-1] for weight in (1e-6, 1.0)]
+    assert last[1]["loss_distortion"] < 0.9 * last[0]["loss_distortion"]
+    assert all(np.isfinite(row["grad_norm"]) for row in last)

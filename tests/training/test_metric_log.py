@@ -1,0 +1,49 @@
+"""Rows of metrics, and the lines that a run prints."""
+
+import types
+
+import numpy as np
+import pytest
+
+from jaxnerf.training import metric_log
+
+STEP = {
+    "loss": 0.5,
+    "mse": 0.01,
+    "mse_coarse": 0.1,
+    "grad_norm": 1.0,
+    "nonfinite": 0,
+    "nonfinite_in_a_row": 0,
+    "num_reinits": 0,
+}
+TRAIN = types.SimpleNamespace(batch_size=64, max_steps=100, max_seconds=0.0)
+EXPERIMENT = types.SimpleNamespace(train=TRAIN, schedule=lambda step: 1e-3 * step)
+
+
+def row(steps, step=20):
+    return metric_log.row(
+        EXPERIMENT, step, [STEP | each for each in steps], seconds=5.0, rate=lambda rays: 100.0, compile_seconds=1.0
+    )
+
+
+def test_row_averages_errors_and_keeps_the_last_counters():
+    found = row([{"loss": 1.0, "dead_fine": 3}])
+    assert (found["loss"], found["dead_fine"], found["rays"]) == (1.0, 3, 20 * 64)
+    found = row([{"mse": 0.01, "nonfinite": 1}, {"mse": 0.03, "nonfinite": 2}])
+    assert found["psnr_fine"] == pytest.approx(-10 * np.log10(0.02)) and found["nonfinite"] == 2
+    assert found["lr"] == pytest.approx(19e-3) and not any(name.startswith("loss_") for name in found)
+
+
+def test_row_holds_each_loss_where_there_are_several():
+    found = row([{"loss_mse": 0.1, "loss_distortion": 1.0}, {"loss_mse": 0.3, "loss_distortion": 3.0}])
+    assert found["loss_mse"] == pytest.approx(0.2) and found["loss_distortion"] == pytest.approx(2.0)
+
+
+def test_line_reports_what_went_wrong():
+    plain = metric_log.line(row([{}]), TRAIN, out_of_time=False)
+    assert plain == "20.00 dB  100 rays/s  0:05 elapsed, 0:51 left"
+    steps = [{"rays_dropped": 320, "nonfinite": 3, "dead_fine": 150, "dead_coarse": 0, "num_reinits": 2}]
+    line = metric_log.line(row(steps), TRAIN, out_of_time=True)
+    assert line.endswith(
+        "0:00 left  3 nonfinite steps  25% of rays dropped  fine network dead  2 networks reinitialized"
+    )
