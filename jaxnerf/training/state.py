@@ -30,13 +30,15 @@ class TrainState:
     counters: dict[str, jax.Array]
 
 
-def create_state(model: Model, optimizer: optax.GradientTransformation, seed: int, valid: Any = None) -> TrainState:
+def create_state(
+    model: Model, optimizer: optax.GradientTransformation, seed: jax.typing.ArrayLike, valid: Any = None
+) -> TrainState:
     """Creates the TrainState at step 0, the same for the same seed.
 
     Args:
         model: see `Model`.
         optimizer: an optax gradient transformation.
-        seed: of the initial parameters.
+        seed: int [], of the initial parameters.
         valid: [X, Y, Z] bool, the cells of the grid that may be occupied; None: all. Ignored without a grid.
     """
     schedule = model.grid_schedule

@@ -156,7 +156,7 @@ def test_a_single_pose_and_a_single_frame():
 
 def test_the_mean_of_a_pose_and_its_mirror_image_lies_between():
     left, right = (pose(turn([0, 1, 0], angle), [angle, 0, 5]) for angle in (-20, 20))
-    np.testing.assert_allclose(poses_module.mean_pose([left, right]), pose(np.eye(3), [0, 0, 5]), atol=1e-6)
+    np.testing.assert_allclose(poses_module.mean_pose(np.stack([left, right])), pose(np.eye(3), [0, 0, 5]), atol=1e-6)
 
 
 def test_the_default_kind_depends_on_where_cameras_look():

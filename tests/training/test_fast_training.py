@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 from types import SimpleNamespace
 
 import jax
@@ -79,7 +80,8 @@ class Tiny:
     def _train(self, data, seed, occlusion_start_step, treated):
         """Trains; treated: whether occluded rays show no background, as in _over_background."""
         experiment = self.experiment
-        model = occupancy_model(
+        # Without the check of its types: a traced occlusion_start_step lets all runs share one compiled function.
+        model = inspect.unwrap(occupancy_model)(
             self.field,
             experiment.model.grid_schedule,
             pool_samples_per_ray=16,
