@@ -146,6 +146,7 @@ def test_a_full_disk_keeps_the_old_text_file(tmp_path, monkeypatch):
     assert (tmp_path / "config.json").read_text() == "old"
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_the_old_results(trained, tmp_path, monkeypatch):
     folder = shutil.copytree(trained, tmp_path / "run")
     (folder / "eval" / "20").mkdir(parents=True)
@@ -161,6 +162,7 @@ def test_a_full_disk_keeps_the_old_results(trained, tmp_path, monkeypatch):
     assert files(folder) == before
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_complete_checkpoints(trained, tmp_path):
     """Trains on a small tmpfs until it is full, if the process may mount one."""
     disk = tmp_path / "disk"

@@ -168,6 +168,7 @@ def _required_by(name):
     return names
 
 
+@pytest.mark.slow
 def test_the_readmes_first_example_needs_jax_and_jaxtyping_only(bare, tmp_path):
     found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (tmp_path / "example.py").write_text(found.group(1))

@@ -74,6 +74,7 @@ def mypy(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_mypy_accepts_typed_code(mypy):
     assert (ROOT / "py.typed").is_file()
     status, output = mypy(SAMPLE)

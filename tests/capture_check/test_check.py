@@ -301,6 +301,7 @@ def test_the_program_reports_and_does_not_touch_the_dataset(folders, tmp_path):
     assert inside.returncode == 1 and "choose another path with --out" in inside.stderr
 
 
+@pytest.mark.slow
 def test_the_program_replaces_no_other_file_than_its_own_plot(folders, tmp_path):
     plot = tmp_path / "check-llff.png"
     other = camera_plot.plot_cameras(inspect(folders / "llff"))
@@ -344,6 +345,7 @@ def test_images_too_far_apart_to_judge_are_no_error(scenes_dir, tmp_path):
     assert not report.num_errors, report.text()
 
 
+@pytest.mark.slow
 @pytest.mark.scenes("lego", "fern", "fox", "can")
 @pytest.mark.parametrize("scene", SCENES)
 def test_defects_planted_in_real_scenes_are_found(scenes_dir, tmp_path, scene, monkeypatch):

@@ -187,6 +187,7 @@ def test_a_contracted_field_is_evaluated_inside_its_box():
     )
 
 
+@pytest.mark.slow
 def test_a_grid_can_be_made_for_a_scene_trained_without_one():
     """Matter far outside the uncontracted part is kept, and renders as it does without a grid."""
     field = Field(None, lambda params, x, viewdirs: (jnp.zeros(x.shape[:-1]), x))

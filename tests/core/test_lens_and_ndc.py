@@ -30,6 +30,7 @@ def solve(u, v, coefficients):
     return x, y
 
 
+@pytest.mark.slow
 @pytest.mark.scenes("fox")
 def test_the_whole_image_of_the_fox_is_undistorted(scenes_dir):
     """To 1e-4 px in float64, and to 1e-6 of the plane at distance 1 in float32."""
@@ -58,6 +59,7 @@ def test_the_whole_image_of_the_fox_is_undistorted(scenes_dir):
     assert np.abs(np.asarray(points) - expected).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_ndc_and_plain_rays_render_the_same_scene():
     """Coloured fog with a denser ball in world space; its density in NDC is divided by the stretch."""
     focal, height, width = 20.0, 12, 16

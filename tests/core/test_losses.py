@@ -167,7 +167,7 @@ RAYS, SEGMENTS = 24, 40
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("rule", ["segments", "points"])
+@pytest.mark.parametrize("rule", ["segments", pytest.param("points", marks=pytest.mark.slow)])
 def test_dense_and_packed_renderings_have_the_same_loss(masked, rule):
     """Also in value and gradient where the occupancy grid skips samples, or the buffer has unused slots."""
     rays = rays_past_origin(0, RAYS)
@@ -218,6 +218,7 @@ def largest_intermediate(function, *given):
     return max(sizes(jax.make_jaxpr(function)(*given).jaxpr))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["dense", "packed"])
 def test_time_and_memory_are_linear_in_the_number_of_samples(layout):
     def function(weights, t, delta):

@@ -116,6 +116,7 @@ def test_ssim_is_symmetric_at_most_one_and_one_for_itself():
     np.testing.assert_allclose(fast_ssim(a, a), 1, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite():
     black = jnp.zeros((11, 12, 3))
     slopes = jax.jit(jax.grad(lambda a, b: ssim(a, b) + psnr(a, b)))

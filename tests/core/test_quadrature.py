@@ -156,6 +156,7 @@ def test_the_floor_of_float32(name):
     assert np.abs(got.depth / expected.depth - 1).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ORDERS)
 @pytest.mark.parametrize("name", SHARP)
 def test_an_edge_costs_at_most_its_cell(name, rule):
@@ -181,6 +182,7 @@ def test_an_edge_between_two_cells_costs_nothing(rule, order):
     assert (errors(halves, rays, rule, (48,), compiled(halves.exact)(rays))[:, :2] < 1e-14).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule, order", [("segments", 1.4), ("gauss", 3.5)])
 def test_stratified_samples_converge_and_err_to_both_sides(rule, order):
     medium, draws = SMOOTH["atmosphere"], 256
@@ -198,6 +200,7 @@ def test_stratified_samples_converge_and_err_to_both_sides(rule, order):
     assert np.log2(root_mean_square[0] / root_mean_square[1]) / 2 >= order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule, order", ORDERS.items())
 def test_hierarchical_converges_to_the_closed_form(rule, order):
     medium = SMOOTH["atmosphere"]
@@ -373,6 +376,7 @@ def exact_slopes(name):
     return compiled(jax.jacrev(lambda place: seen(name, place, lambda medium, rays: medium.exact(rays))))(PLACE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, rule, accuracy",
     [("atmosphere", "gauss", 2e-5), ("blob", "gauss", 2e-5), ("blob", "segments", 2e-3)],

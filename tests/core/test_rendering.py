@@ -135,6 +135,7 @@ def test_a_masked_sample_changes_nothing(rays):
     assert_same(run(1.0, 4), run(1.0, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", draw)
 def test_a_ray_with_its_own_key_does_not_depend_on_its_batch(rays, keys, name):
     whole = draw[name](keys, rays)

@@ -13,6 +13,7 @@ from hard_cases.rays import RAYS
 from jaxnerf import Rays, Samples, render_samples
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ALL, ids=str)
 def test_a_hard_case_is_within_its_bars(case):
     failed = [str(check) for check in case.run() if not check.passed]

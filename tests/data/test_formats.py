@@ -95,6 +95,7 @@ FEATURES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FEATURES)
 def test_transforms(tmp_path, name):
     cameras, images, tolerance = FEATURES[name]

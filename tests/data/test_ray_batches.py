@@ -53,6 +53,7 @@ def pixel_ids(rays, pixel_offset=0.5):
     return view, OFFSET[view] + row * width + column
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batching", ray_batches.BATCHINGS)
 @pytest.mark.parametrize("pixel_offset", [0.0, 0.5])
 def test_colours_are_those_of_the_rays_pixels(batching, pixel_offset):

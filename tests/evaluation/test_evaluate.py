@@ -136,6 +136,7 @@ def test_predictions_have_the_metrics_of_the_evaluation_that_wrote_them(scored, 
         external.score_folder(tmp_path / "20", overwrite=True)
 
 
+@pytest.mark.slow
 def test_watching_waits_scores_each_checkpoint_and_ends(trained, tmp_path):
     """Watches an empty folder, then one checkpoint, then the last two."""
     folder = tmp_path / "run"

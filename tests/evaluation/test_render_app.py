@@ -100,6 +100,7 @@ def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch)
     assert len(calls) == 1, "all frames exist"
 
 
+@pytest.mark.slow
 def test_frames_of_other_settings_are_not_mixed(rendered, run, path_file, tmp_path):
     kept = (rendered[0] / "color" / "0000.png").read_bytes()
     with pytest.raises(ValueError, match="mine-20: holds frames rendered with width 25, not 50; give --over"):
@@ -147,6 +148,7 @@ def test_an_mp4_of_odd_sides_is_cropped_by_one_row_and_column(tmp_path):
     assert not list(tmp_path.glob("*.tmp*"))
 
 
+@pytest.mark.slow
 def test_the_program_selects_a_path_and_reports_it(run):
     """As `make demo` calls it, with fewer frames and a GIF."""
     flags = (

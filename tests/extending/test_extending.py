@@ -103,6 +103,7 @@ def test_a_wrong_line_is_named(tum_folder, tmp_path):
         jaxnerf.load_dataset(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_programs_import_plugins(compiled_once, tmp_path):
     """Training with the sampler works by --plugins, and without it the message names the flag."""
     flags = [*SMOKE_FLAGS, "--config.sampler=uniform", "--config.train.max_steps=2", f"--workdir={tmp_path / 'run'}"]

@@ -237,6 +237,7 @@ def slopes(name):
     return compiled(backward), compiled(jax.vmap(numbers, in_axes=(0, None)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MEDIA)
 def test_gradients_are_finite_and_those_of_central_differences(name):
     """Finite everywhere; equal where a derivative exists: not along a tangent, or on an edge."""

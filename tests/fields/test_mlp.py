@@ -173,6 +173,7 @@ FIELDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, rays, samples, directions",
     [("mlp", 16, 64, 1), ("mlp", 16, 64, 64), ("mlp", 512, 1, 1), ("mlp", 2, 512, 1), ("hash_grid", 2, 512, 1)],

@@ -16,8 +16,15 @@ pytestmark = pytest.mark.usefixtures("unoptimized")
 STEPS = 40
 
 
-@pytest.mark.parametrize("sampler", ["hierarchical", "occupancy"])
-@pytest.mark.parametrize("field", ["mlp", "hash_grid"])
+@pytest.mark.parametrize(
+    ("field", "sampler"),
+    [
+        ("mlp", "hierarchical"),
+        ("hash_grid", "occupancy"),
+        pytest.param("mlp", "occupancy", marks=pytest.mark.slow),
+        pytest.param("hash_grid", "hierarchical", marks=pytest.mark.slow),
+    ],
+)
 def test_the_loss_falls(field, sampler):
     config = smoke_config(max_steps=STEPS, lr_steps=STEPS, lr_init=1e-2, lr_final=1e-2)
     config.update_from_flattened_dict({**PACKED, "field": field, "sampler": sampler, "losses.distortion": 1e-3})

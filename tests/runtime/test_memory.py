@@ -149,6 +149,7 @@ def test_chunk_that_does_not_fit_is_halved_and_the_image_is_the_same(monkeypatch
     assert "image with 40 rays per chunk (--chunk): needs 0.0 MB" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masked", [False, True])
 def test_metrics_that_do_not_fit_are_computed_in_strips(monkeypatch, capsys, masked):
     rng = np.random.default_rng(0)

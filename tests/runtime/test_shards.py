@@ -142,6 +142,7 @@ def test_views_of_other_settings_are_not_mixed(fresh, run, whole):
         score_run(other, run[0], shard=(1, 2))
 
 
+@pytest.mark.slow
 def test_shards_of_a_path_make_its_video_when_all_frames_exist(run, rendered, tmp_path, capsys):
     folder = shutil.copytree(run[0], tmp_path / "run", ignore=shutil.ignore_patterns("eval", "whole"))
     options = {"path": "turntable", "num_frames": 3, "size": (8, 8), "kind": "gif", "settings": {"chunk": 64}}

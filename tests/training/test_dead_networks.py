@@ -230,6 +230,7 @@ def test_without_reinitialization_a_dead_run_stays_dead_and_reports_it(reinitial
     assert not any("reinitialized" in text for _, text in shown)
 
 
+@pytest.mark.slow
 def test_healthy_run_is_the_same_with_and_without_reinitialization(tmp_path):
     folders = [tmp_path / "never", tmp_path / "always"]
     for folder, allowed in zip(folders, (0, 10), strict=True):

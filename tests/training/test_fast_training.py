@@ -272,6 +272,7 @@ def toy_runs(unoptimized, toy):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["sharded", "pmap"])
 def test_devices_give_the_same_update_grid_and_counts(toy_runs, toy, mode):
     (one, one_rows), (many, many_rows) = toy_runs["jit"], toy_runs[mode]
@@ -317,6 +318,7 @@ def test_resumed_run_is_bit_exact_with_its_grid(toy, unoptimized, tmp_path):
     ).any()
 
 
+@pytest.mark.slow
 def test_workdir_restores_the_scene_and_its_images(unoptimized, tmp_path, capsys):
     """The config has "auto" sizes, and only the workdir is known afterwards."""
     config = tiny_config()

@@ -71,6 +71,7 @@ def test_kill_loses_nothing(compiled_once, tmp_path):
     kill_many.main(kills=1, seed=3, out=tmp_path)
 
 
+@pytest.mark.slow
 def test_truncated_checkpoint_is_renamed_and_training_continues_from_the_one_before(folder, trained, capsys):
     cut(numbers(folder, 20))
     assert train_and_evaluate(smoke_config(), folder)

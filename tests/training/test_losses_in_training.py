@@ -174,6 +174,7 @@ def test_a_config_without_a_loss_of_the_renderings_is_an_error(weights):
         build_losses({**weights, "decay": 1.0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True])
 def test_the_distortion_loss_gathers_the_weights_of_a_ray(packed):
     """Training with the loss ends with less distortion than training without it, from the same start."""

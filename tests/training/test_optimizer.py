@@ -164,6 +164,7 @@ def test_averaged_params_returns_the_average_or_the_last_parameters():
     assert averaged_params(last_state(params_of_steps, plain)) is params_of_steps[-1]
 
 
+@pytest.mark.slow
 def test_run_renders_its_average(unoptimized, tmp_path):
     config = smoke_config(averaging_power=10.0, max_steps=8, parallel="jit")
     config.sampling.num_fine = 0  # one network compiles faster
