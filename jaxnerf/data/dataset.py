@@ -55,12 +55,11 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
     return load_split(data, split)
 
 
-def resolve(data: ConfigDict, *, missing_ok: bool = False) -> tuple[ConfigDict, list[str]]:
+def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
     """Resolves a data section against its folder: every "auto" becomes a value.
 
     Args:
         data: see configs/default.py; it is not changed.
-        missing_ok: whether everything stays "auto" if the folder does not exist.
 
     Returns:
         A copy of the section, and one line per inferred value with its reason.
@@ -80,12 +79,7 @@ def resolve(data: ConfigDict, *, missing_ok: bool = False) -> tuple[ConfigDict, 
         for name, value in _SYNTHETIC.items():
             infer(name, value)
         return data, lines
-    try:
-        folder = dataset_folder(data.dir)
-    except ValueError:
-        if missing_ok:
-            return data, lines
-        raise
+    folder = dataset_folder(data.dir)
     if pathlib.Path(data.dir).is_dir():  # a name below $JAXNERF_SCENES stays a name
         data.dir = str(folder.absolute())
     if is_auto(data.format):

@@ -41,3 +41,12 @@ def test_the_loss_falls(field, sampler):
         assert metrics["loss_distortion"] >= 0
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
     assert not state.counters["nonfinite"]
+
+
+@pytest.mark.parametrize(("field", "value"), [("sampling.stratified", False), ("sampling.density_noise", 1.0)])
+def test_the_occupancy_sampler_names_what_it_cannot_do(field, value):
+    config = smoke_config()
+    config.update_from_flattened_dict({**PACKED, "occupancy.lower": (-1.0,) * 3, "occupancy.upper": (1.0,) * 3})
+    config.update_from_flattened_dict({field: value, "occupancy.contracted": False, "eval.max_samples": 1024})
+    with pytest.raises(ValueError, match=f"^{field} is {value}.*sampler 'occupancy'.*'hierarchical'"):
+        build(config)

@@ -19,7 +19,13 @@ from runs import smoke_config
 RAYS, STEPS = 64, 3
 OPTIMIZER = optax.adam(1e-2)
 
-each_network = pytest.mark.parametrize("kind", [("float32", "segments"), ("bfloat16", "gauss")], ids="-".join)
+each_network = pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(("float32", "segments"), id="float32-segments"),
+        pytest.param(("bfloat16", "gauss"), id="bfloat16-gauss", marks=pytest.mark.slow),
+    ],
+)
 
 
 @functools.cache
