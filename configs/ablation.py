@@ -1,7 +1,7 @@
 """Lego at 100 x 100: the paper's model scaled down in proportion, for experiments/ablation.
 
 The two networks have equal sizes: half the paper's depth and a fifth of its width. Pixels are eight times as
-large, so the model has an eighth of the samples, which keeps their distance in pixels, and three octaves less.
+large, so the model has an eighth of the samples (their distance in pixels stays the same) and three octaves less.
 Softplus and the learning rate come from lego_small.py. Adam updates all parameters, as in the paper.
 """
 

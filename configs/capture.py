@@ -9,7 +9,7 @@ def get_config():
     data = config.data
     data.format, data.dir, data.factor, data.width = "auto", "", "auto", 200
     data.background, data.ndc = "auto", "auto"
-    # Without alpha no cell is known to be empty at first, and thin density in real images is mostly fog.
+    # Without alpha no cell is known to be empty at first. In real scenes thin density is mostly spurious fog.
     config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 27.0
     train = config.train
     # lego_fast.py has other values here, chosen on lego alone.

@@ -51,7 +51,7 @@ def get_config():
                 # The colour behind alpha and behind the scene: "white", "black", "none" or "auto".
                 "background": "white",
                 "hold_out": 0,  # every n-th training view belongs to the split "held_out" instead; 0: none
-                "num_views": 0,  # number of training views, evenly spread over all of them; 0: all
+                "num_views": 0,  # number of training views to use, spread evenly over all of them; 0: all
                 "pixel_offset": 0.5,  # px; rays pass through pixel centres (0.5) or pixel corners (0)
                 # The world's coordinates: "file" (as in the dataset), "forward" (recentred for NDC), "around"
                 # (centred on and scaled to the region that the cameras see) or "auto".
@@ -80,7 +80,7 @@ def get_config():
                 "view_depth": 2,  # hidden layers of the colour network
                 "view_width": 128,  # outputs of such a layer
                 "use_viewdirs": True,  # False: colour does not depend on the direction
-                "feature_scale": 4.0,  # features / table entries; it scales the learning rate of the table
+                "feature_scale": 4.0,  # features are table entries times this; it scales the table's learning rate
             },
             "occupancy": {  # of the sampler "occupancy"; the box also bounds the hash grid
                 "use_alpha": True,  # cells outside the visual hull of the alpha channels are empty from the start

@@ -138,7 +138,7 @@ def register_loss(
     Args:
         name: of the loss.
         function: with on="renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
-            of a step, with weights and samples, and the last is the one that images show; `batch` is a Batch.
+            of a step, with weights and samples; the last one is the final rendering. `batch` is a Batch.
             With on="params" (params) -> scalar.
         on: "renderings" or "params".
         needs: the optional fields of Batch that the function reads, of "image_index", "pixel" and "alpha".

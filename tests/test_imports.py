@@ -130,7 +130,7 @@ def test_every_package_has_an_init():
         ("fields/mlp.py", "def f():\n    from jaxnerf.data.readers import blender", False),
         ("fields/mlp.py", "from jaxnerf.models import base", False),
         ("models/occupancy.py", "from jaxnerf.fields import base", True),
-        ("models/occupancy.py", "from jaxnerf.runtime import chunking", False),
+        ("models/occupancy.py", "from jaxnerf.runtime import memory", False),
         ("runtime/memory.py", "from jaxnerf.core.types import Rays", True),
         ("runtime/memory.py", "from jaxnerf.data import dataset", False),
         ("data/dataset.py", "from jaxnerf.runtime import user_cache", True),

@@ -60,7 +60,7 @@ def undistort(
     flat = target.reshape(-1, 2)
     points, converged = jax.vmap(lambda goal: _invert(distort, distortion, goal))(flat)
     if camera.lens == "fisheye":
-        # The unknown is the angle from the axis, along (x, y); the plane at distance 1 takes its tangent.
+        # The length of a solution is the angle from the axis; on the plane at distance 1 it is the angle's tangent.
         angle = norm(points)
         inside = converged & (angle < 0.5 * math.pi)
         angle = jnp.where(inside, angle, 0)
@@ -179,14 +179,14 @@ def ndc_rays(rays: Rays, camera: Camera, *, near_plane: Num[ArrayLike, ""] = 1.0
     height = rays.origins[..., 2:]
 
     def lateral_and_slope(depth):
-        # Both from the given origin: moving it to the near plane first would subtract large terms.
+        # Computed from the given origin: moving it to the near plane first would subtract large terms.
         slant = divide(rays.directions[..., :2], jnp.broadcast_to(depth[..., None], (*depth.shape, 2)))
         lateral = scale * (rays.origins[..., :2] - (near_plane + height) * slant)
         return jnp.concatenate([lateral, scale * (height * slant - rays.origins[..., :2])], axis=-1)
 
     forward = rays.directions[..., 2] < 0
     depth = jnp.where(forward, rays.directions[..., 2], -1)
-    slope = jax.lax.stop_gradient(lateral_and_slope(depth) / depth[..., None])  # in depth, the steepest
+    slope = jax.lax.stop_gradient(lateral_and_slope(depth) / depth[..., None])  # with respect to depth, the steepest
     forward &= jnp.isfinite(slope).all(axis=-1)
     projected = lateral_and_slope(jnp.where(forward, rays.directions[..., 2], -1))
     plane = jnp.ones_like(projected[..., :1])

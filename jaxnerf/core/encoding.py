@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.safe_math import at_least_float32
 
 # 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half the digits of a float32
-# is exact. Six pieces hold |x| 2^k up to 1e6 * 2^15 to 2^-27 of a turn.
+# is exact. Six pieces resolve |x| 2^k, up to 1e6 * 2^15, to 2^-27 of a turn.
 _TURNS = 0x28BE60DB9391054A7F
 _PIECES = [((_TURNS >> (60 - 12 * j)) & 0xFFF) * 2.0 ** (-12 * (j + 1)) for j in range(6)]
 _SIN = [(-1) ** n / math.factorial(2 * n + 1) for n in range(5)]
@@ -59,7 +59,7 @@ def positional_encoding(
 def encode_planes(x: Float[Array, "D N"], *, num_freqs: int, include_input: bool = True) -> Float[Array, "features N"]:
     """Computes the same encoding for x [D, N] as [D (1 + 2F), N], one row per feature.
 
-    This is the layout of the computation: the inner loops are long, and a matrix product takes it without a
+    The computation uses this layout because its inner loops are long and a matrix product reads it without a
     transposition.
     """
     parts = [x] if include_input else []
@@ -91,8 +91,8 @@ def _scales(num_freqs, dtype):
 def _next_octave(turns, _):
     """Returns the angle (in turns) doubled, and the sine and cosine [2, N] of the given angle.
 
-    Plain arithmetic is vectorised, library calls for sine and cosine are not. The octaves are a loop because the
-    compiler would otherwise reduce x again for each one.
+    Plain arithmetic is vectorised; library calls for sine and cosine are not. The octaves are computed in a loop
+    because the compiler would otherwise reduce x again for each one.
     """
     high, low = turns
     quarters = 4 * high

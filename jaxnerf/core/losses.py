@@ -1,7 +1,7 @@
 """Training losses: each maps the renderings of a step and its batch to one value per ray.
 
-`outputs` are all renderings of a step, the one that counts last. The training step sums the losses with the
-weights of the config's `losses`, over the rays whose samples were all evaluated.
+`outputs` are all renderings of a step; the last one is the final rendering. The training step sums the losses with
+the weights of the config's `losses`, over the rays whose samples were all evaluated.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ def distortion_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, 
     s_i is the position of sample i and d_i its length, both as fractions of the ray between near and far, or
     of its range of disparity where far is infinite. The sum over pairs takes linear time: it is
     2 sum_i w_i D_i, where D_i = D_(i-1) + (w_1 + ... + w_(i-1)) (s_i - s_(i-1)) adds only terms >= 0, so
-    that nothing cancels.
+    there is no cancellation.
 
     Args:
         outputs: Renderings [B] with samples; those of a packed rendering may be PackedSamples.
@@ -93,14 +93,14 @@ def _sum_since(starts: jax.Array, values: jax.Array) -> jax.Array:
 
 def _fractions(t, delta, used, near, far, rule):
     """Returns the positions and lengths of samples as fractions of their rays; broadcasts all arrays."""
-    if rule == "points":  # a point stands for the gap that follows it, and the last gap may leave the ray
+    if rule == "points":  # a point represents the gap behind it; the last gap may end beyond far
         delta = jnp.minimum(delta, jnp.maximum(far - t, 0))
     infinite = jnp.isinf(far)
     span = jnp.where(infinite | (far <= near), 1, far - near)
     inside = used & (far > near)
     t, delta = jnp.where(inside, t, near), jnp.where(inside, delta, 0)
-    # In disparity. A segment is [t - delta / 2, t + delta / 2]; one of infinite length has its sample at
-    # twice its lower edge, see sampling.samples_from_edges.
+    # For infinite rays, in disparity. A segment is [t - delta / 2, t + delta / 2]; one of infinite length has its
+    # sample at twice its lower edge, see sampling.samples_from_edges.
     start = jnp.where(infinite & (near > 0), near, 1)
     position, unbounded = jnp.where(infinite, jnp.maximum(t, start), start), jnp.isinf(delta)
     finite = jnp.where(unbounded, 0, delta)

@@ -28,8 +28,8 @@ def turntable(
         num_frames: N, one turn.
         center: [3] world.
         radius: distance to the center, world units.
-        elevation: radians above the plane through the center across up.
-        up: [3] axis of the circle; unit length, not along x + 0.1 y.
+        elevation: radians above the plane through the center that is perpendicular to up.
+        up: [3] axis of the circle; unit length, not parallel to x + 0.1 y.
 
     Returns:
         Poses [N, 3, 4].
@@ -78,8 +78,8 @@ def spiral(
 ) -> Float[Array, "N 3 4"]:
     """Places cameras on a spiral around one pose, looking at a point in front of it.
 
-    The path of the LLFF code (Mildenhall et al. 2019): the camera circles across the viewing direction and
-    oscillates along it. The path is closed if rotations * zrate is an integer.
+    This is the path of the LLFF code (Mildenhall et al. 2019): the camera circles in the plane perpendicular to the
+    viewing direction and oscillates along that direction. The path is closed if rotations * zrate is an integer.
 
     Args:
         num_frames: N.
@@ -115,7 +115,7 @@ def interpolate(num_frames: int, *, poses: Num[ArrayLike, "K 3 4"], closed: bool
     Args:
         num_frames: N. The path passes through a pose where `path_times` is an integer.
         poses: [K, 3, 4], K >= 1.
-        closed: whether the path returns from the last pose to the first; it then ends one frame before it.
+        closed: whether the path returns from the last pose to the first. It then ends one frame before the first pose.
 
     Returns:
         Poses [N, 3, 4].

@@ -54,7 +54,10 @@ def render_samples(scene: SceneFn, rays: Rays, samples: Samples, *, background: 
     rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # channel by channel, as in composite
     length = segment_lengths(samples.delta, rays.directions)
     dtype = jnp.result_type(length.dtype, density.dtype, rgb.dtype)
-    density, rgb = density.astype(dtype), rgb.astype(dtype)  # before the sums, or each rounds its gradient to bfloat16
+    density, rgb = (
+        density.astype(dtype),
+        rgb.astype(dtype),
+    )  # before the sums: in bfloat16 each would round its gradient
     weights = volume_rendering.weights_from_density(density, length, rule=samples.rule)
     transmittance = volume_rendering.transmittance(density, length)
     return Rendering(
@@ -166,8 +169,8 @@ def render_image(render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int)
     """Renders a whole image in chunks of equal size, so that `render` is compiled once.
 
     Args:
-        render: Rays [chunk] -> Rendering [chunk], jitted. Make the parameters its arguments and bind them
-            with functools.partial: new parameters then need no compilation.
+        render: Rays [chunk] -> Rendering [chunk], jitted. Pass the parameters as arguments and bind
+            them with functools.partial, so that new parameters need no compilation.
         rays: Rays [H, W], or any other leading axes.
         chunk: rays per call. The last chunk is padded with copies of the last ray.
 
@@ -187,7 +190,7 @@ def render_image(render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int)
     return _join_chunks(parts, shape=shape)
 
 
-# Both jitted: op by op they would take longer than rendering a small image.
+# Both are jitted: run op by op, they would take longer than rendering a small image.
 @functools.partial(jax.jit, static_argnames="chunk")
 def _take_chunk(rays, start, *, chunk):
     """Returns Rays [chunk]: rays [...] from start on, padded with copies of the last."""

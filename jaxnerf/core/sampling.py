@@ -41,7 +41,7 @@ def uniform_edges(
         inner = near / ((1 - s) + s * (near / far))
     else:
         inner = near + (far - near) * s
-    inner = clamp(inner, near, far)  # a rounding past the end would put samples outside
+    inner = clamp(inner, near, far)  # rounding past the end would put samples outside
     return jnp.concatenate([near, inner, far], axis=-1)
 
 
@@ -90,11 +90,11 @@ def samples_from_edges(key: Keys | None, edges: Num[ArrayLike, "*batch edges"], 
         key: None for fixed samples, one key, or one key per ray [...].
         edges: [..., S + 1] ascending, in t. The last may be inf: the segment is then sampled in 1 / t, and its
             midpoint is at twice its lower edge (which must be > 0).
-        rule: "segments": density and colour are taken as constant over the segment. A key draws t
+        rule: "segments": density and colour are assumed constant over the segment. A key draws t
             uniformly in it (Eq. 2); the midpoint makes the quadrature second order.
-            "gauss": two samples in each segment, at (1 -+ 1 / sqrt(3)) / 2 of it, each for half of its
-            length: fourth order where the scene is smooth. A key draws the edges instead, each
-            between the adjacent midpoints; the first and last edge stay fixed.
+            "gauss": two samples in each segment, at (1 -+ 1 / sqrt(3)) / 2 of it, each representing
+            half of its length; fourth order where the scene is smooth. A key draws the edges instead of the
+            samples, each between the adjacent midpoints; the first and last edge stay fixed.
 
     Returns:
         Samples [..., S], or [..., 2 S] for "gauss". A drawn t lies in [edge, next edge), exactly; a
@@ -114,11 +114,11 @@ def samples_from_edges(key: Keys | None, edges: Num[ArrayLike, "*batch edges"], 
 
 
 def samples_from_points(t: Num[ArrayLike, "*batch samples"], *, last_delta: Num[ArrayLike, ""] = 1e10) -> Samples:
-    """Makes samples that stand for the gap to the next one: the released codes' quadrature.
+    """Makes samples that each represent the gap to the next one, the released codes' quadrature.
 
-    delta_i = t_{i+1} - t_i, as below Eq. 3. The last sample stands for last_delta, which makes every ray opaque
-    that ends in matter. The rule "segments" is more accurate: this one is of first order, and
-    with the default it does not converge where the far end lies inside matter.
+    delta_i = t_{i+1} - t_i, as below Eq. 3. The last sample represents last_delta, which makes every ray
+    that ends in matter opaque. The rule "segments" is more accurate: this rule is of first order, and
+    with the default last_delta it does not converge where the far end lies inside matter.
 
     Args:
         t: [..., S] ascending, S >= 1.
@@ -201,8 +201,8 @@ def importance_points(
         edges: [..., S + 1] ascending, in t.
         weights: [..., S] >= 0. If all are 0, the points are spread evenly over the segments.
         num_points: N >= 1.
-        padding: added to every weight. The released codes use 1e-5 against division by zero, which
-            moves samples into empty space on nearly empty rays; it is offered here for parity.
+        padding: added to every weight. The released codes add 1e-5 to avoid a division by zero, which
+            moves samples into empty space on nearly empty rays. The argument exists for parity with them.
 
     Returns:
         [..., N] ascending points in t, within the edges. No gradient flows through them.
@@ -339,7 +339,7 @@ def _draw_between(key, lower, upper):
     if key is None:
         return clamp(_interpolate(lower, upper, 0.5), lower, upper)
     draw = _interpolate(lower, upper, uniform(key, lower.shape).astype(lower.dtype))
-    # The edges are rounded: a draw this close to one may lie in the neighbouring exact bin.
+    # The edges are rounded, so a draw this close to an edge may lie in the neighbouring bin of exact edges.
     finite_upper = jnp.where(jnp.isinf(upper), lower, upper)
     rounding = 2 * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(finite_upper))
     margin = jnp.minimum(rounding, 0.25 * (finite_upper - lower))
@@ -355,7 +355,7 @@ def _interpolate(lower, upper, fraction):
 
 
 def _width(lower, upper):
-    return jnp.where(upper == lower, 0, upper - lower)  # also from inf to inf
+    return jnp.where(upper == lower, 0, upper - lower)  # inf - inf would be NaN
 
 
 def _count_below(sums, target):

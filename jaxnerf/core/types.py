@@ -72,7 +72,7 @@ class Samples:
 
     Attributes:
         t: [..., S] in t, near to far.
-        delta: [..., S] length in t that each sample stands for; samples of length 0 are ignored.
+        delta: [..., S] length in t that each sample represents; samples of length 0 are ignored.
         rule: the quadrature: "segments", "gauss" (two samples per segment) or "points".
     """
 
@@ -109,7 +109,7 @@ class Rendering:
     Attributes:
         rgb: [..., 3] in [0, 1] if the scene's colours and the background are.
         opacity: [...] in [0, 1], 1 - transmittance of the whole ray.
-        depth: [...] in t, the expected depth; the transmitted fraction counts at far.
+        depth: [...] in t, the expected depth; the transmitted fraction contributes far.
         disparity: [...] in 1 / t, the expected inverse depth; 0 for an empty ray.
         weights: [..., S] compositing weight of each sample; None where dropped.
         num_dropped: [...] number of samples that did not fit into the packed buffer; 0 unless packed.
@@ -170,7 +170,7 @@ class Views:
         mask: [P] False for pixels that are excluded from batches and scores; None where all count.
         names: V file names without folder and extension.
         background: the colour that alpha is composited over; None for images without alpha.
-        box: [2, 3] lower and upper corner in world units; the dataset declares the outside empty.
+        box: [2, 3] lower and upper corner in world units; the dataset states that space outside is empty.
         to_file: [4, 4] maps this world to that of the dataset's files; None where they are the same.
     """
 

@@ -35,7 +35,7 @@ def weights_from_density(
 
     Returns:
         [..., S] weights in [0, 1], at least float32. An infinite density over a positive length is
-        opaque. The gradient is that of Eq. 3 to rounding, also in dense media, where its terms cancel.
+        opaque. The gradient equals that of Eq. 3 up to rounding, even in dense media, where the terms of Eq. 3 cancel.
 
     Raises:
         ValueError: if the shapes differ (they are not broadcast), the rule is unknown, or S is odd for "gauss".
@@ -62,7 +62,7 @@ def transmittance(
         length: [..., S] in world units; length 0 removes the segment.
 
     Returns:
-        [...] in [0, 1]; accurate also where 1 - sum of weights would cancel.
+        [...] in [0, 1]; accurate even where 1 - sum of weights would cancel.
 
     Raises:
         ValueError: if the shapes differ.
@@ -73,7 +73,7 @@ def transmittance(
 def opacity(
     density: Num[ArrayLike, "*batch samples"], length: Num[ArrayLike, "*batch samples"]
 ) -> Float[Array, "*batch"]:
-    """Computes the opacity 1 - T in [0, 1], the sum of the weights, accurate also in thin media.
+    """Computes the opacity 1 - T in [0, 1], the sum of the weights, accurate even in thin media.
 
     Takes the arguments of `transmittance` and raises its errors.
     """
@@ -101,7 +101,7 @@ def composite(
 
     Args:
         weights: [..., S].
-        values: [..., S, C], colours or other values, finite also where the weight is 0.
+        values: [..., S, C], colours or other values; they must be finite even where the weight is 0.
         background: None for black (nothing is added), [C], or [..., C], one per ray.
         transmittance: [...] weight of the background; None for 1 - sum of weights.
 
@@ -310,8 +310,8 @@ def _follow_transmittance(weights, depth):
 def running_sum(x: Float[ArrayLike, "*batch samples"], part_size: int = 16) -> Float[Array, "*batch samples"]:
     """Computes the cumulative sum along the last axis by matrix products with triangles of ones.
 
-    On a CPU this is faster than jnp.cumsum and as accurate. The values must be finite: one that is not makes its
-    whole part NaN.
+    On a CPU this is faster than jnp.cumsum and as accurate. The values must be finite: a single
+    one that is not makes its whole part NaN.
     """
     size = x.shape[-1]
     if size <= part_size:

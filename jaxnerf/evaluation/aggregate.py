@@ -1,4 +1,4 @@
-"""Finished views of an evaluation, and the results.json that is made of them; see `evaluate`."""
+"""Finished views of an evaluation, and the results.json that is made from them; see `evaluate`."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def finish(
     count: int,
     first: bool,
 ) -> None:
-    """Finishes a view whose images are written: writes the rest, its row of metrics last.
+    """Finishes a view whose images are written: writes its other files, the row of metrics last.
 
     Args:
         folder: of the evaluation.
@@ -42,7 +42,7 @@ def finish(
         truth: [H, W, 3].
         image: Rendering [H, W].
         count: of all views.
-        first: whether its process rendered it before any other, so that its time includes the compilation.
+        first: whether it is the first view that its process rendered, so that its time includes compilation.
     """
     if index in _on_contact_sheet(count):
         output_images.write_image(_contact_sheet_file(folder, index), output_images.contact_sheet_row(truth, image))
@@ -92,8 +92,8 @@ def merge(
     with atomic_files.partial_file(partial / "results.json") as file:
         file.write_text(json.dumps(results, indent=2) + "\n")
     old = target.with_name(target.name + ".old")
-    if target.exists():  # a kill between the two moves loses neither result
-        shutil.rmtree(old, ignore_errors=True)  # of such a kill
+    if target.exists():  # a process killed between the two moves loses neither result
+        shutil.rmtree(old, ignore_errors=True)  # left by such a process
         os.replace(target, old)
     os.replace(partial, target)
     for name in _WORKING:
@@ -112,7 +112,7 @@ def _results(run, workdir, views, variables, finished, origin):
     return {
         **means(rows),
         "views": len(rows),
-        # Of one process, averaged over all that rendered.
+        # The rate of one process, averaged over all processes that rendered.
         "rays_per_second": sum(view["rays"] for view in finished) / len(rows) / seconds,
         "seconds_per_frame": seconds,
         "step": origin["step"],

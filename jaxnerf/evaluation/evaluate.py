@@ -1,7 +1,7 @@
 """Scores a trained run on held-out views, and writes the images that the metrics are computed from.
 
 A view is finished when its images and its row of metrics are in eval/<step>.tmp/. Finished views are kept and
-skipped, whichever process made them: one that was stopped, or another shard. The process that finds all views
+skipped, whichever process made them: an interrupted one, or another shard. The process that finds all views
 finished writes results.json and moves the folder to eval/<step>/.
 """
 
@@ -105,7 +105,7 @@ def score_run(
     views: Views | None = None,
     shard: tuple[int, int] = shards.WHOLE,
 ) -> dict[str, Any] | None:
-    """Scores a checkpoint as `evaluate` does, for a restored run and views that may have been read already."""
+    """Scores a checkpoint as `evaluate` does, for a restored run, with views if they have been read already."""
     step = newest_step(run, workdir, step)
     target = claim_target(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
     split = split or run.experiment.eval.split
@@ -141,7 +141,7 @@ def claim_target(
 ) -> pathlib.Path:
     """Returns the folder of a result; raises ValueError if it exists and is not to be replaced.
 
-    For a shard it may exist: then all shards are finished, and this one has nothing to do.
+    For a shard it may exist: all shards are then finished, and this one has nothing to do.
     """
     step, own = newest_step(run, workdir, step), run.experiment.eval.split
     name = str(step) if split in (None, own) else f"{step}-{split}"

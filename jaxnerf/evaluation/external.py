@@ -29,9 +29,9 @@ def score_folder(
     """Scores a folder of predictions and writes results.json into it.
 
     Args:
-        folder: holds the images, or color/ with them. They pair with the views by name where all names agree,
-            otherwise in the order of their names.
-        config: its dataset is the reference; when None the folder's own gt-color/ is.
+        folder: holds the images, or color/ with them. They are matched with the views by name if all names
+            agree, otherwise in the order of their names.
+        config: its dataset is the reference; None: the folder's own gt-color/.
         split: of that dataset; the config's eval.split when None.
         overwrite: whether an earlier results.json is replaced.
 

@@ -32,7 +32,7 @@ def view_files(folder: pathlib.Path, name: str) -> list[pathlib.Path]:
 
 
 def write_image(path: pathlib.Path, pixels: ArrayLike) -> None:
-    """Writes an image into an existing folder, whole or not at all; the suffix of its path names the format."""
+    """Writes an image into an existing folder, completely or not at all; the path's suffix selects the format."""
     with atomic_files.partial_file(path) as partial:
         iio.imwrite(partial, pixels, extension=path.suffix)
 
@@ -47,7 +47,7 @@ def straight_alpha(rgb: ArrayLike, opacity: ArrayLike, background: Sequence[floa
         opacity: [H, W] in [0, 1].
         background: [3], or None for black.
     """
-    alpha = to_8_bits(opacity)[..., None] / 255  # rounded first, so that the colour makes up for it
+    alpha = to_8_bits(opacity)[..., None] / 255  # rounded first, so that the colour compensates for the rounding
     own = np.asarray(rgb) - (1 - alpha) * np.asarray((0.0, 0.0, 0.0) if background is None else background)
     straight = np.where(alpha > 0, own / np.maximum(alpha, 1 / 255), 0)
     return to_8_bits(np.concatenate([straight, alpha], axis=-1))

@@ -1,6 +1,6 @@
-"""The protocol of an evaluation: all that makes its metrics comparable, and with which published tables.
+"""The protocol of an evaluation: what its metrics depend on, and the published tables comparable with them.
 
-It follows from the data alone: how the views were read, how many there are, and how large they are.
+It depends on the data alone: how the views were read, how many there are, and how large they are.
 """
 
 import re
@@ -51,7 +51,7 @@ _WHY = {
 
 
 def of_views(conventions: Mapping[str, Any], views: Views, *, split: str) -> dict[str, Any]:
-    """Returns what results.json says of its metrics: {"conventions": ..., "comparable_with": ...}.
+    """Returns what results.json states about its metrics: {"conventions": ..., "comparable_with": ...}.
 
     Args:
         conventions: how the views were read, see `build.conventions`.
@@ -67,7 +67,7 @@ def of_views(conventions: Mapping[str, Any], views: Views, *, split: str) -> dic
 
 
 def of_images(conventions: Mapping[str, Any], size: ArrayLike | Sequence[Sequence[int]]) -> dict[str, Any]:
-    """Returns the same for images of size [V, 2] (height, width), of which less may be known."""
+    """Returns the same as `of_views` for images of size [V, 2] (height, width), with any known conventions."""
     pairs = np.unique(np.asarray(size), axis=0).tolist()
     found = {**conventions, "views": len(size), "size": pairs[0] if len(pairs) == 1 else pairs, **METRICS}
     return {"conventions": found, "comparable_with": comparable_with(found)}
@@ -76,7 +76,7 @@ def of_images(conventions: Mapping[str, Any], size: ArrayLike | Sequence[Sequenc
 def comparable_with(conventions: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Returns for each published table whether metrics of these conventions are comparable with it, and why.
 
-    Where they are, "why" says what differs nevertheless, and by how many dB where that is known.
+    If they are, "why" states the remaining differences, in dB where that is known.
     """
     rows = []
     for table, expected, metric, pixel_offset in _TABLES:

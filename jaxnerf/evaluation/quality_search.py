@@ -1,4 +1,4 @@
-"""Searches the cheapest settings that render a trained model within an error."""
+"""Searches for the cheapest settings that render a trained model within an error."""
 
 import os
 import sys
@@ -45,7 +45,7 @@ def choose(
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Returns the settings of `cheapest_settings` for `evaluate`, and prints all candidates."""
-    # The search takes a while, so errors that would end the evaluation after it come first.
+    # The search takes a while, so errors that would end the later evaluation are raised first.
     claim_target(restore_run(workdir, config, data_dir=data_dir), workdir, split=split, step=step, overwrite=overwrite)
     options = {"config": config, "data_dir": data_dir, "split": split, "step": step, "settings": settings}
     best, candidates = cheapest_settings(workdir, error_budget, **options)
@@ -114,7 +114,7 @@ def cheapest_settings(
 
     has_grid = experiment.model.grid_schedule is not None
     for bake in (False,) if has_grid else (False, True):
-        # Without a grid no ray ends early.
+        # Without a grid there is no early termination.
         _search(is_within, sample_multipliers, early_stop_eps if has_grid or bake else early_stop_eps[:1], bake)
     return _fastest(candidates, error_budget, workdir), candidates
 

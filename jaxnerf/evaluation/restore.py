@@ -13,6 +13,7 @@ from ml_collections import ConfigDict
 from jaxnerf.core.types import Rays, Rendering, SceneFn
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
+from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
@@ -70,8 +71,9 @@ def restore_run(
         config = copy.deepcopy(config)
     if data_dir:
         config.data.dir = data_dir
-        if config.data.format == "synthetic":  # it has no folder, so the folder's own format counts
+        if config.data.format == "synthetic":  # it has no folder, so the format of data_dir is detected
             config.data.format = "auto"
+    if data_dir or is_auto(config.data.ndc):
         config.data, _ = dataset.resolve(config.data)
     config.eval.update(settings or {})
     config, _ = auto_config.resolve_for_device(config)
@@ -80,12 +82,14 @@ def restore_run(
     trained, model, bake = experiment.model, experiment.model, None
     if config.eval.bake_occupancy and model.grid_schedule is None:
         views = experiment.load_split("train")
+        if auto_config.auto_fields(config):  # of a run that was converted without its dataset
+            config = auto_config.resolve_for_device(auto_config.resolve(config, views).config)[0]
         options = {"view_rays": experiment.view_rays, "pixel_offset": experiment.pixel_offset}
         model, bake = build.bake_model(config, model, functools.partial(random_rays, views, **options))
 
     @functools.cache
     def template():
-        # Only shapes count, and zeros need no compiling.
+        # Only the shapes matter, and zeros need no compilation.
         shapes = jax.eval_shape(lambda: create_state(trained, experiment.optimizer, experiment.seed))
         return jax.tree.map(lambda leaf: jax.device_put(np.zeros(leaf.shape, leaf.dtype)), shapes)
 

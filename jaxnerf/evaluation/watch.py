@@ -1,4 +1,4 @@
-"""Scores the checkpoints of a training while it runs."""
+"""Scores the checkpoints of a training run while it runs."""
 
 import os
 import pathlib
@@ -22,10 +22,10 @@ def watch(
     split: str | None = None,
     settings: dict[str, Any] | None = None,
 ) -> None:
-    """Scores every new checkpoint of a training until its last one, and reports when it waits.
+    """Scores every new checkpoint of a training run until the last one, and prints a line when it waits.
 
     Args:
-        workdir: that training writes; it may not exist yet.
+        workdir: the folder that training writes; it may not exist yet.
         poll_seconds: time between searches for a new checkpoint.
         config, data_dir, split, settings: see `evaluate`.
 

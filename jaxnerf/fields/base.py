@@ -16,8 +16,8 @@ from jaxnerf.registry import FIELDS
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
 
 _CACHE_ROW = 512  # float32 numbers, 2 KiB
-_FEW_RAYS = 16  # fewer would grow much by one more ray
-_MORE_SAMPLES = 32  # padding of each of few rays
+_FEW_RAYS = 16  # with fewer rays, padding by a whole ray costs too much
+_MORE_SAMPLES = 32  # padding of each ray, if there are few
 
 
 class Field(NamedTuple):
@@ -27,8 +27,8 @@ class Field(NamedTuple):
         init: key -> params, any pytree of float arrays.
         apply: (params, x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S] in 1 / world unit, rgb
             [..., S, 3] in [0, 1]). A field may take `key` and `density_noise` as keywords, see `mlp_field`.
-        input_layers: keys of params, the layers that the position enters; empty: all of them. A field is dead
-            if no gradient reaches these, and training then reinitializes it.
+        input_layers: keys of params: the layers that receive the position; empty: all layers. A field is dead
+            if no gradient reaches these layers; training then reinitializes it.
     """
 
     init: Callable[[jax.Array], Any]
@@ -51,7 +51,7 @@ def make_field(name: str, options: Mapping[str, Any], box: Box | None) -> Field:
 
 
 def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
-    """Makes the Field of all of space from one that covers a box.
+    """Makes a Field that covers all of space from one that covers a box.
 
     The inner half of the box from lower [3] to upper [3] is evaluated as it is; the outer half holds the rest
     of space, see `contraction.contract`.
@@ -75,8 +75,8 @@ def apply_network(
 ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
     """Evaluates a network at positions in a layout that suits a CPU's cache.
 
-    Rows of features that are a multiple of 2 KiB long collide in the cache, which slows each product down.
-    Such a batch is padded by one ray, or, if there are few rays, by a few samples for each.
+    Rows of features whose length is a multiple of 2 KiB collide in the cache, which slows down each product.
+    Such a batch is padded by one ray or, if there are few rays, by a few samples per ray.
 
     Args:
         network: its call takes x and viewdirs, and returns [..., S] and [..., S, 3].

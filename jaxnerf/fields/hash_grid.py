@@ -70,14 +70,14 @@ class HashGrid(linen.Module):
     Attributes:
         lower, upper: [3] world units, the box.
         resolutions: vertices along the longest side, for each level.
-        features_per_level: of each vertex.
-        table_size: rows of a level; vertices beyond share rows by a hash.
+        features_per_level: features of each vertex.
+        table_size: maximal rows per level; a level with more vertices shares rows by a hash.
         width: features of the density network's hidden layer.
-        geometry_features: passed from the density network to the colour network.
+        geometry_features: outputs of the density network that the colour network reads.
         view_depth: hidden layers of the colour network.
         view_width: features of such a layer.
         use_viewdirs: False: colour does not depend on the direction.
-        feature_scale: features over table entries. A step changes few entries, so each should change more.
+        feature_scale: features over table entries. A step reaches few entries, so each should change more.
     """
 
     lower: Sequence[float]
@@ -102,14 +102,14 @@ class HashGrid(linen.Module):
         place = [(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)]
         sizes = [vertices(side, resolution) for resolution in self.resolutions]
         first = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes])
-        # One table for all levels: one gradient to clear and one array to update.
+        # All levels share a table, so there is only one gradient to clear and one array to update.
         table = self.param("table", _near_zero, (int(first[-1]), self.features_per_level))
         levels = [
             interpolate(table, place, size, rows=range(*ends))
             for size, ends in zip(sizes, np.stack([first[:-1], first[1:]], -1).tolist(), strict=True)
         ]
         features = self.feature_scale * jnp.concatenate(levels, axis=-1)
-        # Rows come from the table, but small layers are faster with features first.
+        # The table yields one row per sample, but small layers are faster with features first.
         kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
         bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
         hidden = jax.nn.relu(jnp.einsum("df,nd->fn", kernel, features) + bias[:, None])
@@ -143,8 +143,8 @@ def interpolate(
         table: [T, F] features of vertices.
         place: three arrays [N], x, y and z as fractions of the box; clamped to it.
         size: vertices along x, y and z.
-        rows: range of the table's rows that belong to this level: one per vertex, z fastest, or fewer, which
-            vertices then share by the hash of arXiv:2201.05989 (Eq. 4).
+        rows: range of the table's rows that belong to this level: one row per vertex, z fastest, or fewer rows,
+            which vertices share by the hash of arXiv:2201.05989 (Eq. 4).
 
     Returns:
         [N, F]. The derivative with respect to place is that of the linear pieces.

@@ -20,7 +20,7 @@ def mlp_field(**options: Any) -> Field:
     """Makes a Field of the paper's network.
 
     Args:
-        **options: attributes of MLP; the defaults are the paper's, 595,844 parameters.
+        **options: attributes of MLP; the defaults are those of the paper, with 595,844 parameters.
 
     Returns:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3], key=None, density_noise=0.0)
@@ -59,12 +59,12 @@ def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
 
 
 class MLP(linen.Module):
-    """Fully connected layers, the encoded position joined again after one of them, and a small head for colour.
+    """Fully connected layers with one skip connection from the encoded position, and a small head for colour.
 
     Attributes:
         depth: layers before the density.
         width: features of such a layer.
-        skip_layer: the encoded position joins again after the layer of this index.
+        skip_layer: the encoded position is concatenated again after the layer of this index.
         view_width: features of the layer that takes the direction.
         num_freqs: octaves of the position's encoding.
         num_view_freqs: octaves of the direction's encoding.
@@ -93,8 +93,8 @@ class MLP(linen.Module):
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations.
 
-        Arrays inside are [features, N]: the encoding and all three products of a layer's forward and backward
-        pass then run along memory, from which a small network on a CPU gains most.
+        Arrays inside are [features, N], so that the encoding and all three products of a layer's forward and
+        backward pass read memory contiguously. A small network on a CPU gains most from this.
         """
         shape = x.shape[:-1]
         encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode).astype(self.compute_dtype)
@@ -145,9 +145,9 @@ class Dense(Affine):
 
         Args:
             *inputs: [D_i, ...].
-            before: kernel [D_0, E] and bias [E] of an affine layer that is applied to the first input. With no
-                activation between them the two layers are one, whose kernel costs less than a layer of all
-                samples.
+            before: kernel [D_0, E] and bias [E] of an affine layer that is applied to the first input. As there is
+                no activation between them, the two layers are multiplied into one, which costs less than
+                applying both to all samples.
         """
         sizes = [value.shape[0] for value in inputs]
         if before:

@@ -15,12 +15,12 @@ class Model(NamedTuple):
     """Pure functions of parameters, an occupancy grid (None if the model has none) and rays.
 
     Attributes:
-        init: key -> params, a dict with an entry for each network. "fine" is the one that images show.
+        init: key -> params, a dict with an entry for each network. "fine" is the network of the final rendering.
         render: (keys [B], params, grid, Rays [B], step) -> Renderings [B] for training, that of "fine" last.
             They carry weights and samples, for losses.
         view: (params, grid, Rays [...]) -> Rendering [...] without weights and samples, for images.
-        scene: (params, grid) -> the scene that images show.
-        samples_per_ray: about how often a ray evaluates the largest network in training.
+        scene: (params, grid) -> the scene of the final rendering.
+        samples_per_ray: approximate number of evaluations of the largest network per ray in training.
         grid_schedule: how the occupancy grid is created and updated; None without one.
         input_layers: by network, see `Field`.
         cull: (grid, Rays [...]) -> bool [...], which rays may hit an occupied cell, and the Rendering [...]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, update_grid
 from jaxnerf.fields.base import Field
 
-_CHUNK = 8160  # cells evaluated at once: their activations fit a processor's cache, and do not collide there
+_CHUNK = 8160  # cells evaluated at once; their activations fit into a processor's cache without collisions
 
 Corner = tuple[float, float, float]
 
@@ -45,7 +45,7 @@ class GridSchedule(NamedTuple):
         return tuple((high - low) / count for low, high, count in sides)
 
     def box(self) -> dict[str, Any]:
-        """Returns the arguments by which `visible_grid` describes the same grid."""
+        """Returns the arguments with which `visible_grid` creates a grid of the same box."""
         names = ("lower", "upper", "shape", "step_size", "threshold", "contracted")
         return {name: getattr(self, name) for name in names}
 
@@ -67,13 +67,13 @@ def make_grid_schedule(
 
     Args:
         lower, upper: [3] world units.
-        resolution: cells along the longest side; the number along the others makes them cubes.
-        step_size: world units between samples, where space is plain.
-        field: Field, whose density under params["fine"] updates the grid. None where there are no updates.
+        resolution: cells along the longest side; the numbers along the other sides make them cubes.
+        step_size: world units between samples, where space is not contracted.
+        field: Field whose density with params["fine"] updates the grid. None if the grid is never updated.
         threshold: opacity of one step below which a cell is empty.
         update_every: training steps between updates.
-        cells_per_update: if there are more cells, updates at first come more often, until each cell has been
-            updated initial_passes times; during that time neighbours of dense cells are occupied, too.
+        cells_per_update: cells in one update. If there are more cells, updates are more frequent at first, until each
+            cell has been updated initial_passes times; until then neighbours of dense cells are occupied, too.
         contracted: whether the box holds all of space, see OccupancyGrid.
         initial_passes: see cells_per_update.
 
@@ -90,7 +90,7 @@ def make_grid_schedule(
     empty_below = density / _stretches(shape) if contracted else density
 
     def create(valid):
-        # A cell starts at ten times the threshold: half a dozen updates empty it.
+        # A cell starts at ten times the threshold, so about half a dozen updates empty it.
         return create_grid(
             jnp.asarray(lower, jnp.float32),
             jnp.asarray(upper, jnp.float32),
@@ -110,7 +110,7 @@ def make_grid_schedule(
         num_updates = jnp.where(young, step // often, step // update_every)
 
         def updated():
-            # Whole chunks, as a remainder of another size would be compiled too.
+            # Whole chunks, as a remainder of another size would have to be compiled, too.
             place = jnp.arange(count + (-count % _CHUNK if count > _CHUNK else 0))
             index = num_updates % rounds * count + place
             beyond = (place >= count) | (index >= cells.size)
@@ -131,7 +131,7 @@ def make_grid_schedule(
 
 
 def _stretches(shape):
-    """Returns [X, Y, Z], the length of steps across contracted cells over that of steps in plain space."""
+    """Returns [X, Y, Z], the length of steps in each contracted cell over that of steps in plain space."""
     along = [np.abs(4 * (np.arange(size) + 0.5) / size - 2) for size in shape]
     largest = np.max(np.meshgrid(*along, indexing="ij"), axis=0)
     return np.float32(1 / np.minimum(2 - largest, 1) ** 2)

@@ -45,9 +45,9 @@ def hierarchical_model(
     Args:
         fields: Field by name.
         density_noise: 1 / world unit, standard deviation of the noise on the density in training.
-        stratified: whether training draws its samples at random; otherwise they are at fixed places, as in
+        stratified: whether training draws its samples at random; otherwise they have fixed positions, as in
             images.
-        sample_multiplier: samples along a ray of images over those of training.
+        sample_multiplier: samples per ray of images over those of training.
         num_coarse, num_fine, rule, in_disparity, importance_padding, background: see `render_hierarchical`.
 
     Raises:
@@ -55,7 +55,11 @@ def hierarchical_model(
     """
     options = {"rule": rule, "in_disparity": in_disparity, "background": background}
     for name, field in fields.items():
-        if density_noise and "density_noise" not in inspect.signature(field.apply).parameters:
+        parameters = inspect.signature(field.apply).parameters
+        takes_noise = "density_noise" in parameters or any(
+            parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()
+        )
+        if density_noise and not takes_noise:
             raise ValueError(
                 f"sampling.density_noise is {density_noise}, and the {name} field takes no noise; set it to 0"
             )

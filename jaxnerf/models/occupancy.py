@@ -20,7 +20,7 @@ from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 
 _LONG_STEP = 3.0  # times the step size
-_SMALLEST_EPS = 1e-30  # in place of an early_stop_eps of 0: transmittance below which nothing is left
+_SMALLEST_EPS = 1e-30  # replaces an early_stop_eps of 0: below this transmittance no light is left
 
 
 def from_context(context: SamplerContext) -> Model:
@@ -83,9 +83,9 @@ def occupancy_model(
         schedule: of the occupancy grid.
         pool_samples_per_ray: size of training's sample buffer over the number of rays. Rays whose samples do
             not fit are dropped and counted.
-        long_steps_until: the training step before which samples are three times as long: early fog looks the
-            same, and more rays fit.
-        max_optical_depth: optical depth, as the grid estimates it, beyond which training evaluates nothing;
+        long_steps_until: the training step before which steps are three times as long. Early in training the
+            field is fog, which looks the same with long steps, and more rays fit into the buffer.
+        max_optical_depth: training skips samples behind this optical depth, as estimated by the grid;
             0: no limit.
         occlusion_start_step: the training step from which max_optical_depth applies.
         early_stop_eps: of images: transmittance below which a ray ends.
@@ -130,12 +130,12 @@ def bake_occupancy(
     max_samples: int,
     background: Background | None,
 ) -> tuple[Model, Callable[[Any], OccupancyGrid]]:
-    """Makes a model that renders images through a grid of its visible matter, of one trained without a grid.
+    """Converts a model trained without a grid into one that renders images with a grid of its visible density.
 
     Args:
         model: Model without a grid.
         schedule: GridSchedule of the box that images show.
-        visibility_rays: count -> Rays [count] of what the training views see.
+        visibility_rays: count -> Rays [count] of the training views.
         early_stop_eps, sample_multiplier, max_samples, background: see `occupancy_model`.
 
     Returns:
@@ -172,7 +172,7 @@ def render_with_grid(
     Args:
         scene, grid, rays, background: see `render_packed`.
         step_size, cell: see `march_rays`.
-        early_stop_eps: transmittance below which a ray ends; 0: where nothing is left of it.
+        early_stop_eps: transmittance below which a ray ends; 0: it ends when no light is left.
         max_samples: samples evaluated at once; the rest follow in further rounds.
     """
     samples = march_rays(None, grid, rays, step_size=step_size, cell=cell)
@@ -213,9 +213,9 @@ def _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, backg
 def _over_background(rendering, occluded, background):
     """Composites a Rendering on black over a background.
 
-    Where occluded samples were skipped, the remaining light is taken to look like the rest of the ray. If the
-    background showed there, the field would grow opaque too early, and with it the grid's estimate, which
-    would skip more samples: a feedback loop.
+    Where occluded samples were skipped, the remaining light is assumed to look like the rest of the ray. If it
+    had the background's colour, the field would become opaque too early. The grid's estimate would follow and
+    skip more samples: a feedback loop.
     """
     transmittance = (1 - rendering.opacity)[..., None]
     behind = jnp.zeros(3) if background is None else jnp.asarray(background)

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, whatever interrupts the writer."""
+"""Files that appear completely or not at all, even if the writer is interrupted."""
 
 import contextlib
 import os
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def partial_file(path: str | os.PathLike, suffix: str = ".tmp") -> Iterator[pathlib.Path]:
-    """Yields a path to write to; afterwards moves what is there to `path`.
+    """Yields a path to write to, and then moves the written file to `path`.
 
     The partial file lies beside `path` and has a random name, so that any number of processes may write the
     same file: the last one wins. A process that is killed leaves its partial file behind; see `sweep`.
@@ -19,7 +19,7 @@ def partial_file(path: str | os.PathLike, suffix: str = ".tmp") -> Iterator[path
         suffix: of the partial file, for writers that infer a format from it; `sweep` expects ".tmp" in it.
 
     Raises:
-        OSError: with the path, also where the system names none, as on a full disk.
+        OSError: with the path, even if the system names none, as on a full disk.
     """
     path = pathlib.Path(path)
     partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}{suffix}")

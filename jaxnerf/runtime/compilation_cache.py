@@ -31,7 +31,7 @@ def use_compilation_cache() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        # JAX's own limit of 1 s excludes dozens of small programs, which take as long together.
+        # JAX's default of 1 s excludes dozens of small programs, which together take as long.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
@@ -84,7 +84,7 @@ def _is_complete_zstd(content):
 
 
 def _machine():
-    """Returns a name for this processor's instruction set; a program for a larger one would crash."""
+    """Returns a name for this processor's instruction set; programs compiled for a larger one would crash."""
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         features = {line for line in lines if line.startswith(("model name", "flags", "Features"))}

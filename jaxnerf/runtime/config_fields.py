@@ -12,10 +12,10 @@ AUTO = "auto"  # the only marker of a value that is inferred
 def auto(kind: type, value: Any = AUTO) -> FieldReference:
     """Declares a field that holds a value of one type, or "auto".
 
-    Flags and Python code both set it, and set it back to "auto". `auto_config.resolve` replaces "auto".
+    Flags and Python code can set the field, also back to "auto". `auto_config.resolve` replaces "auto".
 
     Args:
-        kind: bool, int, float or tuple. A field of text is declared as plain text.
+        kind: bool, int, float or tuple. A field that holds text is declared as a plain string.
         value: the default.
     """
     return FieldReference(value, field_type=_AUTO_TYPES[kind])

@@ -1,7 +1,7 @@
 """Devices: the same training step under jit, sharded jit and pmap.
 
-With several processes (see `processes.cluster`) the devices are those of all of them. Each process reads all
-training views and copies them to each of its devices, as any ray may be drawn from any pixel: which one depends
+With several processes (see `processes.cluster`) the devices are those of all processes. Each process reads all
+training views and copies them to each of its devices, because any ray may come from any pixel. The pixel depends
 only on the ray's position in the whole batch, so batches are the same on any number of devices. A process draws,
 renders and differentiates the rays of its own devices; gradients are summed over all devices. Only the first
 process writes config.json and metrics.jsonl and prints; all take part in a checkpoint.
@@ -38,7 +38,7 @@ def compile_step(
     Args:
         train_step: see `make_train_step`.
         state: TrainState, or a function that makes one, which runs while the step compiles. With several
-            processes the first one's state counts.
+            processes the state of the first one is used.
         data: what the step draws from; copied to every device. The same in all processes.
         batch_size: rays per step, over all devices of all processes.
         microbatch_size: rays whose gradient is computed at once; None, or more than a device has: all of them.
@@ -110,7 +110,7 @@ def _unoptimized(function, device):
 
 
 def _with_global_state(run, everywhere):
-    """Returns the pmapped step with a state on the devices of all processes; pmap returns one on its own only."""
+    """Returns the pmapped step with its state on the devices of all processes; pmap returns it on the local ones."""
 
     def to_global(leaf):
         parts = [shard.data for shard in leaf.addressable_shards]
@@ -145,7 +145,7 @@ def devices_of(mode: str) -> list[jax.Device]:
 
 
 def default_microbatch(rays: int, samples_per_ray: float, platform: str) -> int:
-    """Returns the microbatch size with which a device is fastest.
+    """Returns the microbatch size that is fastest on a device.
 
     Args:
         rays: of a step on this device.

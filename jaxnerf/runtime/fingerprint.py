@@ -12,7 +12,7 @@ def fingerprint(*values: Any, sample: int | None = None) -> str:
     """Returns 16 hexadecimal digits of SHA-256 over text, bytes and trees of arrays.
 
     Boundaries, types and shapes count: ("ab", "c") differs from ("a", "bc"). Of a pytree only the leaves
-    count, without None and without static fields.
+    count; None and static fields do not.
 
     Args:
         *values: str, bytes, arrays, numbers, or pytrees of them.
@@ -28,7 +28,7 @@ def fingerprint(*values: Any, sample: int | None = None) -> str:
             rows = leaf if sample is None or np.ndim(leaf) == 0 else leaf[:: max(len(leaf) // sample, 1)]
             rows = np.asarray(rows)
             digest.update(f"{rows.dtype.name}{np.shape(leaf)}:".encode())
-            content = np.ascontiguousarray(rows).reshape(-1).view(np.uint8)  # types that hashlib does not know, too
+            content = np.ascontiguousarray(rows).reshape(-1).view(np.uint8)  # also for types that hashlib does not know
         digest.update(content)
     return digest.hexdigest()[:16]
 

@@ -12,7 +12,7 @@ from jaxnerf.core.occupancy.ray_culling import render_selected
 from jaxnerf.core.rendering import render_image
 from jaxnerf.core.types import Rays, Rendering
 
-_HOST_FRACTION = 0.8  # of the host's free memory that a program may take: beyond, the system kills processes
+_HOST_FRACTION = 0.8  # of the host's free memory that a program may take; if it takes more, the system kills processes
 _MARGIN = 0.9  # part of what a program needs does not scale with the size of its parts
 
 
@@ -112,7 +112,7 @@ def fit_step(
 
     Whether a size fits is checked when the step is compiled, and again by the first step, which is repeated
     with a smaller size if memory runs out. Later steps need no more than the first. The batch stays the same,
-    so except for rounding a step does, too.
+    so the step's result does, too, except for rounding.
 
     Args:
         compile_step: (state, data, microbatch size) -> run, state, data; see `devices.compile_step`.
@@ -129,7 +129,7 @@ def fit_step(
         nonlocal run, size, tried
         if tried:
             return run(state, data)
-        kept = jax.device_get(state)  # a step consumes its state, also one that fails
+        kept = jax.device_get(state)  # a step consumes its state, even if it fails
 
         def attempt(new_size):
             nonlocal run

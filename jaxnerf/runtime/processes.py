@@ -25,7 +25,7 @@ _BY_HAND = "--coordinator=HOST:PORT --num_processes=N --process_id=I"
 def launched(environ: Mapping[str, str] = os.environ) -> tuple[int, int] | None:
     """Returns (index, count) of this process among those that srun or mpirun started; None without them.
 
-    SLURM_NTASKS does not tell: a batch script and an interactive shell have it too, and are one process.
+    SLURM_NTASKS is no evidence: it is also set in batch scripts and interactive shells, which are one process.
     """
     for index, count in _LAUNCHERS:
         if index in environ and count in environ:
@@ -42,10 +42,10 @@ def cluster(
     process_id: int | None = None,
     seconds: float = 300.0,
 ) -> Iterator[None]:
-    """Joins the processes of one training run, if there are several; precedes any other use of JAX.
+    """Joins the processes of one training run, if there are several; call it before any other use of JAX.
 
     An error inside ends this process at once with one line, as a regular exit would wait for the other
-    processes, which may be waiting for this one. The line also tells when another process is the cause.
+    processes, which may be waiting for this one. The line also reports if another process is the cause.
 
     Args:
         multihost: True joins the cluster that JAX detects (SLURM, Open MPI 4, Kubernetes, Cloud TPU); None
@@ -90,7 +90,7 @@ def _check(coordinator, num_processes, process_id):
 
 
 def _join(coordinator, num_processes, process_id, seconds):
-    # This service would catch SIGTERM.
+    # The preemption service would catch SIGTERM.
     jax.config.update("jax_enable_preemption_service", False)
     failed = []
 
@@ -177,7 +177,7 @@ def broadcast(tree: Any) -> Any:
 def check_same(what: str, *values: Any) -> None:
     """Raises a ValueError in all processes unless all have the same text and trees of arrays.
 
-    Of large arrays it compares a sample of the rows, as they may lie on a disk.
+    For large arrays it compares a sample of the rows, as they may be on a disk.
     """
     if jax.process_count() == 1:
         return

@@ -1,7 +1,7 @@
-"""Splits frames among processes that need not know of each other, and claims the folder that they share.
+"""Splits frames among independent processes, and claims the folder that they share.
 
 Any number of processes may run at the same time, on any machine that sees the folder. A frame is finished when
-its files exist; each file appears whole or not at all, see `atomic_files`.
+its files exist; each file appears completely or not at all, see `atomic_files`.
 """
 
 import json
@@ -44,7 +44,7 @@ def parse(text: str | None) -> tuple[int, int]:
 
 
 def own(indices: Iterable[int], shard: tuple[int, int]) -> list[int]:
-    """Returns the indices of a shard's frames: every count-th, so that all shards take about as long."""
+    """Returns the indices of a shard's frames: every count-th, so that all shards take about the same time."""
     return [index for index in indices if index % shard[1] == shard[0]]
 
 
@@ -83,7 +83,7 @@ def claim_folder(
 
 
 def check_origin(folder: pathlib.Path, origin: Mapping[str, Any], *, file: str, remedy: str) -> None:
-    """Checks that the frames in a folder have an origin; see `claim_folder`.
+    """Checks that the frames in a folder have the given origin; see `claim_folder`.
 
     Raises:
         ValueError: if they have another, or the file cannot be read; names what differs.

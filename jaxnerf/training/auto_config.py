@@ -1,4 +1,4 @@
-"""Resolves a config against a dataset: every "auto" becomes a value, with a line that gives its reason."""
+"""Resolves a config against a dataset: every "auto" becomes a value, and a line gives the reason."""
 
 import copy
 import math
@@ -19,10 +19,10 @@ from jaxnerf.training.build import build_model
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum
-_MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features sooner than finer steps
-_TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps grow with the root of an image's side in pixels
-_MAX_STATED_BOX = 3.0  # times all of contracted space: a stated box that is larger is no better than contraction
-_MAX_RESOLUTION = 128  # cells: updating more costs more than the samples that they save
+_MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
+_TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
+_MAX_STATED_BOX = 3.0  # times the box of contraction; a stated box that is larger is no better than contraction
+_MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
 
 # These depend on the device, so they are inferred at every start and stay "auto" in the workdir.
 DEVICE_FIELDS = ("train.microbatch_size", "eval.chunk", "eval.max_samples")
@@ -74,7 +74,7 @@ def resolve_for_device(config: ConfigDict) -> tuple[ConfigDict, list[str]]:
     config, lines = copy.deepcopy(config), []
     infer = _inferring(lines)
     cpu = jax.default_backend() == "cpu"
-    # On a CPU activations stay in the cache; an accelerator needs many samples to be busy.
+    # On a CPU activations should stay in the cache; an accelerator needs many samples to be busy.
     samples, rays = (2**10, 2**12) if cpu else (2**17, 2**16)
     infer(config.eval, "max_samples", samples, f"images        {samples} samples per batch, for this device")
     infer(config.eval, "chunk", rays, f"images        {rays} rays per chunk, for this device")
@@ -118,7 +118,7 @@ def auto_fields(config: ConfigDict) -> list[str]:
 
 
 def _inferring(lines: list[str]) -> Callable[..., None]:
-    """Returns the function that fills a field in if it is "auto", and adds a line if the run uses it."""
+    """Returns the function that fills in a field if it is "auto", and adds a line if the run uses the field."""
 
     def infer(section: Any, name: str, value: Any, line: str, *, used: bool = True) -> None:
         if is_auto(section[name]):
@@ -134,9 +134,9 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     lines: list[str] = []
     infer = _inferring(lines)
     section, train, ndc = config.occupancy, config.train, config.data.ndc
-    paper = config.sampler == "hierarchical" and config.field == "mlp"  # it knows no box
+    paper = config.sampler == "hierarchical" and config.field == "mlp"  # has no box
     use_box = {"used": not paper or config.eval.bake_occupancy}
-    # Alpha bounds the box of a field that lives in it. A box for images alone holds all that cameras see.
+    # Alpha bounds the box of a field that is defined in it. A box only for rendering holds all that cameras see.
     use_alpha = not paper and section.use_alpha and views.pixels.shape[-1] == 4 and not ndc
     if is_auto(section.contracted):
         contracted, why = _contracted(config, views, use_alpha)
@@ -178,22 +178,23 @@ class _LookAt:
     """What the cameras look at.
 
     Attributes:
-        center: [3] world units, the point nearest to the cameras' axes. Where the axes are parallel, all
-            cameras are at one point, or there is one view, no such point lies in front of the cameras; then it
-            is the mean of the middles of the views' depth ranges.
-        distance: [V] of it from the cameras.
-        half_size: [V, 2] half the width and height of the images there.
-        footprint: the size of a pixel there, the median over views.
+        center: [3] world units, the point nearest to the cameras' axes. If the axes are parallel, all
+            cameras are at one point, or there is one view, no such point lies in front of the cameras; the
+            center is then the mean of the middles of the views' depth ranges.
+        distance: [V] from the cameras to the center.
+        half_size: [V, 2] half the width and height of the images at that distance.
+        footprint: the size of a pixel at that distance, the median over views.
     """
 
     def __init__(self, views):
         to_world = np.asarray(views.cameras.to_world, np.float64)
         eyes, axes = to_world[:, :, 3], to_world[:, :, 2]
-        middle = (np.asarray(views.near, np.float64) + np.asarray(views.far, np.float64)) / 2
+        near, far = np.asarray(views.near, np.float64), np.asarray(views.far, np.float64)
+        middle = np.where(np.isfinite(far), near + far, 3 * np.where(near > 0, near, 1)) / 2
         self.center = poses.gaze_center(to_world)
         self.distance = np.linalg.norm(eyes - self.center, axis=-1)
         spread = np.linalg.eigvalsh(np.eye(3) - axes.T @ axes / len(axes))[0]
-        if spread < 1e-6 or np.median(self.distance) < 1e-3 * np.median(middle):
+        if spread < 1e-6 or np.median(self.distance) < 1e-3 * np.median(np.where(near > 0, near, middle)):
             self.center = (eyes - middle[:, None] * axes).mean(axis=0)
             self.distance = middle
         focal = np.asarray(views.cameras.focal, np.float64)
@@ -202,7 +203,7 @@ class _LookAt:
 
     @property
     def inner_half_side(self):
-        """Half the side of the cube that most images show whole, which deserves most cells."""
+        """Half the side of the cube that most images show completely; it gets most cells."""
         return float(np.median(self.half_size.min(axis=1)))
 
 
@@ -239,7 +240,7 @@ def _box(views, use_alpha, *, ndc, contracted):
 
 
 def _ends_of_rays(views):
-    """Returns lower [3] and upper [3] of all rays: NDC rays are straight, so those of the corners bound all."""
+    """Returns lower [3] and upper [3] of all rays: NDC rays are straight, so the corners' rays bound all."""
     ends = []
     for index, (height, width) in enumerate(np.asarray(views.size)):
         corners = np.float32([[0, 0], [width, 0], [0, height], [width, height]])

@@ -23,7 +23,7 @@ from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.optimizer import make_optimizer
 from jaxnerf.training.step import StepLoss, TrainData
 
-_FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha")  # of the optional ones, those that datasets give
+_FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha")  # the optional fields that datasets provide
 
 
 class Experiment(NamedTuple):
@@ -31,7 +31,7 @@ class Experiment(NamedTuple):
 
     Attributes:
         model: the config's field and sampler.
-        losses: those with a weight.
+        losses: those whose weight is not 0.
         optimizer: see `make_optimizer`.
         schedule: step -> learning rate.
         load_split: split -> Views.
@@ -113,7 +113,7 @@ def build_losses(weights: Mapping[str, Any]) -> tuple[StepLoss, ...]:
     """Builds the losses of the config's section; one whose weight is 0 is absent.
 
     Raises:
-        ValueError: if no loss has a weight, a name is not registered, or a loss needs what no dataset gives.
+        ValueError: if no loss has a weight, a name is not registered, or a loss needs a field that no dataset provides.
     """
     losses = []
     for name, weight in weights.items():
@@ -153,7 +153,7 @@ def conventions(data: ConfigDict) -> dict[str, Any]:
 
 
 def identity(config: ConfigDict) -> str:
-    """Returns the parts of a config that renderings depend on as text: not its training, nor the dataset's folder."""
+    """Returns as text the parts of a config that renderings depend on; not training, nor the dataset's folder."""
     plain = json.loads(config.to_json_best_effort())
     data = {name: value for name, value in plain["data"].items() if name != "dir"}
     rest = {name: value for name, value in plain.items() if name not in ("train", "eval", "data", "losses")}
@@ -201,9 +201,11 @@ def _make_field(config, sections, box, network) -> Field:
     if name == "mlp" and is_auto(options["num_freqs"]):
         raise ValueError(f"{network}.num_freqs is 'auto'; resolve the config against a dataset, or set a number")
     field = make_field(name, options, box)
-    # The paper's networks are not contracted; all other fields live in the box.
+    # The paper's networks are not contracted; all other fields are defined in the box.
     in_box = config.sampler != "hierarchical" or name != "mlp"
     if in_box and sections["occupancy"]["contracted"] is True:
+        if box is None:
+            raise ValueError("occupancy.lower or occupancy.upper is 'auto'; resolve the config, or set both")
         return contract_field(field, *box)
     return field
 

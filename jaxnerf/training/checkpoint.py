@@ -75,7 +75,7 @@ class Checkpoints:
         """Returns the newest state that can be read, or `like` if there is none; and lines about the others.
 
         Newer checkpoints that cannot be read are renamed, never removed. If none can be read, the cause is more
-        likely the program than the disk, and a new start would waste the run.
+        likely the program than the disk, and training from step 0 would discard the run.
 
         Raises:
             ValueError: if there are checkpoints and none can be read; names the newest.
@@ -106,8 +106,8 @@ class Checkpoints:
 
     def _open(self):
         if self._writer is None:
-            # Opened late, as it creates the folder, which a reader must not. Only the process that writes may
-            # remove an unfinished checkpoint: it knows that a killed process left it.
+            # Opened late, because this creates the folder, which a reader must not do. Only the process that
+            # writes may remove an unfinished checkpoint: it knows that a killed process left it.
             self._writer = ocp.training.Checkpointer(
                 self._folder,
                 preservation_policy=self._preservation,
@@ -152,6 +152,6 @@ def _silence_orbax():
 
 
 def _reason(error):
-    while error.__cause__ is not None:  # the root of orbax's chain of errors says what went wrong
+    while error.__cause__ is not None:  # the first error of orbax's chain says what went wrong
         error = error.__cause__
     return (str(error).splitlines() or [type(error).__name__])[0][:400]

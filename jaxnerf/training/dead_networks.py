@@ -21,7 +21,7 @@ _GRADIENT = 1e-5  # norm over the root of that error; a healthy network has 1e-2
 def count_dead_steps(
     counters: Mapping[str, Any],
     grads: Mapping[str, Any],
-    errors: Sequence[Any],
+    errors: Mapping[str, Any],
     input_layers: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
     """Counts for how many steps in a row each network has been dead, as counters "dead_<name>".
@@ -30,7 +30,7 @@ def count_dead_steps(
     Then its density is 0 everywhere, as the input of a ReLU is negative everywhere (an empty image); or it is
     an opaque wall in front of the camera whose colour is saturated; or a layer of ReLUs is 0 everywhere, which
     leaves the same fog at all positions. Adam's momentum can still revive it for a dozen steps; later nothing
-    can. A batch without an error, of a part of the scene that is empty, leaves the count unchanged.
+    can. A batch without an error, as in an empty part of the scene, leaves the count unchanged.
 
     The gradient is a better criterion than opacity or density, and costs nothing: an image of one colour that
     training is about to leave is not dead, and a dead network is dead whatever its image looks like.
@@ -38,12 +38,13 @@ def count_dead_steps(
     Args:
         counters: of the step before; int32 [].
         grads: network name -> gradient over the whole batch.
-        errors: [networks], in the order of grads, the mean squared error of each network's rendering.
+        errors: network name -> mean squared error of its rendering.
         input_layers: network name -> names of the layers that take the position; empty: all layers.
     """
     dead = {}
-    for (name, grad), error in zip(grads.items(), errors, strict=True):
-        inputs = [grad[layer] for layer in input_layers.get(name) or grad]
+    for name, grad in grads.items():
+        layers, error = input_layers.get(name), errors[name]
+        inputs = [grad[layer] for layer in layers] if layers else grad
         still = optax.tree.norm(inputs) <= _GRADIENT * jnp.sqrt(error)
         before = counters[f"dead_{name}"]
         dead[f"dead_{name}"] = jnp.where(error > _ERROR, (before + 1) * still.astype(jnp.int32), before)
@@ -59,8 +60,8 @@ def dead_networks(metrics: Mapping[str, Any]) -> tuple[str, ...]:
 def make_reinitializer(experiment: Any, folder: str | os.PathLike) -> Callable[..., tuple]:
     """Makes the function (step, state, metrics) -> (state, metrics) that reinitializes dead networks.
 
-    It checks every CHECK_EVERY steps. It decides from the state, at steps that do not depend on what is logged
-    or saved when, so a resumed run does the same.
+    It checks every CHECK_EVERY steps. The decision depends only on the state and the step, not on when rows are
+    logged or checkpoints saved, so a resumed run decides the same.
 
     Raises:
         ValueError: from that function, if more networks have died than train.max_reinits allows.
@@ -90,8 +91,8 @@ def make_reinitializer(experiment: Any, folder: str | os.PathLike) -> Callable[.
 def make_reinitialize(model: Model, optimizer: optax.GradientTransformation, seed: int) -> Callable[..., TrainState]:
     """Makes the function (state, names) -> TrainState that reinitializes the networks of these names.
 
-    Their parameters are drawn again, from the seed and the step; the optimizer's moments of them become 0 and
-    averages begin at the new parameters; all valid cells of the model's grid become occupied. The other
+    Their parameters are drawn again, from the seed and the step; their optimizer moments become 0 and
+    averages restart from the new parameters; all valid cells of the model's grid become occupied. The other
     networks, and the schedule of the learning rate, stay as they are.
     """
 

@@ -1,6 +1,7 @@
 """The training loop: resume, step, log, save, stop cleanly."""
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import os
@@ -51,11 +52,14 @@ def train(
     """
     started = time.perf_counter()
     config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves no trace
-    experiment = build.build(resolve_for_device(config)[0])
+    on_device, device_lines = resolve_for_device(config)
+    experiment = build.build(on_device)
     options = experiment.train
     num_devices = len(devices.devices_of(options.parallel))
     devices.split_positions(options.batch_size, num_devices, options.microbatch_size)
-    processes.check_same("config", config.to_json_best_effort())
+    anywhere = copy.deepcopy(config)
+    anywhere.data.dir = ""  # machines may have the dataset at different places; its content is compared later
+    processes.check_same("config", anywhere.to_json_best_effort())
     with contextlib.ExitStack() as stack:
 
         def claim():
@@ -63,7 +67,7 @@ def train(
             workdir.claim(folder, config)
 
         processes.run_on_first(claim, pathlib.Path(folder) / "config.json")
-        processes.print_once(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
+        processes.print_once(*lines, *device_lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
         finished = run_training(experiment, views, folder)
         return finished and (at_end is None or not experiment.eval.at_end or at_end(folder))
 

@@ -21,12 +21,12 @@ from jaxnerf.training.state import TrainState
 
 
 class MetricLog:
-    """The rows of metrics.jsonl, one JSON object a line, ascending in step; also written as events."""
+    """The rows of metrics.jsonl, one JSON object per line, ascending in step; also written as events."""
 
     def __init__(self, workdir: str | os.PathLike, *, first_step: int, write: bool = True):
         """Opens the file to append, without rows after first_step.
 
-        Lines that are no rows are dropped with a message, and the damaged file is kept.
+        Lines that are not valid rows are dropped with a message, and the damaged file is kept.
 
         Args:
             workdir: of the run.
@@ -192,7 +192,7 @@ def header(
     lines += [
         f"compiled      in {compile_seconds:.1f} s",
         f"steps         {int(state.step)} of {options.max_steps} done, {options.batch_size} rays per step in "
-        f"microbatches of {min(options.microbatch_size, options.batch_size)}",
+        f"microbatches of {min(options.microbatch_size, options.batch_size // len(devices))}",
     ]
     return lines
 
@@ -205,8 +205,8 @@ def row(
     Args:
         experiment: of the run.
         step: steps taken.
-        recent: the metrics of each step since the last row. Losses and errors are averaged over them; of the
-            rest the last values count.
+        recent: the metrics of each step since the last row. Losses and errors are averaged over them; of all
+            other metrics the last values count.
         seconds: of training so far.
         rate: rays so far -> rays per second since the last row.
         compile_seconds: that compiling the step took.

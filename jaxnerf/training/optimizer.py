@@ -9,8 +9,8 @@ import optax
 
 from jaxnerf.training.state import TrainState
 
-_MIN_SIDE = 8  # inputs and outputs of a layer whose matrix Muon updates; it would gain nothing on smaller ones
-_ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; one by one they compile once, as a loop
+_MIN_SIDE = 8  # least inputs and outputs of a layer that Muon updates; smaller layers gain nothing
+_ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one, they compile once, as a loop
 
 
 def make_optimizer(train: Any) -> tuple[optax.GradientTransformation, Callable[[Any], Any]]:
@@ -38,8 +38,8 @@ def with_muon(
     """Returns an optimizer that updates the matrices of layers by Muon and all other parameters by another one.
 
     Muon's updates have the same length in each direction of a matrix, so directions along which the gradient
-    is small are learned as soon as the others (arXiv:2502.16982). The rows of a hash grid's table are not
-    directions, and an output of one or three features has hardly any: these stay with the other optimizer.
+    is small are learned as fast as the others (arXiv:2502.16982). This does not apply to the rows of a hash grid's
+    table, nor to outputs of one or three features: the other optimizer updates these.
 
     Args:
         optimizer: updates the other parameters.
@@ -107,5 +107,5 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
 
 
 def averaged_params(state: TrainState) -> Any:
-    """Returns the parameters that images show: the averaged ones, or the last ones where nothing is averaged."""
+    """Returns the parameters that evaluation uses: the averaged ones, or the last ones without averaging."""
     return state.opt_state.average if isinstance(state.opt_state, Averaging) else state.params

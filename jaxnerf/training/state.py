@@ -45,7 +45,7 @@ def create_state(
     if schedule is not None and valid is None:
         valid = jnp.ones(schedule.shape, bool)
 
-    @jax.jit  # initialization op by op would take longer than compiling it
+    @jax.jit  # op by op, initialization would take longer than its compilation
     def create(key, valid):
         params = model.init(key)
         names = ["nonfinite", "nonfinite_in_a_row", "num_reinits", *(f"dead_{name}" for name in params)]

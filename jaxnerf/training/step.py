@@ -20,7 +20,7 @@ class TrainData(NamedTuple):
     """What the steps of a run read and never change.
 
     Attributes:
-        seed: uint32 []. As data, not a constant, it lets runs that differ by it share a compiled step.
+        seed: uint32 []. It is data, not a constant, so that runs with different seeds share a compiled step.
         views: of the split "train".
         active_pixels: the pixels to draw from; None: all.
         cells: [M] int32, the cells of the grid that are updated; None without a grid.
@@ -54,10 +54,10 @@ def make_train_step(
     """Makes the pure training step.
 
     Args:
-        model: see `Model`; the last of its Renderings in training counts.
+        model: see `Model`; the last of its Renderings is the final one.
         optimizer: an optax gradient transformation.
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see `draw_batch`.
-        losses: at least one of the renderings.
+        losses: at least one must be a loss of the renderings.
 
     Returns:
         train_step(state, data, positions, *, axis_name=None) -> (state, metrics).
@@ -65,7 +65,7 @@ def make_train_step(
         `data` is TrainData; for a model without a grid it may be anything that `draw` accepts. `positions` is
         [N, B] int32, the positions of this device's rays in the whole batch, in N microbatches. These run one
         after the other and their gradients are summed, so the activations of only B rays must fit into the
-        cache or memory. With an `axis_name` all sums are also over that axis of devices.
+        cache or memory. With an `axis_name` all sums also run over that axis of devices.
 
         `metrics` are scalars: "loss", "mse" (last rendering), "mse_coarse" (first rendering), "loss_<name>" of
         each loss (unweighted) if there are several, "grad_norm", the number of "rays" that were not dropped,
@@ -117,7 +117,7 @@ def make_train_step(
         if axis_name is not None:
             total = jax.lax.psum(total, axis_name)
         metrics, grads, rays = _mean_over_rays(*total)
-        errors = (metrics["mse_coarse"], metrics["mse"])[-len(grads) :]
+        errors = {name: metrics["mse" if name == "fine" else "mse_coarse"] for name in grads}
         dead = count_dead_steps(state.counters, grads, errors, model.input_layers)
         metrics, grads = regularize(state, metrics, grads)
         metrics["grad_norm"] = optax.tree.norm(grads)
@@ -127,7 +127,7 @@ def make_train_step(
             updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
             return optax.apply_updates(state.params, updates), opt_state
 
-        # A branch, as selecting between old and new arrays takes about as long as the update itself.
+        # A branch: selecting between old and new arrays would take about as long as the update itself.
         params, opt_state = jax.lax.cond(finite, descend, lambda: (state.params, state.opt_state))
         missed = (~finite).astype(jnp.int32)
         counters = {

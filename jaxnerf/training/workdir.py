@@ -18,7 +18,7 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-# A run may be resumed with other values of these fields and sections, as they change no step that was taken.
+# A run may be resumed with other values of these fields and sections, as finished steps do not depend on them.
 CHANGEABLE = (
     "data.dir",
     "train.max_steps",
@@ -58,8 +58,9 @@ def claim(workdir: str | os.PathLike, config: ConfigDict) -> None:
     elif (path.parent / "checkpoints").exists():
         raise ValueError(f"{workdir}: has checkpoints but no config.json; give another --workdir")
     path.parent.mkdir(parents=True, exist_ok=True)
-    for partial in path.parent.glob("*.tmp"):
-        partial.unlink(missing_ok=True)
+    for name in ("config.json", "metrics.jsonl"):
+        for partial in path.parent.glob(f"{name}.*.tmp"):
+            partial.unlink(missing_ok=True)
     atomic_files.write_text(path, config.to_json_best_effort(indent=2) + "\n")
 
 
@@ -90,8 +91,8 @@ def _flat(config):
 def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
     """Holds a workdir, made if missing, for one training.
 
-    The lock is flock's on the file "running", which names its holder. The system releases it however the
-    process ends. `filelock` and the like do not name the holder.
+    The lock is a flock on the file "running", which names its holder. The system releases it however the
+    process ends. Packages such as `filelock` do not name the holder.
 
     Raises:
         ValueError: if another process holds it, or nothing can be written there; names the folder.
@@ -112,7 +113,7 @@ def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # a file that stays behind locks nobody out
+        with contextlib.suppress(OSError):  # a file that remains does not lock anybody out
             path.unlink()
         file.close()
 
@@ -120,7 +121,7 @@ def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
 def _locked(path):
     """Returns the file, opened and locked; raises ValueError if another process holds it."""
     while True:
-        # A link could point at a file that truncate would empty.
+        # Links are not followed, as truncate would empty the file that a link points at.
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         file = os.fdopen(os.open(path, flags, 0o666), "a+")
         try:

@@ -101,6 +101,7 @@ def test_a_dataset_without_defects_has_no_errors(folders, format):
     assert np.median(off_walls) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["transforms", "llff"])
 @pytest.mark.parametrize("signs", [(1, -1, -1), (-1, -1, 1), (-1, 1, -1)])
 def test_turned_axes_are_found_and_the_change_corrects_them(folders, tmp_path, format, signs):

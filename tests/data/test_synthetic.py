@@ -156,6 +156,7 @@ def test_round_opaque_objects_of_the_shiny_scene_have_highlights():
     assert (shiny >= matt - 1e-6).all() and (shiny <= 1).all()
 
 
+@pytest.mark.slow
 def test_field_is_bounded_with_finite_gradients():
     x = jax.random.uniform(jax.random.key(0), (500, 4, 3), minval=-2.0, maxval=2.0)
     special = jnp.array([0.0, -0.38, -0.71, 0.22, 1e3, -0.40, 0.46, 0.42])  # centres of objects, and far away

@@ -97,6 +97,7 @@ def test_nothing_is_overwritten_without_the_flag(scored, run):
     assert (folder / "results.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_other_splits_and_steps_have_folders_of_their_own_and_the_chunk_changes_no_metric(scored, run):
     results, _ = scored
     val = evaluate(run, split="val")

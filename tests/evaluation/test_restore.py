@@ -1,11 +1,16 @@
 """Restored runs: where their dataset is found."""
 
+import json
+import shutil
+
 import pytest
 
 import captures
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import auto_config, workdir
 from runs import smoke_config
+
+pytest_plugins = ["run_fixtures"]
 
 
 @pytest.fixture
@@ -49,3 +54,14 @@ def test_another_folder_of_the_same_dataset_replaces_that_of_the_run(scene, tmp_
         restore_run(tmp_path / "run").experiment.load_split("train")
     run = restore_run(tmp_path / "run", data_dir=str(moved / "scene"))
     assert len(run.experiment.load_split("train").offset) == 7
+
+
+def test_a_run_without_resolved_sizes_is_baked(trained, tmp_path):
+    """A run that was converted without its dataset keeps "auto" fields, which are inferred when they are used."""
+    folder = shutil.copytree(trained, tmp_path / "run")
+    content = json.loads((folder / "config.json").read_text())
+    content["occupancy"].update(dict.fromkeys(("lower", "upper", "step_size", "resolution", "contracted"), "auto"))
+    content["data"]["ndc"] = "auto"
+    (folder / "config.json").write_text(json.dumps(content))
+    run = restore_run(folder, settings={"bake_occupancy": True})
+    assert run.experiment.model.grid_schedule is None and run.variables(20)[1].valid.ndim == 3

@@ -120,6 +120,7 @@ def reference(name, density, origin, direction, near, far):
     return total[:3], total[3], transmitted, total[4] + transmitted * far
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", [1e-9, 3.0])
 @pytest.mark.parametrize("name", MEDIA)
 def test_exact_is_the_integral_of_the_scene(name, density):

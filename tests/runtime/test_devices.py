@@ -57,6 +57,7 @@ def test_ten_steps_end_in_the_same_parameters(runs):
         assert_same(many_row, row, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["sharded", "pmap"])
 @pytest.mark.parametrize("microbatch_size", [4, 2])
 def test_gradient_is_a_mean_over_devices(mode, microbatch_size):

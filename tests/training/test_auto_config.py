@@ -277,6 +277,13 @@ def test_odd_cameras_are_resolved(name, sampler, field):
     assert (0.5 < box).all() and (box < 20).all() and 1e-3 < got.occupancy.step_size < 1
 
 
+@pytest.mark.parametrize("near, far", [(2.0, np.inf), (0.0, np.inf), (0.01, 1e6)])
+@pytest.mark.parametrize("name", ODD_CAMERAS)
+def test_a_far_away_end_of_rays_is_resolved(name, near, far):
+    got = resolve(auto_config("mlp"), of_cameras(ODD_CAMERAS[name], near, far)).config
+    assert np.isfinite([*got.occupancy.lower, *got.occupancy.upper, got.occupancy.step_size]).all()
+
+
 def test_octaves_are_inferred(views):
     config = resolve(auto_config("mlp"), views).config
     wave = 2 * np.pi / 2 ** (config.fine.num_freqs - 1)

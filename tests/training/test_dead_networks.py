@@ -250,3 +250,12 @@ def test_run_that_keeps_dying_stops_with_advice(tmp_path):
     assert check(149, None, metrics) == (None, metrics)
     with pytest.raises(ValueError, match="step 150 the coarse and the fine network .* after 2 .*lower train.lr_init"):
         check(150, None, metrics)
+
+
+def test_networks_of_any_structure_and_number_are_counted_by_name():
+    """Parameters may be any pytree, and the order of the names says nothing about the order of the renderings."""
+    grads = {"fine": [jnp.zeros(3)], "proposal": jnp.ones(2), "warp": {"a": jnp.zeros(1)}}
+    counters = {f"dead_{name}": jnp.int32(4) for name in grads}
+    errors = {"fine": jnp.float32(0.1), "proposal": jnp.float32(0.1), "warp": jnp.float32(0.0)}
+    got = dead_networks.count_dead_steps(counters, grads, errors, {"fine": ()})
+    assert jax.tree.map(int, got) == {"dead_fine": 5, "dead_proposal": 0, "dead_warp": 4}

@@ -147,6 +147,7 @@ def test_empty_cells_hold_no_matter(tiny):
     assert abs(tiny.score(everywhere) - tiny.score(state)) < 0.1
 
 
+@pytest.mark.slow
 def test_early_occlusion_costs_little_as_occluded_rays_do_not_show_the_background(tiny):
     """An estimate that hides matter which has not formed yet must not prevent it from forming.
 

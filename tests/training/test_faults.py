@@ -19,7 +19,7 @@ from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
-from jaxnerf.training.workdir import workdir_lock
+from jaxnerf.training.workdir import claim, workdir_lock
 from runs import ROOT, smoke_config
 from slow.faults import kill_many
 
@@ -259,3 +259,11 @@ def test_signal_before_training_prints_one_line(number):
     )
     assert done.returncode == 128 + number
     assert done.stderr.startswith("error: stopped before ") and len(done.stderr.splitlines()) == 1
+
+
+def test_partial_files_of_a_killed_run_are_removed_and_no_others(tmp_path):
+    for name in ("config.json.0a1b.tmp", "metrics.jsonl.0a1b.tmp", "notes.tmp"):
+        (tmp_path / name).write_text("partial")
+    (tmp_path / "folder.tmp").mkdir()
+    claim(tmp_path, smoke_config())
+    assert {path.name for path in tmp_path.iterdir()} == {"config.json", "notes.tmp", "folder.tmp"}

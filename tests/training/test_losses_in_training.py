@@ -80,7 +80,7 @@ def train(weights, num_steps=1, packed=False):
     return state, rows
 
 
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("packed", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_loss_is_the_weighted_sum_by_name(packed):
     _, (row,) = train({"mse": 2.0, "distortion": 0.3}, packed=packed)
     assert row["loss_distortion"] > 1e-4

@@ -20,7 +20,7 @@ _MAX_ERROR = 1 / 512  # of a colour: half a step of 8 bits
 
 
 def num_visibility_rays(shape: tuple[int, int, int]) -> int:
-    """Returns how many rays visible_grid needs for a grid of a shape: some for each cell on a surface."""
+    """Returns how many rays visible_grid needs for a grid of a shape, so that several hit each cell on a surface."""
     return -(-16 * max(shape) ** 2 // _CHUNK) * _CHUNK
 
 
@@ -39,13 +39,13 @@ def visible_grid(
 ) -> OccupancyGrid:
     """Creates the grid of the cells of a box in which a scene is dense and visible.
 
-    Occupied are the cells that the rays need for colours within half a step of 8 bits, and those between two
-    such cells. A network that was trained along whole rays has white fog before white, fog thinner than the
-    threshold before all that is dense, and matter inside of objects; none of these is kept.
+    A cell is occupied if the rays need it for colours within half a step of 8 bits, or if it lies between two
+    such cells. A network that was trained along whole rays has white fog in front of white surfaces, fog thinner
+    than the threshold in front of everything dense, and matter inside objects; none of these is kept.
 
     Args:
         scene: see render_samples.
-        rays: Rays [N], a multiple of 2048: what the training views see.
+        rays: Rays [N] of the training views; N is a multiple of 2048.
         lower, upper: [3] world units, the box.
         shape: cells along x, y and z.
         step_size: world units between samples.

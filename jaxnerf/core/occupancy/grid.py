@@ -1,4 +1,4 @@
-"""The occupancy grid: which cells of a box may hold matter, learned beside the scene (after arXiv:2201.05989).
+"""The occupancy grid: which cells of a box may hold matter, updated while the scene trains (arXiv:2201.05989).
 
 The grid is part of the model. A field that was trained with one is undefined in its empty cells, so it must be
 rendered with its grid.
@@ -19,15 +19,15 @@ _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 
 @pytree(static=("contracted",))
 class OccupancyGrid:
-    """What is known of the X x Y x Z cells of a box, into which all of space may be contracted.
+    """The X x Y x Z cells of a box, into which all of space may be contracted.
 
     Attributes:
         lower: [3] world units, the box's lower corner.
         upper: [3] world units, its upper corner.
-        valid: [X, Y, Z] bool; False: always empty, as alpha masks have shown.
+        valid: [X, Y, Z] bool; False for cells that are always empty, as determined from alpha.
         density_max: [X, Y, Z] 1 / world unit, the largest density that recent updates found.
         density_mean: [X, Y, Z] 1 / world unit, the running mean of the densities found; -1 in empty cells.
-        occupied: [X, Y, Z] bool, where a scene is evaluated.
+        occupied: [X, Y, Z] bool; a scene is evaluated only in these cells.
         contracted: whether the box's outer half holds all of space outside its inner half.
     """
 
@@ -48,15 +48,15 @@ def create_grid(
     initial_density: float,
     contracted: bool = False,
 ) -> OccupancyGrid:
-    """Creates the grid of a box of which only the valid cells are known (as the grids of arXiv:2201.05989).
+    """Creates the grid of a box before any update, when only the valid cells are known (as in arXiv:2201.05989).
 
     Args:
         lower, upper: [3] world units.
         valid: [X, Y, Z] bool, x first.
         initial_density: 1 / world unit, the density_max of every cell. An empty cell stays occupied until
             updates bring that down to the threshold: log(initial_density / threshold) / log(1 / decay) of them.
-        contracted: whether there is space outside of the box, too: then the cells of its inner half are
-            plain, and those of the outer half hold all the rest, see contraction.contract.
+        contracted: whether the box holds all of space: the cells of its inner half are then not contracted,
+            and those of its outer half hold all the rest, see contraction.contract.
 
     Returns:
         OccupancyGrid with fields [X, Y, Z], occupied wherever it is valid.
@@ -92,23 +92,23 @@ def update_grid(
 ) -> OccupancyGrid:
     """Updates some cells from the density at a random point in each (as in arXiv:2201.05989).
 
-    A cell is occupied where its density_max exceeds the threshold, or, with spread, that of a neighbour does:
-    a field that is still forming must not lose what it is about to grow.
+    A cell is occupied if its density_max exceeds the threshold or, with spread, if that of a neighbour does. Early
+    in training, neighbours let the density of the field grow into cells next to dense ones.
 
     Args:
         key: for the point in each cell.
         grid: OccupancyGrid.
         scene: see render_samples.
         cells: [M] int32, flat indices x first, each at most once; indices past the last cell are ignored.
-        threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there drops what
-            absorbs less than 1 % of the light.
+        threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there empties cells
+            that absorb less than 1 % of the light.
         decay: the factor of density_max at an update that finds less.
         smoothing: the weight of an update in density_mean.
-        spread: bool, traced or not. Once the field has formed, neighbours cost samples and are empty.
+        spread: bool, may be traced. Once the field has formed, neighbours of dense cells only cost samples.
         chunk: cells evaluated at once.
 
     Returns:
-        OccupancyGrid. What is not valid stays empty. No gradient is meant to flow through it.
+        OccupancyGrid. Cells that are not valid stay empty. The update is not meant to be differentiated.
 
     Raises:
         ValueError: on other shapes.
@@ -126,7 +126,7 @@ def update_grid(
     largest, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
     largest = largest.at[cells].set(jnp.maximum(decay * largest[cells], found)).reshape(grid.density_max.shape)
     mean = mean.at[cells].add(smoothing * (found - mean[cells])).reshape(grid.density_mean.shape)
-    dense = ~(largest <= threshold)  # NaN is dense, and shows
+    dense = ~(largest <= threshold)  # NaN counts as dense, so that it is visible
     occupied = jnp.where(spread, _widen(dense), dense) & grid.valid
     return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
 
@@ -148,12 +148,12 @@ def grid_from_scene(
     Args:
         key: for the points in the cells.
         scene: see render_samples.
-        lower, upper: [3] world units, the box; outside of it nothing will be evaluated.
+        lower, upper: [3] world units, the box; the scene is not evaluated outside of it.
         shape: cells along x, y and z.
         threshold, chunk: see update_grid.
         contracted: see create_grid.
-        num_updates: random points in each cell. A cell is occupied where the density at one of them, or of a
-            neighbour's, exceeds the threshold, so matter much thinner than a cell may be missed.
+        num_updates: random points in each cell. A cell is occupied if the density at one of them, or at one of a
+            neighbour's, exceeds the threshold. Matter much thinner than a cell may be missed.
 
     Returns:
         OccupancyGrid.
@@ -207,7 +207,7 @@ def clip_rays_to_box(grid: OccupancyGrid, rays: Rays) -> Rays:
 def is_occupied(
     grid: OccupancyGrid, rays: Rays, t: Float[ArrayLike, "*batch samples"]
 ) -> Bool[Array, "*batch samples"]:
-    """Returns whether the cell around each x(t) is occupied; True where t is NaN, so that it shows."""
+    """Returns whether the cell around each x(t) is occupied; True where t is NaN, so that it is visible."""
     index, inside = _cells_of(grid, _along_rays(grid, rays, t))
     return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t)
 
@@ -220,29 +220,29 @@ def mask_samples(
     Occlusion is estimated for training from the grid alone: no scene is evaluated.
 
     Args:
-        grid: OccupancyGrid. The estimate is its running mean: its maximum would occlude what still has to form.
+        grid: OccupancyGrid. The estimate uses density_mean; density_max would occlude density that is still forming.
         rays: Rays [...].
         samples: Samples [..., S].
-        max_optical_depth: estimated optical depth in front of a sample beyond which it is occluded.
+        max_optical_depth: a sample is occluded if the estimated optical depth in front of it exceeds this.
 
     Returns:
-        Samples [..., S] with delta 0 where they are masked; and occluded [...], whether a ray has samples in
-        occupied cells that are masked.
+        Samples [..., S] with delta 0 where they are masked; and occluded [...], whether samples of a ray in
+        occupied cells are masked.
     """
     index, inside = _cells_of(grid, _along_rays(grid, rays, samples.t))
     mean = jnp.where(inside & ~(samples.delta <= 0), grid.density_mean.reshape(-1)[index], -1)
-    # A plain norm, as it is computed again for every sample: an estimate needs no care for directions of 1e-20.
+    # A plain norm, as it is computed again for every sample; an estimate need not be accurate at lengths of 1e-20.
     x, y, z = (rays.directions[..., axis] for axis in range(3))
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
     occluded = volume_rendering.exclusive_sum(jnp.maximum(mean, 0) * samples.delta * size) > max_optical_depth
-    occupied = ~(mean < 0) | jnp.isnan(samples.t)  # NaN is kept, and shows
+    occupied = ~(mean < 0) | jnp.isnan(samples.t)  # NaN is kept, so that it is visible
     kept = occupied & ~occluded
     masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
     return masked, (occupied & occluded).any(axis=-1)
 
 
 def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
-    """Makes a scene that is empty where the grid is: what render_packed renders (arXiv:2201.05989).
+    """Makes a scene that is empty in the grid's empty cells, as render_packed renders it (arXiv:2201.05989).
 
     Args:
         scene: see render_samples.
@@ -281,10 +281,10 @@ def drop_thin_density(
 
 
 def flat_index(places: Sequence[Int[Array, "*batch"]], shape: tuple[int, ...]) -> Int[Array, "*batch"]:
-    """Returns the indices [...] among all cells of a shape (X, Y, Z) of places, three arrays [...] int32.
+    """Returns the flat indices [...] of cells in a grid of a shape (X, Y, Z); places are three arrays [...] int32.
 
-    It is a sum over a stack, because XLA ends a loop there on a CPU: if one loop found cells and read them,
-    none of it would be vectorised.
+    The sum over a stack makes XLA end a loop there on a CPU. A single loop that computed indices and read cells
+    would not be vectorised at all.
     """
     strides = jnp.array([shape[1] * shape[2], shape[2], 1]).reshape(3, *(1,) * places[0].ndim)
     return (jnp.stack(places) * strides).sum(axis=0)

@@ -1,4 +1,4 @@
-"""Rendering of the samples in occupied cells alone: packed into one buffer, or with early termination.
+"""Renders only the samples in occupied cells: packed into one buffer, or with early termination.
 
 Occupied samples are those of positive length in an occupied cell. Training packs them into one buffer of fixed
 size and composites them there. Images march each ray only until it is opaque.
@@ -16,7 +16,7 @@ from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
 from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
 
 _OPAQUE = 1e-3  # transmittance below which a ray counts as opaque
-_HIGH_EPS = 0.01  # an early_stop_eps from which on rays end so soon that long runs of samples are wasted
+_HIGH_EPS = 0.01  # an early_stop_eps above which rays end so soon that long runs waste samples
 
 
 def render_packed(
@@ -41,11 +41,11 @@ def render_packed(
         rays: Rays [...].
         samples: Samples [..., S]; rules "segments" and "points".
         max_samples: K >= 1, the size of the buffer.
-        early_stop_eps: 0 evaluates all samples at once; those that do not fit are dropped and counted. Above 0,
-            as many samples as fit are evaluated in each of several rounds, the next ones of rays whose
-            transmittance is still above this: none is dropped. What lies behind a terminated ray is taken to
-            look like what the ray has met: where colours are in [0, 1] the colour is within early_stop_eps of
-            the exact one, and so is the opacity, which is 1. This is for rendering: it has no reverse mode.
+        early_stop_eps: 0 evaluates all samples at once; those that do not fit are dropped and counted. Above 0, none
+            is dropped: each of several rounds evaluates as many samples as fit, the next ones of the rays whose
+            transmittance is still above early_stop_eps. The remaining light of a terminated ray is assumed to
+            look like the rest of the ray. If colours are in [0, 1], the colour is then within early_stop_eps of
+            the exact one, and so is the opacity, which is 1. This mode is for rendering; it has no reverse mode.
         background: see render_samples.
 
     Returns:
@@ -80,21 +80,22 @@ def visible_samples(
     max_samples: int,
     background: Background | None = None,
 ) -> Bool[Array, "*batch samples"]:
-    """Finds the samples that a ray needs: without all others its colour changes by at most an error.
+    """Finds the samples that a ray needs: dropping all others changes its colour by at most an error.
 
-    From back to front, each sample is dropped unless what that adds to the error made behind it, by Eq. 3 of
-    arXiv:2003.08934, is too large. White fog before a white background is not needed, nor is the inside of a
-    wall.
+    Samples are visited from back to front. A sample is dropped if the error of the ray's colour (Eq. 3 of
+    arXiv:2003.08934), including that of the samples dropped behind it, stays within the bound. White fog in front
+    of a white background is not needed, nor is the inside of a wall.
 
     Args:
         scene, rays, samples, background: see render_packed.
         grid: OccupancyGrid, in whose occupied cells the scene is evaluated.
-        error: in each of the three channels, which are taken to be in [0, 1].
+        error: bound in each of the three channels, which are assumed to be in [0, 1].
         max_samples: samples evaluated at once; all are evaluated, in as many rounds as that takes.
 
     Returns:
         [..., S] bool; False where the scene is not evaluated. A ray whose transmittance is below 1e-3 keeps
-        what makes it opaque, whatever the colours: opacity and depth would show it. A NaN is needed, and shows.
+        the samples that make it opaque, whatever their colours, as opacity and depth depend on them. A sample that
+        is NaN is needed, so that it is visible.
 
     Raises:
         ValueError: as render_packed.
@@ -186,8 +187,8 @@ def _rendering(sums, num_dropped, far, shape, background):
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)
 
 
-# Which samples are occupied: one bit each, W words of 32 for each ray. Searching words rather than samples is
-# what makes packing cheap.
+# Which samples are occupied: one bit per sample, W words of 32 bits per ray. Packing is cheap because it searches
+# words rather than samples.
 
 
 class _Occupied(NamedTuple):
@@ -259,8 +260,8 @@ class _Buffer(NamedTuple):
 
 
 def _fill(occupied, place, used):
-    """Returns the _Buffer of the occupied samples at places [K], each the next after the one before."""
-    # How many words have ended up to a place: counted from place to place, rather than searched for each.
+    """Returns the _Buffer of the occupied samples with the indices place [K], which are consecutive."""
+    # The number of words that end before each index, by a cumulative sum instead of a search for each index.
     ended = jnp.zeros_like(place).at[jnp.maximum(occupied.ends - place[0], 0)].add(1, mode="drop")
     word = jnp.minimum(jnp.cumsum(ended), occupied.words.size - 1)
     flags = occupied.words[word]
@@ -319,7 +320,7 @@ class _Slots(NamedTuple):
 def _march_until_terminated(function, scene, rays, samples, words, *, max_samples, early_stop_eps):
     """Marches each ray until its transmittance is at most early_stop_eps, or to its end.
 
-    What lies behind a terminated ray is taken to look like all that it has met: such a ray is opaque.
+    The remaining light of a terminated ray is assumed to look like the rest of the ray, so such a ray is opaque.
 
     Args:
         function: name of the public function, for errors.
@@ -334,7 +335,9 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
         _Sums [B].
     """
     ray_count = rays.near.size
-    samples_per_slot = 2 if early_stop_eps >= _HIGH_EPS else 4  # more waste evaluations, fewer make more rounds
+    samples_per_slot = (
+        2 if early_stop_eps >= _HIGH_EPS else 4
+    )  # more would waste evaluations, fewer would need more rounds
     slot_count = max(min(max_samples // samples_per_slot, ray_count), 1)
     row = jnp.arange(max_samples // slot_count)[None]
     up_to = jnp.cumsum(_count_bits(words), axis=-1)
@@ -367,7 +370,7 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
         run, transmittance = evaluate(slots.ray, slots.num_done), slots.sums[:1]
         sums = jnp.concatenate([transmittance * run[:1], slots.sums[1:] + transmittance * run[1:]])
         num_done = slots.num_done + row.size
-        terminates = ~(sums[0] > early_stop_eps)  # NaN terminates, and shows
+        terminates = ~(sums[0] > early_stop_eps)  # NaN terminates, so that it is visible
         ends = terminates | (num_done >= count.at[slots.ray].get(mode="clip"))
         sums = jnp.where(terminates & (sums[1] > 0), _made_opaque(sums), sums)
         finished = finished.at[:, jnp.where(ends, slots.ray, ray_count)].set(sums, mode="drop")
@@ -387,7 +390,7 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
 def _longest_first(count, most):
     """Returns the order [B] of rays by count [B], at most `most`, so that all slots finish at about the same time.
 
-    It sorts numbers that also hold the ray's index: argsort takes several times as long on a CPU.
+    The sorted numbers combine the count with the ray's index, as argsort takes several times as long on a CPU.
     """
     rays = count.size
     if rays * (most + 1) > 2**32:  # too large for such numbers
@@ -397,7 +400,7 @@ def _longest_first(count, most):
 
 
 def _made_opaque(sums):
-    """Returns sums [7, L] of terminated rays, whose remaining light is taken to look like the rest."""
+    """Returns sums [7, L] of terminated rays, whose remaining light is assumed to look like the rest of the ray."""
     return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:] / sums[1:2]])
 
 
@@ -412,7 +415,7 @@ def _nth_samples(rays, samples, words, up_to, ray, n, used):
 
 
 def _sum_run(function, scene, rays, samples, used):
-    """Returns [7, L], the columns of _Sums of consecutive samples, as if nothing lay before them."""
+    """Returns [7, L], the columns of _Sums of consecutive samples, as if nothing lay in front of them."""
     t, delta = samples
     x = rendering.points_on_rays(rays, t)
     density, rgb = scene(x, rays.viewdirs[:, None])

@@ -1,4 +1,4 @@
-"""Ray culling: rays that cannot hit an occupied cell are found on a coarse grid, and not rendered."""
+"""Ray culling: finds the rays that cannot hit an occupied cell, by means of a coarse grid, and skips them."""
 
 import dataclasses
 import functools
@@ -18,8 +18,8 @@ _COARSE = 2  # cells along a side of a coarse cell
 def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> Bool[Array, "*batch"]:
     """Returns whether a sample of each ray can lie in an occupied cell.
 
-    Coarse cells are read at a few places along the ray, so many rays that pass nearby are True, and all rays
-    where space is contracted. A ray that is NaN is True, so that it shows.
+    The test reads coarse cells at a few positions along the ray, so it is True for many rays that only pass near an
+    occupied cell. It is True for all rays if space is contracted, and for a ray with NaN, so that the NaN is visible.
 
     Args:
         grid, rays, cell: see march_rays.
@@ -30,7 +30,7 @@ def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> B
     inside = clip_rays_to_box(grid, rays)
     length = inside.far - inside.near
     sides = [size * count for size, count in zip(cell, grid.occupied.shape, strict=True)]
-    # No point of a ray is further than a coarse cell from a place, up to rounding.
+    # Up to rounding, no point of a ray is further than a coarse cell from one of these positions.
     count = math.ceil(math.hypot(*sides) / (1.99 * _COARSE * min(cell)))
 
     def read(index, hit):
@@ -79,7 +79,7 @@ def render_selected(
     """Renders only some rays of an image, those that may hit an occupied cell.
 
     Args:
-        render, rays, chunk: see render_image; but the last chunk is filled up with rays of length 0, which
+        render, rays, chunk: see render_image; but the last chunk is padded with rays of length 0, which
             cost least.
         selected: [H, W] bool, which rays are rendered.
         otherwise: Rendering [H, W] without weights, of the other rays; see render_background.
@@ -103,7 +103,7 @@ def render_selected(
 
 def _coarse_cells(occupied):
     """Returns which coarse cells hold an occupied cell, or have one among their 26 neighbours."""
-    # Slices, each or-ed with the others: reduce_window takes several times as long on a CPU.
+    # A bitwise or of shifted slices: reduce_window takes several times as long on a CPU.
     coarse, reach = occupied, 3 * _COARSE
     for axis in range(3):
         around = [(_COARSE, _COARSE + -occupied.shape[i] % _COARSE) if i == axis else (0, 0) for i in range(3)]
@@ -114,7 +114,7 @@ def _coarse_cells(occupied):
     return coarse
 
 
-# All jitted: op by op they would take longer than the rays of a small image.
+# All are jitted: run op by op, they would take longer than rendering a small image.
 @jax.jit
 def _order(selected):
     """Returns [N], the indices of the selected rays; N in the remaining places."""

@@ -27,9 +27,9 @@ def march_rays(
         grid: OccupancyGrid. If it is contracted, the steps are those of samples_in_contracted_space.
         rays: Rays [...].
         step_size: world units, a number.
-        cell: [3] world units, numbers, the size of a cell of this grid: it bounds the number of samples that a
+        cell: [3] world units, numbers, the size of a cell of this grid; it bounds the number of samples that a
             ray may need.
-        stretch: the number of steps that one sample takes, at least 1, traced or not.
+        stretch: factor of the step size, at least 1; may be traced.
 
     Returns:
         Samples [..., S].
@@ -52,17 +52,18 @@ def samples_in_contracted_space(
     t_step: Float[Array, "*batch"],
     steps_in_half_side: float,
 ) -> Samples:
-    """Returns samples from near to far, however far, at steps that grow as contracted cells do.
+    """Returns samples from near to far, at steps that grow with the contracted cells; far may be arbitrarily large.
 
-    With r the distance to the box's center, r0 the ray's smallest, and R the side of its inner half over the
-    square root of 2, steps are equal in s where t = m tan(s / m), m = max(r0, R), counted from the point at
-    r0: plain near the center, times (r / R)^2 far from it, and self-similar where r0 exceeds R.
+    Let r be the distance from the box's center, r0 the smallest r of the ray, and R the side of the box's inner
+    half over the square root of 2. Steps are equal in s, where t = m tan(s / m), m = max(r0, R), and both t and s
+    are measured from the point at r0. Steps have their plain length near the center, are longer by (r / R)^2 far
+    from it, and are self-similar where r0 exceeds R.
 
     Args:
         key: see stepped_edges.
         grid: OccupancyGrid, contracted.
         rays: Rays [...].
-        t_step: [...] in t, the step where space is plain.
+        t_step: [...] in t, the step where space is not contracted.
         steps_in_half_side: a number, half the side of the inner half over the step.
 
     Returns:
@@ -86,6 +87,6 @@ def samples_in_contracted_space(
 
 
 def _whole_words(count):
-    """Rounds up to whole words of 32, as render_packed keeps a bit for each sample and padding takes longer."""
+    """Rounds up to a multiple of 32, as render_packed stores one bit per sample in words and would have to pad."""
     count = math.ceil(count)
     return count + -count % 32

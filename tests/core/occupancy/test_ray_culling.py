@@ -83,6 +83,7 @@ def test_rays_that_are_not_selected_are_not_rendered(fraction):
     assert sorted(origins) == sorted(np.asarray(rays.origins)[np.asarray(selected)].tolist())
 
 
+@pytest.mark.slow
 def test_render_background_is_the_rendering_of_an_empty_scene():
     rays, background = random_rays(0, SHAPE), jnp.array([0.1, 0.2, 0.3])
     empty = lambda x, viewdirs: (jnp.zeros(x.shape[:-1]), x)  # noqa: E731
