@@ -1,7 +1,7 @@
 """Every field of a run's config, with its unit and meaning. The other files here change fields of this one.
 
-A field that is "auto" is inferred from the dataset or the device when a run starts, logged with its reason and
-saved to the workdir.
+A field that is "auto" is inferred when a run starts and logged with its reason. What depends on the dataset is saved to
+the workdir; what depends on the device (microbatch_size, chunk, max_samples) is inferred again at every start.
 """
 
 from ml_collections import ConfigDict
