@@ -81,6 +81,7 @@ def test_a_cell_holds_what_contract_puts_there():
     np.testing.assert_array_equal(found[sure], valid[tuple(index.T)][sure])
 
 
+@pytest.mark.slow
 def test_samples_reach_from_near_to_far_and_grow_only_outside():
     rays, step = some_rays(), 0.01
     samples = march_rays(None, a_grid(), rays, step_size=step, cell=CELL)
@@ -119,6 +120,7 @@ def test_near_and_far_are_kept():
     np.testing.assert_allclose(np.asarray(samples.delta).sum(axis=-1), 0.6, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_packed_equals_dense_when_all_is_occupied():
     rays = some_rays(near=0.3)
 

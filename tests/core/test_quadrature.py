@@ -114,6 +114,7 @@ def largest(got, expected):
     return [np.abs(getattr(got, part) - getattr(expected, part)).max() for part in parts]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ORDERS)
 @pytest.mark.parametrize("name", SMOOTH)
 def test_order_of_colour_opacity_and_depth(name, rule):

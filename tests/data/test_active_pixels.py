@@ -94,6 +94,7 @@ def test_a_box_that_no_ray_hits_is_an_error(views):
         active_region(views, a_schedule(box=((50, 50, 50), (51, 51, 51))), use_alpha=False)
 
 
+@pytest.mark.slow
 def test_a_region_is_cached_until_something_that_it_depends_on_changes(views, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(active_pixels, "_SLOW", 0.0)

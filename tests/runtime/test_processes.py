@@ -48,6 +48,7 @@ def last_state(folder):
     return jax.device_get(Checkpoints(folder).load(two_hosts.STEPS, like))
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_with_the_same_devices(together, tmp_path):
     folder, said = together
     experiment = two_hosts.toy_experiment()
@@ -65,6 +66,7 @@ def test_two_processes_train_as_one_with_the_same_devices(together, tmp_path):
             assert row[name] == pytest.approx(other[name], rel=1e-5), name
 
 
+@pytest.mark.slow
 def test_first_process_prints_and_all_have_the_same_state(together):
     folder, (first, second) = together
     assert "device        4 x cpu (cpu), in 2 processes" in first and "6/6" in first
