@@ -6,10 +6,9 @@ import socket
 import subprocess
 import sys
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))  # for configs, wherever pytest was started
+from jaxnerf.configs import smoke
 
-from jaxnerf.configs import smoke  # noqa: E402
+ROOT = pathlib.Path(__file__).resolve().parent.parent
 
 SMOKE_FLAGS = ("--config=configs/smoke.py", "--config.train.save_every=5")
 

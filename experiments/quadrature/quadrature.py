@@ -75,7 +75,7 @@ MEDIA = {
 
 
 def main(argv: list[str]) -> None:
-    """Measures, unless told not to, and reports everything that is there."""
+    """Measures, except with --report_only, and reports all measurements in the folder."""
     del argv
     out = pathlib.Path(FLAGS.out)
     print(common.describe_machine())

@@ -27,7 +27,7 @@ from jaxnerf.training import metric_log
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the page.", required=True)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an existing page.")
-_VIEWS = 3  # of each run in the pictures
+_VIEWS = 3  # of each run in the contact sheet
 _HEIGHT = 128  # px of an image there
 
 
@@ -57,7 +57,7 @@ def main(argv: list[str]) -> None:
 
 
 def write_report(folders: list[str], out: pathlib.Path, *, overwrite: bool = False) -> None:
-    """Writes report.md and its pictures into a folder; each file appears whole or not at all, the page last.
+    """Writes report.md and its images into a folder; each file appears whole or not at all, the page last.
 
     Raises:
         ValueError: if there is a page already, or no workdir can be read; names them.
@@ -137,7 +137,7 @@ def _page(runs, unread, plotted):
     """Returns the lines of the page."""
     lines = ["# Results", "", *common.markdown(table.HEADS, [row for run in runs for row in run.rows]), ""]
     lines += ["![PSNR over time](psnr.png)" if plotted else "No plot, which needs matplotlib.", ""]
-    lines += ["![Pictures](pictures.png)", ""]
+    lines += ["![Images](pictures.png)", ""]
     lines += [f"Rows: {', '.join(run.name for run in runs)}. Columns: truth and rendering of {_VIEWS} views.", ""]
     lines += ["## Protocol", ""]
     lines += [f"- {run.name}: {run.protocol}" for run in runs]

@@ -5,7 +5,7 @@
 
 Cameras stand on the embedded scene's spiral, each with a pose of its own. Images are rendered at --rendered px and
 enlarged, as the scene in closed form would take hours at full size; noise of a few levels makes them as hard to
-compress as photographs. There is no fine detail to learn, but everything else has the size of a real scene.
+compress like photos. There is no fine detail to learn, but everything else has the size of a real scene.
 """
 
 import argparse

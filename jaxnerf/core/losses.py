@@ -41,7 +41,8 @@ def distortion_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, 
 
     Returns:
         [B], at least 0. An empty ray has loss 0 and gradient 0; so has a ray whose near equals its far.
-        Samples of length 0 are ignored, whatever their t.
+        Samples of length 0 are ignored, whatever their t. Where near is 0 and far is infinite, disparity has no
+        upper end: positions below t = 1 then count as t = 1.
 
     Raises:
         ValueError: if the last rendering carries no samples.

@@ -185,7 +185,7 @@ def check_same(what: str, *values: Any) -> None:
     found = multihost_utils.process_allgather(digest)
     others = [index for index, value in enumerate(found) if value != found[0]]
     if others:
-        raise ValueError(f"processes {others} have another {what} than process 0; give all the same")
+        raise ValueError(f"processes {others} have a different {what} than process 0; give all processes the same")
 
 
 def run_on_first(action: Callable[[], Any], path: str | os.PathLike, seconds: float = 30.0) -> None:

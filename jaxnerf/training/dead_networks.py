@@ -29,7 +29,7 @@ def count_dead_steps(
     A network is dead when its rays have an error and no gradient reaches the layers that take the position.
     Then its density is 0 everywhere, as the input of a ReLU is negative everywhere (an empty image); or it is
     an opaque wall in front of the camera whose colour is saturated; or a layer of ReLUs is 0 everywhere, which
-    leaves the same fog at all positions. Adam's momentum can still revive it for a dozen steps; later nothing
+    leaves the same fog at all positions. Adam's momentum can still bring it back for a dozen steps; later nothing
     can. A batch without an error, as in an empty part of the scene, leaves the count unchanged.
 
     The gradient is a better criterion than opacity or density, and costs nothing: an image of one colour that

@@ -42,7 +42,7 @@ class MetricLog:
         if damaged:
             kept = self._path.with_name("metrics.jsonl.damaged")
             shutil.copyfile(self._path, kept)
-            lines = f"{len(damaged)} lines from line {damaged[0]} on that are no rows"
+            lines = f"{len(damaged)} lines from line {damaged[0]} on that are not rows"
             print(f"{self._path}: dropped {lines}; the file is kept as {kept.name}", file=sys.stderr)
         if cut:
             print(f"{self._path}: dropped an incomplete last line", file=sys.stderr)
@@ -73,7 +73,7 @@ def read_rows(workdir: str | os.PathLike) -> list[dict[str, Any]]:
 
 
 def _parse(path):
-    """Returns rows, the numbers of lines that are no rows, and whether the last line is incomplete."""
+    """Returns rows, the numbers of lines that are not rows, and whether the last line is incomplete."""
     *lines, last = path.read_bytes().split(b"\n") if path.exists() else [b""]
     found = [_parse_row(line) for line in lines]
     damaged = [number for number, row in enumerate(found, 1) if row is None]

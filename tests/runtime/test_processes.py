@@ -139,6 +139,6 @@ def test_difference_between_processes_is_an_error(monkeypatch):
     others = iter([[1, 0, 0], [0, 0, 0]])
     gather = lambda value: np.array(value, np.int64) + next(others)  # noqa: E731
     monkeypatch.setattr(processes.multihost_utils, "process_allgather", gather)
-    with pytest.raises(ValueError, match=r"processes \[1, 2\] have another scene than process 0"):
+    with pytest.raises(ValueError, match=r"processes \[1, 2\] have a different scene than process 0"):
         processes.check_same("scene", {"a": np.arange(3)}, "text")
     processes.check_same("scene", None)

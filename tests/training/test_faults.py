@@ -223,7 +223,7 @@ def test_damaged_rows_are_dropped_and_reported(tmp_path, capsys):
     log.close()
     said = capsys.readouterr().err.splitlines()
     assert said[0].endswith(
-        "dropped 6 lines from line 2 on that are no rows; the file is kept as metrics.jsonl.damaged"
+        "dropped 6 lines from line 2 on that are not rows; the file is kept as metrics.jsonl.damaged"
     )
     assert said[1].endswith("metrics.jsonl: dropped an incomplete last line") and len(said) == 2
     assert (tmp_path / "metrics.jsonl.damaged").read_bytes() == content
