@@ -32,6 +32,7 @@ test-extra: $(BIN)/.dev
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/device_matrix.py runs/extra/device_matrix
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/kill_many.py --kills=20 --seed=1 --out=runs/extra/kill_many
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/cameras_from_images.py runs/extra/cameras
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .

@@ -46,7 +46,8 @@ def get_config():
                 "size": 100,  # px, side of the embedded scene's images
                 "finish": "usual",  # surfaces of the embedded scene: "usual", "matt" (no view dependence), "shiny"
                 # Distances along the camera's axis in the file's units. 0: each image has its own, from the dataset.
-                "near": 0.0,
+                # near "auto": 0, but a small distance from the camera where the box holds all of space.
+                "near": auto(float),
                 "far": 0.0,
                 # The colour behind alpha and behind the scene: "white", "black", "none" or "auto".
                 "background": "white",
@@ -95,14 +96,35 @@ def get_config():
                 # Size of the sample buffer in training, divided by the number of rays. Rays that do not fit are
                 # dropped and counted.
                 "pool_samples_per_ray": 10.0,
-                "long_steps_until": 300,  # training step before which step_size is three times as large
+                # While not all samples fit, the rays with most samples take longer steps, but keep this many; 0: off.
+                "min_samples_per_ray": 8.0,
                 "max_optical_depth": 6.0,  # training skips samples behind it, as estimated by the grid; 0: off
                 "occlusion_start_step": 400,  # training step from which max_optical_depth applies
+                # World units; the gradients of samples that are closer to the camera are reduced; 0: off. Otherwise
+                # fog forms in front of the cameras (arXiv:2305.02756).
+                "near_gradient_distance": auto(float),
+                "min_views": auto(int),  # training views that must see a cell; other cells are empty; 0: no limit
             },
             # Weight of each loss; 0: off. A weight may be a schedule ((step, weight), ...), linear between its points.
             "losses": {
                 "mse": schedule(1.0),
                 "distortion": schedule(0.0),  # arXiv:2111.12077, Eq. 15
+                # Depth of the dataset's sparse points, and interpolated between them (after arXiv:2107.02791); "auto":
+                # at the start of training where space is contracted and there are such points.
+                "depth": schedule("auto"),
+                "opaque": schedule(0.0),  # squared transmittance of rays where the image is opaque
+                # Regularizers of the hash grid: mean square of each level's entries (arXiv:2304.06706), and mean
+                # squared difference of neighbouring vertices in the levels that are not hashed.
+                "hash_decay": schedule(0.0),
+                "total_variation": schedule(0.0),
+            },
+            "cameras": {  # parameters of the training images, trained with the networks
+                "exposure": False,  # a gain per image and colour channel; renderings show the scene without it
+                "exposure_lr": 1e-2,  # initial learning rate; it decays as that of the networks
+                "refine": False,  # corrections of each pose and, common to all images, of the focal length
+                "refine_lr": 5e-4,  # as exposure_lr; radians, fractions of the cameras' spread and of the focal length
+                "refine_start_step": 300,  # training step before which cameras do not move
+                "num_images": auto(int),  # of the split "train"
             },
             "train": {
                 "batch_size": 1024,  # rays per step, over all devices
@@ -110,7 +132,9 @@ def get_config():
                 "batching": "all_images",  # "all_images", or "single_image": each step draws its rays from one view
                 "parallel": "auto",  # "jit", "sharded", "pmap"; "auto": jit on one device, otherwise sharded
                 "max_steps": auto(int, 200_000),
-                "max_seconds": 0.0,  # s of training, without compilation; 0: no limit
+                # s of training, without compilation; 0: no limit. The learning rate then reaches its end when the time
+                # does, so that the run depends on the clock.
+                "max_seconds": 0.0,
                 "lr_init": 5e-4,  # Adam
                 "lr_final": 5e-5,  # reached exponentially at lr_steps
                 "lr_steps": auto(int, 200_000),  # the run may end earlier or later; auto: max_steps
@@ -126,6 +150,9 @@ def get_config():
                 "averaging_power": 0.0,
                 "log_every": 100,  # steps
                 "save_every": 5000,  # steps
+                # s of training between previews, images of a held-out view in previews/; 0: none. It increases to a
+                # tenth of the time that has passed, and to ten times that which a preview takes.
+                "preview_every": 60.0,
                 "max_to_keep": 3,  # checkpoints
                 "max_nonfinite": 20,  # consecutive steps without a finite gradient, after which the run fails
                 "max_reinits": 10,  # reinitializations of dead networks before the run fails; 0: no check
@@ -138,6 +165,8 @@ def get_config():
                 "early_stop_eps": 1e-3,  # with a grid: transmittance below which a ray is terminated
                 "max_samples": auto(int),  # with a grid: size of the sample buffer
                 "at_end": False,  # evaluate the split when training ends
+                # s for scoring some training and some held-out views each when training ends; 0: none
+                "summary_seconds": 5.0,
             },
         }
     )

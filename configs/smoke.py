@@ -14,6 +14,6 @@ def get_config():
     config.sampling.num_coarse, config.sampling.num_fine = 8, 8
     train = config.train
     train.batch_size, train.max_steps, train.lr_steps = 64, 20, 20
-    train.log_every, train.save_every = 5, 10
-    config.eval.chunk = 250
+    train.log_every, train.save_every, train.preview_every = 5, 10, 0.0
+    config.eval.chunk, config.eval.summary_seconds = 250, 0.0
     return config

@@ -37,7 +37,7 @@ from jaxnerf.core.sampling import (
     stepped_edges,
     uniform_edges,
 )
-from jaxnerf.core.types import Batch, Camera, PackedSamples, Rays, Rendering, Samples, SceneFn, Views
+from jaxnerf.core.types import Batch, Camera, PackedSamples, Rays, Rendering, Samples, SceneFn, SparsePoints, Views
 from jaxnerf.core.volume_rendering import (
     composite,
     expected_depth,
@@ -99,7 +99,7 @@ __all__ = [
     # encodings, metrics, losses
     "positional_encoding", "mse", "psnr", "ssim", "round_to_8_bits", "distortion_loss",
     # data and fields
-    "Views", "Batch", "load_dataset", "draw_batch", "mlp_field", "hash_grid_field", "still_life",
+    "Views", "SparsePoints", "Batch", "load_dataset", "draw_batch", "mlp_field", "hash_grid_field", "still_life",
     # runs
     "load_scene", "restore_run", "TrainedRun", "train_and_evaluate",
     # registration

@@ -15,7 +15,7 @@ class Loss(NamedTuple):
     Attributes:
         function: see `register_loss`.
         on: "renderings" if the function is (outputs, batch) -> [B], "params" if it is (params) -> scalar.
-        needs: the optional fields of Batch that it reads.
+        needs: the optional fields of Batch that it reads; of a regularizer, "levels" or nothing.
     """
 
     function: Callable[..., Any]
@@ -89,7 +89,14 @@ SAMPLERS = Registry(
 LOSSES = Registry(
     "loss",
     "jaxnerf.register_loss",
-    {"mse": "jaxnerf.core.losses:MSE", "distortion": "jaxnerf.core.losses:DISTORTION"},
+    {
+        "mse": "jaxnerf.core.losses:MSE",
+        "distortion": "jaxnerf.core.losses:DISTORTION",
+        "depth": "jaxnerf.core.losses:DEPTH",
+        "opaque": "jaxnerf.core.losses:OPAQUE",
+        "hash_decay": "jaxnerf.core.losses:HASH_DECAY",
+        "total_variation": "jaxnerf.core.losses:TOTAL_VARIATION",
+    },
 )
 READERS = Registry(
     "dataset format",
@@ -139,10 +146,12 @@ def register_loss(
         name: of the loss.
         function: with on="renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
             of a step, with weights and samples; the last one is the final rendering. `batch` is a Batch.
-            With on="params" (params) -> scalar.
+            With on="params" (params) -> scalar, or (params, levels) -> scalar if it needs "levels", the
+            TableLevels of a hash grid.
         on: "renderings" or "params".
-        needs: the optional fields of Batch that the function reads, of "image_index", "pixel" and "alpha".
-            Fields that no loss needs are None.
+        needs: the optional fields of Batch that the function reads, of "image_index", "pixel", "alpha", "depth" and
+            "depth_weight". Fields that no loss needs are None. Where one needs a depth, some rays of each batch go
+            through observations of the dataset's sparse points, see `draw_batch`.
 
     Raises:
         ValueError: if another loss has that name, or on another value of `on`.

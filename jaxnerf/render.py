@@ -25,14 +25,15 @@ _BAKE_OCCUPANCY = flags.DEFINE_bool(
 _PATH = flags.DEFINE_string(
     "path",
     None,
-    "turntable, spiral, ellipse, interpolate, or FILE.json. When it is not given, the program selects turntable "
-    "or spiral by the views.",
+    "turntable, arc, spiral, ellipse, interpolate, or FILE.json. When it is not given, the program selects the kind "
+    "that stays where the views' cameras are: a turntable only if they surround the object, otherwise an arc, or a "
+    "spiral if all look one way.",
 )
 _FRAMES = flags.DEFINE_integer(
     "frames",
     None,
-    "The number of frames. When it is not given, a turntable has 48, a spiral or ellipse 120, interpolate 6 for "
-    "each view.",
+    "The number of frames. When it is not given, a turntable has 48, an arc 96, a spiral or ellipse 120, interpolate "
+    "6 for each view.",
     lower_bound=1,
 )
 _CLOSED = flags.DEFINE_bool("closed", False, "Whether --path=interpolate returns to the first view.")

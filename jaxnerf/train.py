@@ -1,15 +1,25 @@
-"""Trains a run, or resumes it: jaxnerf-train --config=lego_fast --data_dir=DIR --workdir=DIR.
+"""Trains a run: jaxnerf-train --config=lego_fast --data_dir=DIR --workdir=DIR; jaxnerf-train --workdir=DIR resumes it.
 
 `python -m jaxnerf.train` is the same program. --config.train.batch_size=2048 sets a field of the config.
 """
 
+import os
 import sys
 
 from absl import flags
 
 from jaxnerf.runtime import cli
 
-_CONFIG = cli.define_config("The config of the run: a name, or the path of a file.", required=True)
+
+def _load_saved(path):
+    from jaxnerf.training.workdir import config_to_resume
+
+    return config_to_resume(os.path.dirname(path))
+
+
+_CONFIG = cli.define_config(
+    "The config of the run: a name, or the path of a file. When it is not given, the workdir's.", load_saved=_load_saved
+)
 _WORKDIR = flags.DEFINE_string(
     "workdir", None, "The run's folder. Training resumes if the folder holds a run.", required=True
 )
@@ -44,6 +54,11 @@ def main(argv):
     from jaxnerf.evaluation.evaluate import train_and_evaluate
     from jaxnerf.runtime import processes
 
+    if _CONFIG.value is None:
+        raise ValueError(
+            f"--workdir={_WORKDIR.value} holds no config.json, so there is no run to resume; give --config=NAME to "
+            "start one (--config=help lists the names), or correct --workdir"
+        )
     config = cli.use_data(_CONFIG.value, _DATA_DIR.value, _FORMAT.value)
     if _BATCH.value is not None:
         config.train.microbatch_size = _BATCH.value
@@ -61,6 +76,7 @@ def main(argv):
 
 def run():
     """Runs the program."""
+    cli.use_saved_config()
     cli.run(main, stopped="before it could save; the same command resumes from the last checkpoint, if there is one")
 
 

@@ -36,7 +36,6 @@ PACKED = {
     "occupancy.resolution": 16,
     "occupancy.update_every": 4,
     "occupancy.pool_samples_per_ray": 32,
-    "occupancy.long_steps_until": 3,
     "hash_grid.resolutions": (8, 16),
     "hash_grid.table_size": 2048,
     "hash_grid.width": 16,

@@ -63,7 +63,7 @@ SURFACE = {
     "register_reader": "name read | detect=None",
 }
 TYPES = ["Rays", "Samples", "PackedSamples", "Rendering", "Camera", "Views", "Batch", "OccupancyGrid", "SceneFn"]
-TYPES += ["TrainedRun"]
+TYPES += ["SparsePoints", "TrainedRun"]
 SOURCE = r"Eqs?\. ?\d|Section \d|Appendix|arXiv|\d{4} code|released codes?|\([A-Z][a-z]+ .*\d{4}"
 
 

@@ -1,7 +1,8 @@
 """Tests that imports follow the order of the packages, without cycles.
 
-core <- fields, models <- data <- training <- evaluation, interop, capture_check <- programs. runtime imports
-core only, and data and everything above may import it and the configs. Everything may import jaxnerf.registry.
+core <- fields, models <- data <- training <- evaluation, interop, capture_check, structure_from_motion <-
+programs. runtime imports core only, and data and everything above may import it and the configs. Everything may
+import jaxnerf.registry.
 """
 
 import ast
@@ -23,6 +24,7 @@ RANKS = {
     "evaluation": 4,
     "interop": 4,
     "capture_check": 4,
+    "structure_from_motion": 4,
     "exporters": 4,
     "viewer": 4,
     "programs": 5,

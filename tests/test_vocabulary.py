@@ -99,7 +99,6 @@ NAMES = {
 # Keys of a config that have been replaced; elsewhere these names may have another meaning.
 CONFIG_KEYS = {
     "features": "hash_grid",
-    "fog_until": "long_steps_until",
     "keep": "max_to_keep",
     "masks": "use_alpha",
     "samples": "sample_multiplier",
@@ -111,7 +110,13 @@ CONFIG_KEYS = {
 EXCEPTIONS = {
     "grad_ema": "a key in checkpoints of other projects",
     "macro_block_size": "an option of ffmpeg",
+    "make_room": "the embedded scene fields/room.py",
+    "score_room": "the embedded scene fields/room.py",
+    "test_room": "the embedded scene fields/room.py",
 }
+
+# Whole names that are allowed, whatever the lists above hold.
+WHOLE_EXCEPTIONS = {"room": "the embedded scene fields/room.py"}
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -150,6 +155,8 @@ def _is_text(node):
 
 def complaint(name):
     """Returns what a name should use instead, or None where it uses the vocabulary."""
+    if name in WHOLE_EXCEPTIONS:
+        return None
     parts = f"_{'_'.join(parts_of(name))}_"
     for known in EXCEPTIONS:
         parts = parts.replace(f"_{known}_", "_")

@@ -28,7 +28,7 @@ _FOX = {"data.format": "transforms", "data.dir": "fox"}
 _NO_UPDATES = {
     "occupancy.update_every": 10**8,
     "occupancy.max_optical_depth": 0.0,
-    "occupancy.long_steps_until": 0,
+    "occupancy.min_samples_per_ray": 0.0,
     "occupancy.pool_samples_per_ray": 243.0,
     "train.batch_size": 43,
 }

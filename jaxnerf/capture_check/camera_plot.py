@@ -13,12 +13,12 @@ from jaxnerf.capture_check.report import Report
 from jaxnerf.core.types import Camera
 from jaxnerf.runtime.atomic_files import partial_file
 
-CAMERA, FLAGGED, POINT = "#2060c0", "#e02020", "#9a9a9a"
+CAMERA, FLAGGED, POINT, PATH = "#2060c0", "#e02020", "#9a9a9a", "#20a040"
 _SOFTWARE = "jaxnerf-check"
 
 
 def plot_cameras(report: Report) -> Figure:
-    """Returns a figure of the cameras, those of findings in red, and of the points.
+    """Returns a figure of the cameras, those of findings in red, of the points, and of the path.
 
     If the images agree on no points, those of the dataset's own model are drawn.
     """
@@ -31,7 +31,8 @@ def plot_cameras(report: Report) -> Figure:
     frusta = np.stack([_frustum(frame.camera, pose, length) for frame, pose in zip(capture.frames, poses, strict=True)])
     # Outliers among the points do not shrink the rest.
     inner = np.percentile(points, [5, 95], axis=0) if len(points) else np.zeros((0, 3))
-    shown = np.concatenate([frusta.reshape(-1, 3), inner])
+    path = np.zeros((0, 3)) if report.path is None else report.path[:, :, 3]
+    shown = np.concatenate([frusta.reshape(-1, 3), inner, path])
     points = points[:: max(1, len(points) // 6000)]
     colours = [FLAGGED if index in flagged else CAMERA for index in range(len(poses))]
     figure = Figure(figsize=(13, 6.7), dpi=100, layout="constrained")
@@ -40,12 +41,14 @@ def plot_cameras(report: Report) -> Figure:
         view = np.stack([right, vertical], axis=-1)
         plot.scatter(*(points @ view).T, s=2, color=POINT, linewidths=0)
         plot.add_collection(LineCollection(frusta @ view, colors=colours, linewidths=0.8))
+        plot.plot(*(path @ view).T, color=PATH, linewidth=1.5)
         low, high = (shown @ view).min(axis=0), (shown @ view).max(axis=0)
         middle, reach = (low + high) / 2, 0.55 * max((high - low).max(), 1e-9)
         plot.set(xlim=middle[0] + [-reach, reach], ylim=middle[1] + [-reach, reach], aspect="equal", title=title)
         plot.set(xlabel=_name(right), ylabel=_name(vertical))
     text = f"{len(poses)} cameras (blue, open in viewing direction), {len(report.points)} points (grey)"
     text += f", {len(flagged)} cameras with findings (red)" if flagged else ""
+    text += ", the path of jaxnerf-render (green)" if len(path) else ""
     figure.suptitle(f"{capture.source}: {text}", fontsize="medium")
     return figure
 

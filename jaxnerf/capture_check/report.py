@@ -10,6 +10,8 @@ from jaxtyping import Float
 from jaxnerf.capture_check import cameras, depths, tracks
 from jaxnerf.capture_check import images as images_module
 from jaxnerf.capture_check.findings import Finding, percent
+from jaxnerf.data.geometry import path_poses
+from jaxnerf.data.geometry.path_poses import coverage
 from jaxnerf.data.geometry.poses import gaze_center
 from jaxnerf.data.geometry.world import looks_forward, poses_of
 from jaxnerf.data.images.load_images import split_indices
@@ -28,6 +30,7 @@ class Report(NamedTuple):
         findings: errors first.
         poses: [V, 3, 4], corrected where the axes are wrong.
         points: [N, 3], on which the images agree.
+        path: [M, 3, 4], the poses that jaxnerf-render selects; None: the cameras define no path.
     """
 
     capture: Capture
@@ -35,6 +38,7 @@ class Report(NamedTuple):
     findings: tuple[Finding, ...]
     poses: Float[np.ndarray, "V 3 4"]
     points: Float[np.ndarray, "N 3"]
+    path: Float[np.ndarray, "M 3 4"] | None = None
 
     @property
     def num_errors(self) -> int:
@@ -88,10 +92,11 @@ def inspect(
         Finding("warning", "skipped", note, "nothing skipped", "the files named, if this is not intended")
         for note in whole.notes
     ]
+    path, line = _path(whole)
     facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence)
-    facts.append(("near, far", _range(bounds, stated, depth)))
+    facts += [("near, far", _range(bounds, stated, depth)), ("path", line)]
     order = sorted(findings, key=lambda finding: finding.severity != "error")
-    return Report(capture, tuple(facts), tuple(order), evidence.poses, points)
+    return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path)
 
 
 def _subset(capture):
@@ -127,7 +132,8 @@ def _camera_facts(capture, evidence):
     middle = gaze_center(poses)
     distance = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
     up, tilt = _up_axis(poses)
-    around, low, high = _arcs(poses)
+    cover = coverage(poses)
+    low, high = cover.elevation.min(), cover.elevation.max()
     shown = evidence.tracks.shown
     seen = shown.sum() / max(len(shown), 1)
     handed = "right-handed" if np.linalg.det(poses[:, :, :3]).min() > 0 else "mirrored"
@@ -143,7 +149,11 @@ def _camera_facts(capture, evidence):
             f"{_view_direction(capture)}; {distance.min():.4g} to {distance.max():.4g} from "
             f"{np.round(middle, 3).tolist()}",
         ),
-        ("arcs", f"{around:.0f} of 360 degrees around up, at elevations of {low:.0f} to {high:.0f} degrees"),
+        (
+            "arcs",
+            f"{360 - np.degrees(cover.gap):.0f} of 360 degrees around up, at elevations of {np.degrees(low):.0f} to "
+            f"{np.degrees(high):.0f} degrees",
+        ),
         (
             "overlap",
             f"{len(shown)} corners are matched, each in {seen:.1f} of {1 + evidence.near.shape[1]} views; "
@@ -189,16 +199,15 @@ def _up_axis(poses):
     return f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}", float(angle)
 
 
-def _arcs(poses):
-    """Returns degrees: the arc of the cameras around the mean up, their lowest and their highest elevation.
-
-    The arc is the circle without its widest gap. All are seen from `gaze_center`.
-    """
-    up = _mean_up(poses)
-    away = poses[:, :, 3] - gaze_center(poses)
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-    elevation = np.degrees(np.arcsin(np.clip(away @ up, -1, 1)))
-    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    angle = np.sort(np.degrees(np.arctan2(away @ np.cross(up, first), away @ first)))
-    gap = np.diff(np.append(angle, angle[0] + 360)).max()
-    return 360 - float(gap), float(elevation.min()), float(elevation.max())
+def _path(capture):
+    """Returns the poses of the path that jaxnerf-render selects by the views of the split "train", and a line."""
+    frames = [capture.frames[index] for index in split_indices(capture, "train")]
+    poses = np.stack([frame.camera.to_world for frame in frames])
+    try:
+        kind, reason = path_poses.default_kind(poses)
+    except ValueError as error:
+        return None, str(error)
+    line = f"jaxnerf-render selects {kind}, as {reason}"
+    if kind != "interpolate":
+        return path_poses.make_poses(kind, poses), line
+    return path_poses.poses_through(poses[path_poses.natural_order([frame.name for frame in frames])])[0], line

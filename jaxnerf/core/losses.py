@@ -1,16 +1,19 @@
-"""Training losses: each maps the renderings of a step and its batch to one value per ray.
+"""Training losses: each maps the renderings of a step and its batch to one value per ray; and regularizers.
 
 `outputs` are all renderings of a step; the last one is the final rendering. The training step sums the losses with
-the weights of the config's `losses`, over the rays whose samples were all evaluated.
+the weights of the config's `losses`, over the rays whose samples were all evaluated. A regularizer maps the
+parameters of all networks to a number.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnerf.core.types import Batch, PackedSamples, Rendering, Samples, check_shapes
+from jaxnerf.core.types import Batch, PackedSamples, Rendering, Samples, TableLevel, check_shapes
 from jaxnerf.core.volume_rendering import exclusive_sum, running_sum
 from jaxnerf.registry import Loss
 
@@ -48,11 +51,7 @@ def distortion_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, 
         ValueError: if the last rendering carries no samples.
     """
     rendering, rays = outputs[-1], batch.rays
-    samples = rendering.samples
-    if samples is None or (rendering.weights is None and not isinstance(samples, PackedSamples)):
-        raise ValueError(
-            "distortion_loss: the rendering has no samples, expected those of a training step; do not drop them"
-        )
+    samples = _samples("distortion_loss", rendering)
     near, far = jnp.asarray(rays.near), jnp.asarray(rays.far)
     if isinstance(samples, PackedSamples):
         return _packed_distortion(samples, near, far)
@@ -114,5 +113,116 @@ def _fractions(t, delta, used, near, far, rule):
     return tuple(jnp.where(infinite, a, b) for a, b in zip(inverse, linear, strict=True))
 
 
+def depth_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
+    """Computes how far the last rendering's weights lie from the known depth D of each ray.
+
+        depth_weight * (1 - sum_k w_k 2 min(t_k, D) / (t_k + D))
+
+    This is the earth mover's distance between the distribution of where the ray ends, to which the transmitted
+    fraction contributes infinity, and the depth D, under the distance |t - D| / (t + D). As in DS-NeRF
+    (arXiv:2107.02791), the weights are supervised, not their mean, which matter in front of and behind a surface also
+    has. In place of DS-NeRF's KL divergence, whose gradient vanishes away from D and needs a known width, the gradient
+    pulls matter towards D from everywhere. The distance is relative, as the errors of triangulated depths are, and at
+    most 1, so that wrong depths have a bounded effect.
+
+    Args:
+        outputs: Renderings [B] with samples; those of a packed rendering may be PackedSamples.
+        batch: Batch [B] with depth in t and depth_weight. A depth <= 0 is far from all matter.
+
+    Returns:
+        [B] in [0, depth_weight]. It is 0 where depth_weight is 0, with gradient 0.
+
+    Raises:
+        ValueError: if the last rendering carries no samples.
+    """
+    rendering = outputs[-1]
+    samples = _samples("depth_loss", rendering)
+    depth, confidence = jnp.asarray(batch.depth), jnp.asarray(batch.depth_weight)
+    if isinstance(samples, PackedSamples):
+        flat, ray = depth.reshape(-1), samples.ray_index
+        nearness = jnp.where(samples.used, samples.weights, 0) * _nearness(samples.t, flat[ray])
+        reached = jax.ops.segment_sum(nearness, ray, flat.size, indices_are_sorted=True).reshape(depth.shape)
+    else:
+        check_shapes("depth_loss", weights=(rendering.weights, "... S"), t=(samples.t, "... S"), depth=(depth, "..."))
+        used = ~(samples.delta <= 0)
+        nearness = _nearness(jnp.where(used, samples.t, 0), depth[..., None])
+        reached = (jnp.where(used, rendering.weights, 0) * nearness).sum(axis=-1)
+    return jnp.where(confidence > 0, confidence * (1 - reached), 0)
+
+
+def _nearness(t, depth):
+    """Returns 1 - |t - depth| / (t + depth) for t >= 0; 0 where the depth is not positive."""
+    known = depth > 0
+    return jnp.where(known, 2 * jnp.minimum(t, depth) / jnp.where(known, t + depth, 1), 0)
+
+
+def opaque_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
+    """Computes the squared transmittance of the last rendering's rays, times the pixel's alpha.
+
+    In a dataset without alpha every ray ends somewhere, so none should be transparent. With alpha, this holds for
+    the opaque pixels. The square leaves rays alone that are almost opaque; a logarithm of the opacity would have an
+    unbounded gradient where space is still empty.
+
+    Args:
+        outputs: Renderings [B].
+        batch: Batch [B] with alpha.
+
+    Returns:
+        [B] in [0, 1].
+    """
+    return jnp.asarray(batch.alpha) * (1 - outputs[-1].opacity) ** 2
+
+
+def hash_decay(params: Mapping[str, Any], levels: Sequence[TableLevel]) -> Float[Array, ""]:
+    """Computes the mean over levels of the mean square of a level's table entries (arXiv:2304.06706, Section 3.2).
+
+    The mean of each level has the same weight, so an entry of a coarse level is pulled towards 0 more strongly than
+    one of a fine level, which fewer samples reach.
+
+    Args:
+        params: of all networks; the table is that of the final rendering's.
+        levels: of the table.
+    """
+    table = params["fine"]["table"]
+    each = [jnp.full(len(level.rows), 1 / len(level.rows)) for level in levels]
+    return jnp.concatenate(each) @ (table**2).mean(axis=-1) / len(levels)
+
+
+def total_variation(params: Mapping[str, Any], levels: Sequence[TableLevel]) -> Float[Array, ""]:
+    """Computes the mean squared difference of neighbouring vertices' features, summed over axes (arXiv:2112.05131).
+
+    Only levels with a row for each vertex count, with the same weight each; the neighbours in a hashed level share
+    their rows with vertices elsewhere. Such levels have at most table_size rows, so all of them are evaluated.
+
+    Args:
+        params: of all networks; the table is that of the final rendering's.
+        levels: of the table.
+
+    Returns:
+        A number; 0 if all levels are hashed.
+    """
+    table = params["fine"]["table"]
+    dense = [level for level in levels if len(level.rows) == math.prod(level.size)]
+    total = jnp.zeros(())
+    for level in dense:
+        vertices = table[level.rows.start : level.rows.stop].reshape(*level.size, -1)
+        total += sum((jnp.diff(vertices, axis=axis) ** 2).mean() for axis in range(3))
+    return total / max(len(dense), 1)
+
+
+def _samples(function, rendering):
+    """Returns a Rendering's samples; ValueError if it has none, or no weights for them."""
+    samples = rendering.samples
+    if samples is None or (rendering.weights is None and not isinstance(samples, PackedSamples)):
+        raise ValueError(
+            f"{function}: the rendering has no samples, expected those of a training step; do not drop them"
+        )
+    return samples
+
+
 MSE = Loss(mse_loss)
 DISTORTION = Loss(distortion_loss)
+DEPTH = Loss(depth_loss, needs=("depth", "depth_weight"))
+OPAQUE = Loss(opaque_loss, needs=("alpha",))
+HASH_DECAY = Loss(hash_decay, on="params", needs=("levels",))
+TOTAL_VARIATION = Loss(total_variation, on="params", needs=("levels",))

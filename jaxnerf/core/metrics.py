@@ -116,6 +116,39 @@ def ssim(a: Num[ArrayLike, "*batch H W C"], b: Num[ArrayLike, "*batch H W C"]) -
     return (luminance * structure).mean(axis=(-3, -2, -1))
 
 
+def align_colors(
+    image: Num[ArrayLike, "H W C"], target: Num[ArrayLike, "H W C"], *, mask: Bool[ArrayLike, "H W"] | None = None
+) -> Float[Array, "H W C"]:
+    """Multiplies each channel of an image by the gain that brings it closest to another image, by least squares.
+
+        gain = sum(image * target) / sum(image^2)
+
+    This removes a difference in exposure and white balance. It adds no contrast, as a matrix and an offset would do:
+    these also hide fog and blur.
+
+    Args:
+        image: [H, W, C] in [0, 1].
+        target: [H, W, C] in [0, 1].
+        mask: [H, W] bool, the pixels that determine the gains; all when None.
+
+    Returns:
+        [H, W, C], clipped to [0, 1]. A channel that is 0 in all these pixels keeps its colours. NaN stays NaN.
+
+    Raises:
+        ValueError: on other shapes.
+    """
+    image, target = at_least_float32(image, target)
+    check_shapes("align_colors", image=(image, "H W C"), target=(target, "H W C"))
+    if mask is None:
+        kept = image
+    else:
+        check_shapes("align_colors", image=(image, "H W C"), mask=(mask, "H W"))
+        kept = jnp.where(jnp.asarray(mask)[..., None], image, 0)
+    squares, products = (values.sum(axis=(0, 1), keepdims=True) for values in (kept**2, kept * target))
+    gains = jnp.where(squares == 0, 1, products / jnp.where(squares == 0, 1, squares))
+    return jnp.clip(image * gains, 0, 1)
+
+
 def _windows(arrays, size, axis):
     """Returns the arrays shifted to each offset within a window, along an axis."""
     valid = arrays[0].shape[axis] - size + 1

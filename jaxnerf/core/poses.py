@@ -172,6 +172,50 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Float[Array, "3 4"]:
     return jnp.stack([right, jnp.cross(back, right), back, eye], axis=-1)
 
 
+def se3_exponential(twists: Float[ArrayLike, "*batch 6"]) -> Float[Array, "*batch 3 4"]:
+    """Computes the rigid motions exp(twist) of SE(3) (Murray, Li and Sastry 1994, Eq. 2.36).
+
+        R = 1 + a W + b W^2,  position = (1 + b W + c W^2) v,  W v = w x v,
+        a = sin(s) / s,  b = (1 - cos(s)) / s^2,  c = (s - sin(s)) / s^3,  s = |w|
+
+    Args:
+        twists: [..., 6], the rotation w in radians along its axis, and the velocity v in world units.
+
+    Returns:
+        [..., 3, 4] rotation and translation; the identity for a twist of 0. Values and all derivatives are exact
+        there, as a, b and c are power series in s^2 below s = 1.
+
+    Raises:
+        ValueError: on other shapes.
+    """
+    twists = jnp.asarray(twists)
+    check_shapes("se3_exponential", twists=(twists, "... 6"))
+    turn, velocity = twists[..., :3], twists[..., 3:]
+    square = (turn**2).sum(axis=-1)[..., None]
+    is_small = square < 1
+    small, large = jnp.where(is_small, square, 0), jnp.where(is_small, 1, square)
+    angle = jnp.sqrt(large)
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    a = jnp.where(is_small, _alternating(small, 1), sine / angle)
+    b = jnp.where(is_small, _alternating(small, 2), (1 - cosine) / large)
+    c = jnp.where(is_small, _alternating(small, 3), (angle - sine) / (angle * large))
+
+    def apply(first, second, vector):
+        once = jnp.cross(turn, vector)
+        return vector + first * once + second * jnp.cross(turn, once)
+
+    columns = [apply(a, b, jnp.broadcast_to(axis, turn.shape)) for axis in jnp.eye(3, dtype=turn.dtype)]
+    return jnp.stack([*columns, apply(b, c, velocity)], axis=-1)
+
+
+def _alternating(square, first):
+    """Computes the series 1 / n! - x / (n + 2)! + x^2 / (n + 4)! - ..., n = first, of x in [0, 1] in float32."""
+    total = jnp.zeros_like(square)
+    for power in reversed(range(5)):
+        total = 1 / math.factorial(first + 2 * power) - square * total
+    return total
+
+
 def _neighbours(num_frames, poses, closed):
     """Returns the four poses [N, 3, 4] around each frame, and its position [N, 1] between the middle two."""
     count = len(poses)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeAlias, TypeVar, dataclass_transform
+from typing import NamedTuple, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -156,6 +156,40 @@ class Camera:
     width: int | None = None
 
 
+@pytree()
+class SparsePoints:
+    """Points on surfaces, as structure from motion finds them, and their observations: where the views show them.
+
+    Attributes:
+        positions: [N, 3] world units.
+        view: [M] index of an observation's view, ascending.
+        point: [M] index of its point.
+        pixel: [M, 2] px, (x, y) from the image's top left corner; inside the image.
+        confidence: [M] in [0, 1]; None: not known, see `confident_observations`.
+        between: [V, H, W, 2] inverse depth and its confidence between the observations, at every fourth pixel of each
+            view, see `interpolated_depths`; None: not computed.
+    """
+
+    positions: Float[Array, "N 3"]
+    view: Int[Array, " M"]
+    point: Int[Array, " M"]
+    pixel: Float[Array, "M 2"]
+    confidence: Float[Array, " M"] | None = None
+    between: Float[Array, "V H W 2"] | None = None
+
+
+class TableLevel(NamedTuple):
+    """A level of the table of a hash grid.
+
+    Attributes:
+        size: vertices along x, y and z.
+        rows: range of the table's rows; fewer than vertices where the level is hashed.
+    """
+
+    size: tuple[int, int, int]
+    rows: range
+
+
 @pytree(static=("names", "background"))
 class Views:
     """Images with their cameras; the pixels of all images are in one array.
@@ -171,7 +205,10 @@ class Views:
         names: V file names without folder and extension.
         background: the colour that alpha is composited over; None for images without alpha.
         box: [2, 3] lower and upper corner in world units; the dataset states that space outside is empty.
+        free_until: [V] in t, the depth up to which the dataset states that nothing stands in front of each camera;
+            None: not known.
         to_file: [4, 4] maps this world to that of the dataset's files; None where they are the same.
+        sparse: points of the dataset's own model and their observations in these views; None without points.
     """
 
     pixels: UInt[Array, "P C"]
@@ -185,6 +222,8 @@ class Views:
     background: tuple[float, float, float] | None = None
     box: Float[Array, "2 3"] | None = None
     to_file: Float[Array, "4 4"] | None = None
+    free_until: Float[Array, " V"] | None = None
+    sparse: SparsePoints | None = None
 
 
 @pytree()

@@ -12,9 +12,10 @@ from jaxtyping import Bool, Int
 from jaxnerf.core.occupancy.grid import is_occupied
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import Views
+from jaxnerf.data.geometry.seen_cells import free_cells, seen_cells
 from jaxnerf.data.geometry.visual_hull import visual_hull
 from jaxnerf.data.ray_batches import PixelRuns, view_rays
-from jaxnerf.models.grid_schedule import GridSchedule
+from jaxnerf.models.grid_schedule import GridSchedule, InitialCells
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
@@ -24,9 +25,15 @@ _SLOW = 0.5  # seconds of work from which the result is cached
 
 
 def active_region(
-    views: Views, schedule: GridSchedule, *, use_alpha: bool, ndc: bool = False, pixel_offset: float = 0.5
-) -> tuple[Bool[np.ndarray, "X Y Z"], PixelRuns | None, Int[np.ndarray, " M"]]:
-    """Finds the valid cells of the grid, and the pixels whose rays may hit one of them.
+    views: Views,
+    schedule: GridSchedule,
+    *,
+    use_alpha: bool,
+    min_views: int = 0,
+    ndc: bool = False,
+    pixel_offset: float = 0.5,
+) -> tuple[InitialCells, PixelRuns | None, Int[np.ndarray, " M"]]:
+    """Finds what is known of the grid's cells, and the pixels whose rays may hit one of them.
 
     A result that takes a while to compute is kept in the user's cache.
 
@@ -34,28 +41,40 @@ def active_region(
         views: of the split that is trained on.
         schedule: of the box.
         use_alpha: whether cells outside the visual hull of the views' alpha are invalid.
+        min_views: number of views that must see a valid cell, see `seen_cells`; 0: the cameras tell nothing.
         ndc, pixel_offset: see `draw_batch`.
 
     Returns:
-        valid: which cells may contain matter.
+        cells: of the grid before training.
         active: the pixels to draw from, see `find_active_pixels`; None: all.
-        cells: flat indices of the valid cells, int32.
+        indices: flat, of the valid cells, int32.
     """
     options = {"use_alpha": use_alpha, "ndc": ndc, "pixel_offset": pixel_offset}
     runs = {field.name for field in dataclasses.fields(PixelRuns)}
 
     def make():
         valid = valid_cells(views, schedule, use_alpha=use_alpha)
+        if min_views:
+            valid &= seen_cells(views, schedule, min_views=min_views, ndc=ndc, pixel_offset=pixel_offset)
+        empty = np.zeros_like(valid)
+        if min_views and not ndc:
+            free, likely = free_cells(views, schedule, pixel_offset=pixel_offset)
+            valid &= ~free
+            empty = likely & valid & (views.sparse is not None)
         active = find_active_pixels(views, schedule, valid, **options)
-        return {"valid": valid} | ({} if active is None else vars(active))
+        return {"valid": valid, "empty": empty} | ({} if active is None else vars(active))
 
     def is_valid(arrays):
-        return arrays["valid"].shape == schedule.shape and set(arrays) in ({"valid"}, {"valid"} | runs)
+        return arrays["valid"].shape == schedule.shape and set(arrays) in (
+            {"valid", "empty"},
+            {"valid", "empty"} | runs,
+        )
 
-    name = f"active_{_fingerprint(views, schedule, options)}"
+    name = f"active_{_fingerprint(views, schedule, options | {'min_views': min_views})}"
     found = load_or_make(None, name, make, is_valid=is_valid, min_seconds=_SLOW)
-    valid = found.pop("valid")
-    return valid, PixelRuns(**found) if found else None, np.flatnonzero(valid).astype(np.int32)
+    valid, empty = found.pop("valid"), found.pop("empty")
+    cells = InitialCells(valid, empty if empty.any() else None)
+    return cells, PixelRuns(**found) if found else None, np.flatnonzero(valid).astype(np.int32)
 
 
 def valid_cells(views: Views, schedule: GridSchedule, *, use_alpha: bool) -> Bool[np.ndarray, "X Y Z"]:
@@ -168,7 +187,7 @@ def _fingerprint(views, schedule, options):
         (schedule.lower, schedule.upper, schedule.shape, schedule.step_size, schedule.contracted),
         (views.cameras.lens, views.pixels.shape, options),
     )
-    arrays = [views.offset, views.size, views.near, views.far, views.mask, views.box, views.cameras]
+    arrays = [views.offset, views.size, views.near, views.far, views.free_until, views.mask, views.box, views.cameras]
     if options["use_alpha"] and views.pixels.shape[-1] == 4:
         ends = np.append(views.offset[1:], len(views.pixels))
         arrays += [views.pixels[first:end, 3] for first, end in zip(views.offset, ends, strict=True)]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int
 from ml_collections import ConfigDict
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.types import SparsePoints, Views
 from jaxnerf.data import synthetic
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
@@ -93,7 +93,11 @@ def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
     # Reading the cameras takes a while, so they are only read to infer something from them.
     if any(is_auto(data[name]) for name in ("factor", "world", "background", "fingerprint")):
         capture = base.read_capture(folder, data.format)
-        lines += [f"skipped       {note}" for note in capture.notes]
+        lines += [f"note          {note}" for note in capture.notes]
+        masks = [frame.mask for frame in capture.frames if frame.mask is not None]
+        if masks:
+            where = f"{len(masks)} of {len(capture.frames)} images have one, such as {masks[0]}"
+            lines.append(f"masks         {where}: dark pixels are ignored in training and metrics")
         if is_auto(data.factor):
             factor, width = downscaled_copies.factor_for(capture, data.width)
             infer("factor", factor, f"factor        {factor}, of images {width} px wide")
@@ -109,26 +113,34 @@ def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
     return data, lines
 
 
-def load_split(data: ConfigDict, split: str) -> Views:
+def load_split(data: ConfigDict, split: str, *, max_views: int | None = None) -> Views:
     """Reads the Views of a split of the dataset that a config's data section describes.
 
     With `hold_out`, some views of "train" form the split "held_out" instead. With `num_views`, "train" has only
     that many of its views. Fields that are still "auto" are resolved first.
 
+    Args:
+        data: see configs/default.py.
+        split: of the dataset.
+        max_views: read at most so many of its views, spread evenly; None: all.
+
     Raises:
         ValueError: names the field or file, what was found, what is expected and what to do.
     """
     select = _selection(data, split)
+    if max_views is not None:
+        select = _at_most(max_views, select)
     source = "train" if split == "held_out" and data.hold_out else split
     if data.format == "synthetic":
         views = synthetic.load_synthetic(split=source, size=data.size, finish=data.finish)
         return views if select is None else select_views(views, select(len(views.offset)))
     data, _ = resolve(data)
     _check_world(data)
+    near = 0.0 if is_auto(data.near) else data.near  # it is resolved later, against the views
     folder = dataset_folder(data.dir)
     reading = {"split": source, "factor": data.factor, "background": background_of(data), "select": select}
     if data.format == "blender":
-        near, far = data.near or _BLENDER_NEAR, data.far or _BLENDER_FAR
+        near, far = near or _BLENDER_NEAR, data.far or _BLENDER_FAR
         return blender.load_blender(folder, near=near, far=far, **reading)
     capture = base.read_capture(folder, data.format)
     if data.fingerprint not in ("", found := fingerprint(capture)):
@@ -147,10 +159,12 @@ def load_split(data: ConfigDict, split: str) -> Views:
         capture, to_file = world.recenter(capture)
     elif data.world == "around":
         capture, to_file = world.center(capture)
-    capture = bounds.override_bounds(capture, data.near, data.far, to_file)
+    free_until = {frame.name: frame.bounds[0] for frame in capture.frames}
+    capture = bounds.override_bounds(capture, near, data.far, to_file)
     box = None if capture.box is None else np.float32(capture.box)
     views = load_images.load_capture(capture, **reading)
-    return dataclasses.replace(views, to_file=np.float32(to_file), box=box)
+    free_until = np.float32([free_until[name] for name in views.names])
+    return dataclasses.replace(views, to_file=np.float32(to_file), box=box, free_until=free_until)
 
 
 def dataset_folder(name: str) -> pathlib.Path:
@@ -201,7 +215,22 @@ def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -
         near=take(views.near),
         far=take(views.far),
         mask=None if views.mask is None else pick(views.mask),
+        free_until=None if views.free_until is None else take(views.free_until),
         names=tuple(views.names[index] for index in indices) if views.names else (),
+        sparse=None if views.sparse is None else _select_observations(views.sparse, indices),
+    )
+
+
+def _select_observations(sparse: SparsePoints, indices: np.ndarray) -> SparsePoints:
+    """Returns all points with their observations in the views of the given indices, in their order."""
+    first, ends = (np.searchsorted(sparse.view, indices, side=side) for side in ("left", "right"))
+    kept = np.concatenate([np.arange(*own) for own in zip(first, ends, strict=True)]).astype(int)
+    return dataclasses.replace(
+        sparse,
+        view=np.repeat(np.arange(len(indices), dtype=np.int32), ends - first),
+        point=np.asarray(sparse.point)[kept],
+        pixel=np.asarray(sparse.pixel)[kept],
+        confidence=None if sparse.confidence is None else np.asarray(sparse.confidence)[kept],
     )
 
 
@@ -231,6 +260,17 @@ def _selection(data: ConfigDict, split: str) -> Callable[[int], np.ndarray] | No
         return indices
 
     return select
+
+
+def _at_most(number, select):
+    """Returns the selection of at most that many of the views that another one selects."""
+
+    def select_some(count):
+        indices = np.arange(count) if select is None else select(count)
+        kept = min(number, len(indices))
+        return indices[np.arange(kept) * len(indices) // kept]
+
+    return select_some
 
 
 def _check_world(data):

@@ -13,6 +13,9 @@ from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Batch, Rays, Vector, Views, pytree
 
 BATCHINGS = ("all_images", "single_image")
+DEPTH_STRIDE = 4  # px between the places of `SparsePoints.between`
+DEPTH_FIELDS = ("depth", "depth_weight")  # of Batch; for these, some rays go through observations of sparse points
+_OBSERVED_EVERY = 16  # one ray in this many: most pixels show no sparse point
 
 
 @pytree(static=("shape",))
@@ -136,27 +139,61 @@ def draw_batch(
             view, as in the paper's synthetic runs.
         pixel_offset: px, position of a ray in its pixel, see `pixel_grid`.
         ndc: whether the rays are in normalised device coordinates.
-        extras: the optional fields of Batch to fill, of "image_index", "pixel" and "alpha".
+        extras: the optional fields of Batch to fill. For "depth" and "depth_weight", one ray in 16 goes through a
+            random observation of `views.sparse` instead, and has the colour of the pixel around it. The depth of the
+            others is interpolated, if `views.sparse.between` is known.
 
     Returns:
         One key per ray, for sampling along the rays; and the Batch [B].
 
     Raises:
-        ValueError: on an unknown batching.
+        ValueError: on an unknown batching, or if a depth is wanted and the views have no observations.
     """
-    keys, index = draw_pixels(seed, step, positions, views, active_pixels, batching=batching)
+    observed = not set(DEPTH_FIELDS).isdisjoint(extras)
+    keys, index, chosen = _draw(seed, step, positions, views, active_pixels, batching, observed)
     view = jnp.searchsorted(views.offset, index, side="right", method="compare_all") - 1
     place = index - views.offset[view]
     width = views.size[view, 1]
     pixels = jnp.stack([place % width, place // width], axis=-1) + pixel_offset
+    if observed:  # an observation is measured as the pixels are where their rays go through their centres
+        at = jnp.asarray(views.sparse.pixel)[chosen] + (pixel_offset - 0.5)
+        pixels = jnp.where((chosen >= 0)[:, None], at, pixels)
     rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
     stored = views.pixels
-    chosen = stored.rows[positions] if isinstance(stored, Gathered) else stored[index]
-    batch = Batch(rays=rays, rgb=pixel_colors(chosen, views.background))
+    colors = stored.rows[positions] if isinstance(stored, Gathered) else stored[index]
+    batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background))
     if not extras:
         return keys, batch
-    known = {"image_index": view.astype(jnp.int32), "pixel": pixels, "alpha": _alpha(chosen)}
+    known = {"image_index": view.astype(jnp.int32), "pixel": pixels, "alpha": _alpha(colors)}
+    if observed:
+        known |= _known_depth(views, view, chosen, place, rays, ndc)
     return keys, dataclasses.replace(batch, **{name: known[name] for name in extras})
+
+
+def _known_depth(views, view, chosen, place, rays, ndc):
+    """Returns the fields "depth" and "depth_weight" [B], of the chosen observation or else interpolated between them.
+
+    Both are 0 where nothing is known.
+    """
+    sparse = views.sparse
+    position, pose = (
+        jnp.asarray(values)[index]
+        for values, index in ((sparse.positions, jnp.asarray(sparse.point)[chosen]), (views.cameras.to_world, view))
+    )
+    depth = ((pose[:, :, 3] - position) * pose[:, :, 2]).sum(axis=-1)  # along the axis, as t of the rays
+    if ndc:
+        depth = 1 + 1 / position[:, 2]  # t of `ndc_rays`: 0 at z = -1, 1 at infinity
+    weight = 1.0 if sparse.confidence is None else jnp.asarray(sparse.confidence)[chosen]
+    if sparse.between is not None:
+        width = views.size[view, 1]
+        at = view, place // width // DEPTH_STRIDE, place % width // DEPTH_STRIDE
+        inverse, confidence = jnp.moveaxis(jnp.asarray(sparse.between)[at], -1, 0)
+        observed, sure = chosen >= 0, confidence > 0
+        depth = jnp.where(observed, depth, jnp.where(sure, 1 / jnp.where(sure, inverse, 1), 0))
+        weight = jnp.where(observed, weight, confidence)
+        chosen = jnp.where(sure, 0, chosen)
+    known = (chosen >= 0) & (depth > rays.near) & (depth < rays.far)
+    return {"depth": jnp.where(known, depth, 0), "depth_weight": jnp.where(known, weight, 0.0)}
 
 
 def _alpha(pixels):
@@ -174,8 +211,18 @@ def draw_pixels(
     active_pixels: PixelRuns | None = None,
     *,
     batching: str = "all_images",
+    extras: Iterable[str] = (),
 ) -> tuple[Key[Array, " B"], Int[Array, " B"]]:
     """Returns the keys of `draw_batch` and the ids of the pixels that its rays pass through."""
+    observed = not set(DEPTH_FIELDS).isdisjoint(extras)
+    return _draw(seed, step, positions, views, active_pixels, batching, observed)[:2]
+
+
+def _draw(seed, step, positions, views, active_pixels, batching, observed):
+    """Returns keys and ids, see `draw_pixels`; and the index [B] of each ray's observation, -1 for none.
+
+    The last value is None unless observed.
+    """
     if batching not in BATCHINGS:
         raise ValueError(f"draw_batch: batching is {batching!r}, expected one of {BATCHINGS}")
     key = step_key(seed, step)
@@ -190,7 +237,22 @@ def draw_pixels(
             first, last = active_pixels.count_below(jnp.stack([first, first + count]))
             count = last - first
     index = jax.vmap(lambda key: jax.random.randint(key, (), first, first + count))(pixel_keys)
-    return keys, index if active_pixels is None else active_pixels.ids(index)
+    index = index if active_pixels is None else active_pixels.ids(index)
+    if not observed:
+        return keys, index, None
+    if views.sparse is None or not views.sparse.view.shape[0]:
+        raise ValueError(
+            "draw_batch: the views have no observations of sparse points, expected those of a COLMAP model, for example"
+        )
+    sparse = jax.tree.map(jnp.asarray, views.sparse)
+    first, last = 0, sparse.view.size
+    if batching == "single_image":
+        first, last = jnp.searchsorted(sparse.view, jnp.stack([view, view + 1]))
+    chosen = jax.vmap(lambda key: jax.random.randint(key, (), first, jnp.maximum(last, first + 1)))(pixel_keys)
+    chosen = jnp.where((positions % _OBSERVED_EVERY == 0) & (last > first), chosen, -1)
+    view, (column, row) = sparse.view[chosen], jnp.floor(sparse.pixel[chosen]).astype(jnp.int32).T
+    there = jnp.asarray(views.offset)[view] + row * jnp.asarray(views.size)[view, 1] + column
+    return keys, jnp.where(chosen >= 0, there, index), chosen
 
 
 def step_key(seed: Integer[ArrayLike, ""], step: Int[ArrayLike, ""]) -> Key[Array, ""]:

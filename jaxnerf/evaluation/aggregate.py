@@ -121,6 +121,7 @@ def _results(run, workdir, views, variables, finished, origin):
         "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(variables[0])),
         "settings": render_settings(run),
+        "exposure": run.experiment.cameras is not None and run.experiment.cameras.exposure,
         **protocol.of_views(conventions, views, split=origin["split"]),
         "images": rows,
     }
@@ -128,7 +129,7 @@ def _results(run, workdir, views, variables, finished, origin):
 
 def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Returns the mean over the images of each metric."""
-    keys = ("psnr", "ssim", "psnr_float", "psnr_truncated")
+    keys = ("psnr", "ssim", "psnr_float", "psnr_truncated", "psnr_aligned", "ssim_aligned")
     return {key: float(np.mean([row[key] for row in rows])) for key in keys}
 
 

@@ -13,15 +13,14 @@ import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from ml_collections import ConfigDict
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Views
-from jaxnerf.data.ray_batches import pixel_colors
 from jaxnerf.evaluation import aggregate, output_images
-from jaxnerf.evaluation.metrics import image_metrics
-from jaxnerf.evaluation.restore import TrainedRun, newest_step, render_settings, restore_run
+from jaxnerf.evaluation.metrics import image_metrics, pixel_mask, reference
+from jaxnerf.evaluation.previews import Previews
+from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
 from jaxnerf.runtime import atomic_files, processes, shards
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
@@ -47,19 +46,25 @@ def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views:
         ValueError: on bad input, when another process trains in the workdir, or when too many steps in a row
             were not finite.
     """
-    return train(config, workdir, views=views, at_end=_score_newest)
+    previews = Previews(workdir)
+
+    def finish(views):
+        try:
+            if config.eval.at_end:
+                _score_newest(workdir)
+            processes.print_once(*previews.summary(views))
+        except KeyboardInterrupt:
+            processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
+            return False
+        return True
+
+    return train(config, workdir, views=views, preview=previews.write, at_end=finish)
 
 
 def _score_newest(workdir):
-    """Scores the last checkpoint unless it has been scored; returns False where that is interrupted."""
-    if (pathlib.Path(workdir) / "eval" / str(Checkpoints(workdir).steps()[-1])).exists():
-        return True
-    try:
+    """Scores the last checkpoint unless it has been scored."""
+    if not (pathlib.Path(workdir) / "eval" / str(Checkpoints(workdir).steps()[-1])).exists():
         evaluate(workdir, shard=(jax.process_index(), jax.process_count()))
-    except KeyboardInterrupt:
-        processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
-        return False
-    return True
 
 
 def evaluate(
@@ -111,6 +116,7 @@ def score_run(
     split = split or run.experiment.eval.split
     views = run.experiment.load_split(split) if views is None else views
     variables = run.variables(step)
+    views = refined_views(run, views, split, variables[0])
     partial, origin = target.with_name(target.name + ".tmp"), _origin(run, variables, views, split, step)
     if target.exists() and not overwrite:
         return aggregate.read(target, origin, _REMEDY)
@@ -170,23 +176,9 @@ def summary(results: dict[str, Any]) -> str:
     step = f"step {results['step']}: " if "step" in results else ""
     speed = f", {results['seconds_per_frame']:.2f} s per frame" if "seconds_per_frame" in results else ""
     metrics = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
+    if results.get("exposure"):
+        metrics += f" ({results['psnr_aligned']:.2f} dB, {results['ssim_aligned']:.4f} after colour alignment)"
     return f"{step}{metrics} over {results['views']} views{speed}"
-
-
-def reference(views: Views, index: int) -> jax.Array:
-    """Returns the colours [H, W, 3] of one of Views, over its background."""
-    height, width = (int(value) for value in views.size[index])
-    first = int(views.offset[index])
-    pixels = jnp.asarray(views.pixels[first : first + height * width])
-    return pixel_colors(pixels, views.background).reshape(height, width, 3)
-
-
-def pixel_mask(views: Views, index: int) -> jax.Array | None:
-    """Returns [H, W] bool of one of Views: which pixels the metrics use; None where all."""
-    if views.mask is None:
-        return None
-    (height, width), first = views.size[index], int(views.offset[index])
-    return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
 
 
 def _score_views(run, render, views, folder, shard):

@@ -13,8 +13,7 @@ from ml_collections import ConfigDict
 from jaxnerf.data.images.image_files import read_image
 from jaxnerf.evaluation import protocol
 from jaxnerf.evaluation.aggregate import means
-from jaxnerf.evaluation.evaluate import pixel_mask, reference
-from jaxnerf.evaluation.metrics import image_metrics
+from jaxnerf.evaluation.metrics import image_metrics, pixel_mask, reference
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import build
 

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxnerf.core.metrics import decibels, mse, psnr, round_to_8_bits, ssim
+from jaxnerf.core.metrics import align_colors, decibels, mse, psnr, round_to_8_bits, ssim
+from jaxnerf.core.types import Views
+from jaxnerf.data.ray_batches import pixel_colors
 from jaxnerf.runtime import memory
 
 _SSIM_MARGIN = 10  # rows that a window of SSIM covers below its first
@@ -16,6 +18,9 @@ _SSIM_MARGIN = 10  # rows that a window of SSIM covers below its first
 def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> dict[str, float]:
     """Computes psnr, ssim, psnr_float and psnr_truncated; see `protocol.METRICS` for the rounding.
 
+    psnr_aligned and ssim_aligned are those of the image after `align_colors`: without differences in exposure and
+    white balance. They are no measure of the colours themselves.
+
     Args:
         image, truth: [H, W, 3] in [0, 1].
         mask: [H, W] bool, the pixels that PSNR uses; None: all. SSIM has windows, so it sees the truth at the
@@ -23,16 +28,37 @@ def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
     """
     image, truth = jnp.asarray(image), jnp.asarray(truth)
     height, width = image.shape[:2]
+    aligned = jax.jit(align_colors)(image, truth, mask=mask)
 
     def attempt(rows):
-        if rows == height:
-            _check_memory(height, width, mask is None)
-            return _whole(image, truth, mask)
-        return _in_strips(image, truth, mask, rows)
+        def measure(image):
+            if rows == height:
+                _check_memory(height, width, mask is None)
+                return _whole(image, truth, mask)
+            return _in_strips(image, truth, mask, rows)
+
+        found, with_alignment = measure(image), measure(aligned)
+        return {**found, **{f"{name}_aligned": with_alignment[name] for name in ("psnr", "ssim")}}
 
     unit = f"rows of an image of {width} x {height} at once"
     found, _ = memory.back_off(attempt, height, cause="metrics", unit=unit)
     return {key: float(value) for key, value in found.items()}
+
+
+def reference(views: Views, index: int) -> jax.Array:
+    """Returns the colours [H, W, 3] of one of Views, over its background."""
+    height, width = (int(value) for value in views.size[index])
+    first = int(views.offset[index])
+    pixels = jnp.asarray(views.pixels[first : first + height * width])
+    return pixel_colors(pixels, views.background).reshape(height, width, 3)
+
+
+def pixel_mask(views: Views, index: int) -> jax.Array | None:
+    """Returns [H, W] bool of one of Views: which pixels the metrics use; None where all."""
+    if views.mask is None:
+        return None
+    (height, width), first = views.size[index], int(views.offset[index])
+    return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
 
 
 @functools.cache

@@ -17,6 +17,8 @@ METRICS = {
     "the rendering truncated as by the 2020 code, the dataset's image to nearest",
     "ssim": "11 x 11 Gaussian window of deviation 1.5 where it fits, k1 0.01, k2 0.03, population variances, "
     "mean over windows and RGB",
+    "alignment": "psnr_aligned, ssim_aligned: psnr and ssim after each channel of a rendering is multiplied by the "
+    "gain that brings it closest to the dataset's image, by least squares",
     "data_range": 1.0,
     "pixels": "all; PSNR excludes masked pixels, and SSIM sees the dataset's image there",
     "mean": "over the images",

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from ml_collections import ConfigDict
 
-from jaxnerf.core.types import Rays, Rendering, SceneFn
+from jaxnerf.core.types import Rays, Rendering, SceneFn, Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.runtime.config_fields import is_auto
@@ -111,6 +111,12 @@ def restore_run(
 def render_settings(run: TrainedRun) -> dict[str, Any]:
     """Returns the settings of the config's section `eval` that change what a run renders, by name."""
     return {name: getattr(run.experiment.eval, name) for name in _RENDER_SETTINGS}
+
+
+def refined_views(run: TrainedRun, views: Views, split: str, params: Any) -> Views:
+    """Returns Views of a split with the cameras that a run has refined; as they are where it has not."""
+    cameras = run.experiment.cameras
+    return views if cameras is None else cameras.refined_views(params, views, split)
 
 
 def newest_step(run: TrainedRun, workdir: str | os.PathLike, step: int | None = None) -> int:

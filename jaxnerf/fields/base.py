@@ -10,7 +10,7 @@ from flax import linen
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core import contraction
-from jaxnerf.core.types import Vector
+from jaxnerf.core.types import TableLevel, Vector
 from jaxnerf.registry import FIELDS
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
@@ -29,11 +29,16 @@ class Field(NamedTuple):
             [..., S, 3] in [0, 1]). A field may take `key` and `density_noise` as keywords, see `mlp_field`.
         input_layers: keys of params: the layers that receive the position; empty: all layers. A field is dead
             if no gradient reaches these layers; training then reinitializes it.
+        levels: of the parameter "table" of a hash grid, for regularizers; empty without one.
+        color_layers: keys of params: the first layers that serve colour alone; empty: not checked. A field is dead,
+            too, if no gradient reaches these layers.
     """
 
     init: Callable[[jax.Array], Any]
     apply: Callable[..., tuple[jax.Array, jax.Array]]
     input_layers: tuple[str, ...] = ()
+    levels: tuple[TableLevel, ...] = ()
+    color_layers: tuple[str, ...] = ()
 
 
 def make_field(name: str, options: Mapping[str, Any], box: Box | None) -> Field:

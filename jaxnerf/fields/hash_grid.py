@@ -10,7 +10,7 @@ import numpy as np
 from flax import linen
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxnerf.core.types import Vector, check_shapes
+from jaxnerf.core.types import TableLevel, Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network
 from jaxnerf.fields.mlp import Dense
 
@@ -18,6 +18,7 @@ _glorot = linen.initializers.glorot_uniform()
 
 _PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, Eq. 4
 _LARGEST_EXPONENT = 15.0  # a density that is opaque within 1e-5 world units
+_MIN_SLOPE = 1e-3  # the sigmoid has it where its value is 0.001 from 0 or 1: a quarter of an 8-bit level
 
 
 def hash_grid_field(**options: Any) -> Field:
@@ -48,9 +49,10 @@ def hash_grid_field(**options: Any) -> Field:
 
     def apply(params, x, viewdirs):
         density, rgb = apply_network(network, params, x, viewdirs)
-        return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), jax.nn.sigmoid(rgb)
+        return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), color_activation(rgb)
 
-    return Field(init, apply)
+    color_layers = ("view_0",) if network.view_depth else ("rgb",)
+    return Field(init, apply, levels=network.levels(), color_layers=color_layers)
 
 
 def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
@@ -62,6 +64,31 @@ def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
             "config against a dataset, or set them"
         )
     return hash_grid_field(lower=box[0], upper=box[1], **options)
+
+
+@jax.custom_jvp
+def color_activation(logits: Float[ArrayLike, "*shape"]) -> Float[Array, "*shape"]:
+    """Computes the sigmoid, with a derivative of at least 0.001.
+
+    The logits of a scene that is mostly white or black grow within some hundred steps until the sigmoid is exactly
+    1 or 0 in float32, also where the scene is not white or black. Its own derivative s (1 - s) is then 0, and colour
+    is never learnt. The lower bound changes neither the values nor the sign of a derivative, and applies only where
+    the value is within 0.001 of 0 or 1. A wider range, (1 + 2 e) s - e (arXiv:2103.13415), does not help: its
+    derivative vanishes, too.
+
+    Args:
+        logits: [...].
+
+    Returns:
+        [...] in [0, 1].
+    """
+    return jax.nn.sigmoid(logits)
+
+
+@color_activation.defjvp
+def _color_activation_jvp(primals, tangents):
+    value = color_activation(*primals)
+    return value, jnp.maximum(value * (1 - value), _MIN_SLOPE) * tangents[0]
 
 
 class HashGrid(linen.Module):
@@ -92,6 +119,14 @@ class HashGrid(linen.Module):
     use_viewdirs: bool = True
     feature_scale: float = 4.0
 
+    @linen.nowrap
+    def levels(self) -> tuple[TableLevel, ...]:
+        """Returns the levels of the table."""
+        side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
+        sizes = [vertices(side, resolution) for resolution in self.resolutions]
+        ends = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes]).tolist()
+        return tuple(TableLevel(size, range(*rows)) for size, rows in zip(sizes, itertools.pairwise(ends), strict=True))
+
     @linen.compact
     def __call__(
         self, x: Float[ArrayLike, "*batch samples 3"], viewdirs: Float[ArrayLike, "*batch #samples 3"]
@@ -100,15 +135,11 @@ class HashGrid(linen.Module):
         shape = x.shape[:-1]
         side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
         place = [(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)]
-        sizes = [vertices(side, resolution) for resolution in self.resolutions]
-        first = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes])
+        levels = self.levels()
         # All levels share a table, so there is only one gradient to clear and one array to update.
-        table = self.param("table", _near_zero, (int(first[-1]), self.features_per_level))
-        levels = [
-            interpolate(table, place, size, rows=range(*ends))
-            for size, ends in zip(sizes, np.stack([first[:-1], first[1:]], -1).tolist(), strict=True)
-        ]
-        features = self.feature_scale * jnp.concatenate(levels, axis=-1)
+        table = self.param("table", _near_zero, (levels[-1].rows.stop, self.features_per_level))
+        features = [interpolate(table, place, level.size, rows=level.rows) for level in levels]
+        features = self.feature_scale * jnp.concatenate(features, axis=-1)
         # The table yields one row per sample, but small layers are faster with features first.
         kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
         bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))

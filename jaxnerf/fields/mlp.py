@@ -49,7 +49,8 @@ def mlp_field(**options: Any) -> Field:
         return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
 
     layers = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
-    return Field(init, apply, tuple(f"trunk_{layer}" for layer in layers))
+    color_layers = ("view",) if network.use_viewdirs else ("rgb",)
+    return Field(init, apply, tuple(f"trunk_{layer}" for layer in layers), color_layers=color_layers)
 
 
 def from_options(options: Mapping[str, Any], box: Box | None) -> Field:

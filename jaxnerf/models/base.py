@@ -22,7 +22,7 @@ class Model(NamedTuple):
         scene: (params, grid) -> the scene of the final rendering.
         samples_per_ray: approximate number of evaluations of the largest network per ray in training.
         grid_schedule: how the occupancy grid is created and updated; None without one.
-        input_layers: by network, see `Field`.
+        input_layers, color_layers: by network, see `Field`.
         cull: (grid, Rays [...]) -> bool [...], which rays may hit an occupied cell, and the Rendering [...]
             of those that cannot; None where all may.
     """
@@ -35,6 +35,7 @@ class Model(NamedTuple):
     grid_schedule: GridSchedule | None = None
     input_layers: Mapping[str, tuple[str, ...]] = {}
     cull: Callable[..., tuple] | None = None
+    color_layers: Mapping[str, tuple[str, ...]] = {}
 
 
 class SamplerContext(NamedTuple):

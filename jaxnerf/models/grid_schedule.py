@@ -16,6 +16,19 @@ _CHUNK = 8160  # cells evaluated at once; their activations fit into a processor
 Corner = tuple[float, float, float]
 
 
+class InitialCells(NamedTuple):
+    """What is known of the cells of a grid before training.
+
+    Attributes:
+        valid: [X, Y, Z] bool, the cells that may hold matter.
+        empty: [X, Y, Z] bool, those that are likely to be empty: they become occupied once an update finds matter in
+            them; None: nothing is known.
+    """
+
+    valid: Any
+    empty: Any = None
+
+
 class GridSchedule(NamedTuple):
     """The box of a model with an occupancy grid, and how the grid is kept up to date.
 
@@ -24,7 +37,7 @@ class GridSchedule(NamedTuple):
         shape: cells along x, y and z.
         step_size: world units between samples.
         threshold: 1 / world unit, the density below which a cell is empty, or that of each cell [X, Y, Z].
-        create: valid [X, Y, Z] bool -> OccupancyGrid.
+        create: (valid, empty=None) -> OccupancyGrid, see InitialCells.
         update: (key, step, params, OccupancyGrid, cells [L] int32) -> OccupancyGrid.
         contracted: see OccupancyGrid.
     """
@@ -89,13 +102,14 @@ def make_grid_schedule(
     density = threshold / step_size
     empty_below = density / _stretches(shape) if contracted else density
 
-    def create(valid):
+    def create(valid, empty=None):
         # A cell starts at ten times the threshold, so about half a dozen updates empty it.
+        initial = 10 * density if empty is None else jnp.where(jnp.asarray(empty), 0, 10 * density)
         return create_grid(
             jnp.asarray(lower, jnp.float32),
             jnp.asarray(upper, jnp.float32),
             valid,
-            initial_density=10 * density,
+            initial_density=initial,
             contracted=contracted,
         )
 

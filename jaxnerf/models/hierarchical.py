@@ -102,4 +102,5 @@ def hierarchical_model(
         scene=scene,
         samples_per_ray=num_coarse + num_fine,
         input_layers={name: field.input_layers for name, field in fields.items()},
+        color_layers={name: field.color_layers for name, field in fields.items()},
     )

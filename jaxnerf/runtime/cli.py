@@ -65,15 +65,41 @@ def run(
     app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
 
 
-def define_config(help: str, *, required: bool = False) -> flags.FlagHolder:
-    """Defines --config, which takes the name or the path of a config file, followed by `:argument` or not."""
+def define_config(
+    help: str, *, required: bool = False, load_saved: Callable[[str], Any] | None = None
+) -> flags.FlagHolder:
+    """Defines --config, which takes the name or the path of a config file, followed by `:argument` or not.
+
+    Args:
+        help: what the config is for.
+        required: whether the flag must be given.
+        load_saved: path -> the ConfigDict in a config.json that a run has saved; None: such paths are not accepted.
+    """
     config = config_flags.DEFINE_config_file("config", None, f"{help} --config=help lists the names.")
     parser = flags.FLAGS["config"].parser
     load = parser.parse
-    parser.parse = lambda value: load(_list_configs() if value == "help" else config_path(value))
+
+    def parse(value):
+        if load_saved and value.endswith(".json"):
+            return load_saved(value).lock()
+        return load(_list_configs() if value == "help" else config_path(value))
+
+    parser.parse = parse
     if required:
         flags.mark_flag_as_required("config")
     return config
+
+
+def use_saved_config() -> None:
+    """Adds --config=<workdir>/config.json to the command line if it has --workdir and no --config."""
+    given = {}
+    for index, argument in enumerate(sys.argv[1:], 1):
+        name, equals, value = argument.lstrip("-").partition("=")
+        if argument.startswith("-"):
+            given[name] = value if equals else next(iter(sys.argv[index + 1 :]), "")
+    path = pathlib.Path(given.get("workdir", "")) / "config.json"
+    if "config" not in given and given.get("workdir") and path.exists():
+        sys.argv.insert(1, f"--config={path}")  # before the flags that set its fields
 
 
 def define_count(name: str, help: str) -> flags.FlagHolder:
@@ -162,6 +188,9 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         if not flags.FLAGS["verbosity"].present:
             logging.set_verbosity(logging.FATAL)  # orbax logs every file that it touches
         return rest
+    except flags.UnrecognizedFlagError as error:
+        hint = "; give --config=NAME, which has such fields" if error.flagname.startswith("config.") else ""
+        _leave(2, f"{error}{hint}")
     except AttributeError as error:
         _leave(2, f"the config has no such field ({error}); {CONFIGS / 'default.py'} lists all fields")
     except (

@@ -22,7 +22,7 @@ def auto(kind: type, value: Any = AUTO) -> FieldReference:
 
 
 def schedule(value: float | tuple) -> FieldReference:
-    """Declares a field that holds a number, or a schedule ((step, value), ...), linear between its points."""
+    """Declares a field that holds a number, a schedule ((step, value), ...), linear between its points, or "auto"."""
     return FieldReference(value, field_type=Schedule)
 
 
@@ -81,7 +81,9 @@ def _is_schedule(value):
     def is_point(point):
         return isinstance(point, tuple | list) and len(point) == 2 and all(map(is_number, point))
 
-    return is_number(value) or (isinstance(value, tuple | list) and value and all(map(is_point, value)))
+    return (
+        is_auto(value) or is_number(value) or (isinstance(value, tuple | list) and value and all(map(is_point, value)))
+    )
 
 
 Schedule = _Accepts("schedule", (), {"accepts": staticmethod(lambda value: bool(_is_schedule(value)))})
@@ -91,7 +93,7 @@ _AUTO_TYPES = {kind: _auto_type(kind) for kind in (bool, int, float, tuple)}
 class _ScheduleParser(_Literal):
     def __init__(self):
         super().__init__(Schedule, float)
-        self.syntactic_help = "a number, or ((step, value), ...)"
+        self.syntactic_help = "a number, ((step, value), ...), or auto"
 
 
 config_flags.register_flag_parser_for_type(Schedule, _ScheduleParser())

@@ -1,6 +1,7 @@
 """Resolves a config against a dataset: every "auto" becomes a value, and a line gives the reason."""
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,6 +23,8 @@ _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 _MAX_STATED_BOX = 3.0  # times the box of contraction; a stated box that is larger is no better than contraction
+_DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
+_NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
 
 # These depend on the device, so they are inferred at every start and stay "auto" in the workdir.
@@ -59,6 +62,7 @@ def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
     lines = lines + _resolve_sizes(config, views)
+    views = _resolve_near(config, views, lines)
     left = [name for name in auto_fields(config) if name not in DEVICE_FIELDS]
     if left:
         raise ValueError(f"{left[0]} is 'auto', which is not inferred for this field; set a value")
@@ -169,9 +173,40 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     infer(config.hash_grid, "resolutions", levels, line, used=config.field == "hash_grid")
     side = float(np.sqrt(np.prod(views.size, axis=1)).mean())
     steps = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5)
+    if "cameras" in config:  # older versions had no such section
+        infer(config.cameras, "num_images", len(views.size), "", used=False)
     infer(train, "max_steps", steps, f"training      {steps:,} steps, for images {side:.0f} px wide")
     infer(train, "lr_steps", train.max_steps, f"training      learning rate decays over {train.max_steps:,} steps")
     return lines
+
+
+def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:
+    """Fills what concerns the space in front of the cameras into a config; returns the views with their near.
+
+    In unbounded captures each image's own near follows from what it shows. No ray would then train the space between
+    a camera and its near, so that another camera could see fog there.
+    """
+    infer, section = _inferring(lines), config.occupancy
+    everywhere = config.sampler == "occupancy" and section.contracted
+    distance = float(np.median(_LookAt(views).distance)) if everywhere else 0.0
+    line = f"near space    gradients are reduced within {distance:.3g} of a camera"
+    infer(section, "near_gradient_distance", distance, line, used=everywhere)
+    line = "valid cells   those that a training view sees"
+    infer(section, "min_views", 1 if everywhere else 0, line, used=everywhere)
+    observed = everywhere and views.sparse is not None and len(views.sparse.view) > 0
+    count = len(views.sparse.view) if observed else 0
+    line = f"depth         {count:,} observations of sparse points guide the start of training"
+    infer(config.losses, "depth", _DEPTH_WEIGHT if observed else 0.0, line, used=observed)
+    if not is_auto(config.data.near):
+        return views
+    if not everywhere:
+        config.data.near = 0.0
+        return views
+    unit = 1.0 if views.to_file is None else float(np.cbrt(np.linalg.det(np.float64(views.to_file)[:3, :3])))
+    config.data.near = float(f"{_NEAR * distance * unit:.4g}")
+    near = np.float32(config.data.near / unit)
+    lines.append(f"near          {near:.3g} for all images, so that the space in front of each camera is trained")
+    return dataclasses.replace(views, near=np.full_like(views.near, near))
 
 
 class _LookAt:

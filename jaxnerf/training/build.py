@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -12,18 +12,22 @@ import numpy as np
 import optax
 from ml_collections import ConfigDict
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.types import TableLevel, Views
 from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
+from jaxnerf.data.geometry.free_space import interpolated_depths
+from jaxnerf.data.observations import check_observed, confident_observations
 from jaxnerf.fields.base import Field, contract_field, make_field
 from jaxnerf.models.base import Model, SamplerContext, make_model
 from jaxnerf.models.occupancy import bake_occupancy, schedule_from_section, view_options
-from jaxnerf.registry import LOSSES
+from jaxnerf.registry import LOSSES, Loss
 from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.training.camera_parameters import CameraParameters
 from jaxnerf.training.optimizer import make_optimizer
 from jaxnerf.training.step import StepLoss, TrainData
 
-_FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha")  # the optional fields that datasets provide
+# The optional fields that datasets provide.
+_FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIELDS)
 
 
 class Experiment(NamedTuple):
@@ -31,6 +35,7 @@ class Experiment(NamedTuple):
 
     Attributes:
         model: the config's field and sampler.
+        cameras: the parameters of the training images; None where the config has none.
         losses: those whose weight is not 0.
         optimizer: see `make_optimizer`.
         schedule: step -> learning rate.
@@ -39,7 +44,7 @@ class Experiment(NamedTuple):
         pixel_ids: (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes.
         view_rays: (Views, index, pixels) -> Rays.
         world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
-        prepare: Views -> (valid cells, or None without a grid; TrainData).
+        prepare: Views -> (InitialCells, or None without a grid; TrainData).
         seed: of everything random.
         pixel_offset: px, from a pixel's index to the point that its ray goes through.
         train, eval: the config's sections.
@@ -47,6 +52,7 @@ class Experiment(NamedTuple):
     """
 
     model: Model
+    cameras: CameraParameters | None
     losses: tuple[StepLoss, ...]
     optimizer: optax.GradientTransformation
     schedule: Callable[[int], float]
@@ -69,11 +75,15 @@ def build(config: ConfigDict) -> Experiment:
     Raises:
         ValueError: names the field that holds what cannot be built.
     """
-    model, losses = build_model(config), build_losses(dict(config.losses))
-    optimizer, schedule = make_optimizer(config.train)
+    model, losses = build_model(config), build_losses(dict(config.losses), functools.partial(_levels, config))
+    cameras = build_cameras(config)
+    optimizer, schedule = make_optimizer(config.train, None if cameras is None else config.cameras)
+    if cameras is not None:
+        model = cameras.added_to(model)
     options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
     batching = {"batching": config.train.batching}
-    extras = tuple(sorted({need for loss in losses for need in loss.needs}))
+    needs = [*losses, cameras] if cameras is not None else losses
+    extras = tuple(sorted({need for part in needs for need in part.needs}))
     if config.train.batching not in ray_batches.BATCHINGS:
         raise ValueError(f"train.batching is {config.train.batching!r}, expected one of {ray_batches.BATCHINGS}")
 
@@ -83,10 +93,13 @@ def build(config: ConfigDict) -> Experiment:
         )
 
     def pixel_ids(step, positions, data):
-        return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **batching)[1]
+        return ray_batches.draw_pixels(
+            data.seed, step, positions, data.views, data.active_pixels, extras=extras, **batching
+        )[1]
 
     return Experiment(
         model=model,
+        cameras=cameras,
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,
@@ -95,7 +108,7 @@ def build(config: ConfigDict) -> Experiment:
         pixel_ids=pixel_ids,
         view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
         world_depth=functools.partial(ray_batches.world_depth, ndc=config.data.ndc),
-        prepare=functools.partial(_prepare, config, model),
+        prepare=functools.partial(_prepare, config, model, extras),
         seed=config.seed,
         pixel_offset=config.data.pixel_offset,
         train=SimpleNamespace(**config.train),
@@ -109,17 +122,46 @@ def build_model(config: ConfigDict) -> Model:
     return make_model(config.sampler, _context(config))
 
 
-def build_losses(weights: Mapping[str, Any]) -> tuple[StepLoss, ...]:
+def build_cameras(config: ConfigDict) -> CameraParameters | None:
+    """Builds the parameters of the training images; None where none are trained, as in configs of older versions.
+
+    Raises:
+        ValueError: if the number of training images is unknown.
+    """
+    section = config.get("cameras", {})
+    if not (section.get("exposure") or section.get("refine")):
+        return None
+    if is_auto(section.num_images):
+        raise ValueError("cameras.num_images is 'auto'; resolve the config against a dataset, or set a number")
+    return CameraParameters(
+        num_images=section.num_images,
+        exposure=section.exposure,
+        refine=section.refine,
+        view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
+        background=dataset.background_of(config.data),
+    )
+
+
+def build_losses(
+    weights: Mapping[str, Any], levels: Callable[[], Sequence[TableLevel]] = tuple
+) -> tuple[StepLoss, ...]:
     """Builds the losses of the config's section; one whose weight is 0 is absent.
+
+    Args:
+        weights: of the losses, by name.
+        levels: called where a regularizer needs them; returns those of the field's table, see `Field`.
 
     Raises:
         ValueError: if no loss has a weight, a name is not registered, or a loss needs a field that no dataset provides.
     """
     losses = []
     for name, weight in weights.items():
-        if isinstance(weight, int | float) and weight == 0:
+        # "auto" is left in a config that was converted without its dataset.
+        if is_auto(weight) or (isinstance(weight, int | float) and weight == 0):
             continue
         loss = LOSSES.get(name)
+        if loss.on == "params" and "levels" in loss.needs:
+            loss = _of_levels(name, loss, levels())
         missing = [need for need in loss.needs if need not in _FILLED_BATCH_FIELDS]
         if missing:
             raise ValueError(
@@ -129,6 +171,25 @@ def build_losses(weights: Mapping[str, Any]) -> tuple[StepLoss, ...]:
     if not any(loss.on == "renderings" for loss in losses):
         raise ValueError("losses: no loss of the renderings has a weight; set losses.mse to 1")
     return tuple(losses)
+
+
+def check_views(config: ConfigDict, views: Views) -> None:
+    """Raises a ValueError if a loss of a resolved config needs what the views lack, before training starts."""
+    losses = build_losses(dict(config.losses), functools.partial(_levels, config))
+    if any(not set(ray_batches.DEPTH_FIELDS).isdisjoint(loss.needs) for loss in losses):
+        check_observed(views)
+
+
+def _of_levels(name, regularizer, levels):
+    """Returns the Loss of a regularizer (params, levels) -> scalar for the given levels."""
+    if not levels:
+        raise ValueError(f"losses.{name} needs a hash grid, which the field does not have; set it to 0")
+    return Loss(functools.partial(regularizer.function, levels=levels), on="params")
+
+
+def _levels(config):
+    """Returns the levels of the table of the final rendering's field; empty without a table."""
+    return _context(config).make_field("fine").levels
 
 
 def bake_model(config: ConfigDict, model: Model, visibility_rays):
@@ -156,7 +217,7 @@ def identity(config: ConfigDict) -> str:
     """Returns as text the parts of a config that renderings depend on; not training, nor the dataset's folder."""
     plain = json.loads(config.to_json_best_effort())
     data = {name: value for name, value in plain["data"].items() if name != "dir"}
-    rest = {name: value for name, value in plain.items() if name not in ("train", "eval", "data", "losses")}
+    rest = {name: value for name, value in plain.items() if name not in ("train", "eval", "data", "losses", "cameras")}
     return json.dumps({**rest, "data": data}, sort_keys=True)
 
 
@@ -230,18 +291,31 @@ def _weight_at(name, weight):
     return lambda step: jnp.interp(jnp.asarray(step, jnp.float32), steps, values)
 
 
-def _prepare(config, model, views):
-    valid = cells = None
+def _prepare(config, model, extras, views):
+    cameras = build_cameras(config)
+    if cameras is not None and cameras.num_images != len(views.size):
+        raise ValueError(
+            f"cameras.num_images is {cameras.num_images}, expected {len(views.size)}, the training images of the "
+            "dataset; do not set it"
+        )
+    cells = indices = None
     if model.grid_schedule is None:
         active = unmasked_pixels(views)
     else:
-        valid, active, cells = active_region(
+        cells, active, indices = active_region(
             views,
             model.grid_schedule,
             use_alpha=config.occupancy.use_alpha and not config.data.ndc,
+            min_views=config.occupancy.min_views,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
         )
     seed = np.uint32(config.seed % 2**32)
+    sparse = None
+    if not set(ray_batches.DEPTH_FIELDS).isdisjoint(extras):
+        sparse = confident_observations(views)
+        if not config.data.ndc:
+            between = interpolated_depths(dataclasses.replace(views, sparse=sparse))
+            sparse = dataclasses.replace(sparse, between=between)
     # The mask is part of the active pixels.
-    return valid, TrainData(seed, dataclasses.replace(views, mask=None), active, cells)
+    return cells, TrainData(seed, dataclasses.replace(views, mask=None, sparse=sparse), active, indices)

@@ -16,6 +16,9 @@ CHECK_EVERY = 50  # steps
 PATIENCE = 100  # steps: momentum alone can revive a network, which takes a dozen steps at most
 _ERROR = 1e-3  # mean square (30 dB): a network that renders better than this can hardly be dead
 _GRADIENT = 1e-5  # norm over the root of that error; a healthy network has 1e-2, and 1e-4 in the first steps
+# The same of colour's layers. A healthy network has less than 1e-5 while it is almost empty; a saturated sigmoid's
+# derivative is below the resolution of float32.
+_COLOR_GRADIENT = 1e-7
 
 
 def count_dead_steps(
@@ -23,14 +26,17 @@ def count_dead_steps(
     grads: Mapping[str, Any],
     errors: Mapping[str, Any],
     input_layers: Mapping[str, Sequence[str]],
+    color_layers: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
     """Counts for how many steps in a row each network has been dead, as counters "dead_<name>".
 
-    A network is dead when its rays have an error and no gradient reaches the layers that take the position.
-    Then its density is 0 everywhere, as the input of a ReLU is negative everywhere (an empty image); or it is
-    an opaque wall in front of the camera whose colour is saturated; or a layer of ReLUs is 0 everywhere, which
-    leaves the same fog at all positions. Adam's momentum can still bring it back for a dozen steps; later nothing
-    can. A batch without an error, as in an empty part of the scene, leaves the count unchanged.
+    A network is dead when its rays have an error and no gradient reaches the layers that take the position, or none
+    reaches the first layers that serve colour alone. In the first case its density is 0 everywhere, as the input of
+    a ReLU is negative everywhere (an empty image); or it is an opaque wall in front of the camera whose colour is
+    saturated; or a layer of ReLUs is 0 everywhere, which leaves the same fog at all positions. In the second case
+    density may still learn, while colour is exactly 0 or 1 everywhere, where a sigmoid has no derivative, or a layer
+    of ReLUs is 0 everywhere. Adam's momentum can still bring a network back for a dozen steps; later nothing can. A
+    batch without an error, as in an empty part of the scene, leaves the count unchanged.
 
     The gradient is a better criterion than opacity or density, and costs nothing: an image of one colour that
     training is about to leave is not dead, and a dead network is dead whatever its image looks like.
@@ -40,12 +46,15 @@ def count_dead_steps(
         grads: network name -> gradient over the whole batch.
         errors: network name -> mean squared error of its rendering.
         input_layers: network name -> names of the layers that take the position; empty: all layers.
+        color_layers: network name -> names of the first layers that serve colour alone; empty: not checked.
     """
     dead = {}
     for name, grad in grads.items():
-        layers, error = input_layers.get(name), errors[name]
-        inputs = [grad[layer] for layer in layers] if layers else grad
-        still = optax.tree.norm(inputs) <= _GRADIENT * jnp.sqrt(error)
+        error = errors[name]
+        inputs, color = ([grad[layer] for layer in layers.get(name, ())] for layers in (input_layers, color_layers))
+        still = optax.tree.norm(inputs or grad) <= _GRADIENT * jnp.sqrt(error)
+        if color:
+            still |= optax.tree.norm(color) <= _COLOR_GRADIENT * jnp.sqrt(error)
         before = counters[f"dead_{name}"]
         dead[f"dead_{name}"] = jnp.where(error > _ERROR, (before + 1) * still.astype(jnp.int32), before)
     return dead
@@ -93,13 +102,13 @@ def make_reinitialize(model: Model, optimizer: optax.GradientTransformation, see
 
     Their parameters are drawn again, from the seed and the step; their optimizer moments become 0 and
     averages restart from the new parameters; all valid cells of the model's grid become occupied. The other
-    networks, and the schedule of the learning rate, stay as they are.
+    networks, other parameters, and the schedule of the learning rate stay as they are.
     """
 
     def reinitialize(state, names):
         # No ray has this position in the batch, so the key is unused otherwise.
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), state.step), 2**32 - 3)
-        fresh = model.init(key)
+        fresh = {**state.params, **model.init(key)}
         is_new = {name: jax.tree.map(lambda _, name=name: name in names, tree) for name, tree in fresh.items()}
         replaced = optax.tree.map_params(
             optimizer,

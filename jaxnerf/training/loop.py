@@ -22,8 +22,9 @@ from jaxnerf.runtime import devices, memory, processes
 from jaxnerf.training import build, metric_log, workdir
 from jaxnerf.training.auto_config import resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config_ranges import check_ranges
 from jaxnerf.training.dead_networks import make_reinitializer
-from jaxnerf.training.state import create_state
+from jaxnerf.training.state import TrainState, create_state
 from jaxnerf.training.step import make_train_step
 
 
@@ -32,7 +33,8 @@ def train(
     folder: str | os.PathLike,
     *,
     views: Views | None = None,
-    at_end: Callable[[str | os.PathLike], bool] | None = None,
+    preview: Callable[[TrainState, Views], str] | None = None,
+    at_end: Callable[[Views], bool] | None = None,
 ) -> bool:
     """Trains as a config says, from the last checkpoint in a workdir if there is one.
 
@@ -40,8 +42,9 @@ def train(
         config: see configs/default.py.
         folder: the workdir; made if missing.
         views: of the split "train" where they have been read.
-        at_end: called with the workdir when training is complete, if `eval.at_end` is set; returns whether it
-            has completed.
+        preview: called with the state and the Views of the split "train" about every `train.preview_every` seconds;
+            returns a line to print. Its time does not count.
+        at_end: called with these Views when training is complete; returns whether it has completed.
 
     Returns:
         Whether training, and at_end, have completed. False: stopped by Ctrl-C or SIGTERM and saved.
@@ -51,7 +54,9 @@ def train(
             were not finite.
     """
     started = time.perf_counter()
+    check_ranges(config)
     config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves no trace
+    build.check_views(config, views)
     on_device, device_lines = resolve_for_device(config)
     experiment = build.build(on_device)
     options = experiment.train
@@ -68,11 +73,17 @@ def train(
 
         processes.run_on_first(claim, pathlib.Path(folder) / "config.json")
         processes.print_once(*lines, *device_lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
-        finished = run_training(experiment, views, folder)
-        return finished and (at_end is None or not experiment.eval.at_end or at_end(folder))
+        finished = run_training(experiment, views, folder, preview=preview)
+        return finished and (at_end is None or at_end(views))
 
 
-def run_training(experiment: build.Experiment, views: Views, folder: str | os.PathLike) -> bool:
+def run_training(
+    experiment: build.Experiment,
+    views: Views,
+    folder: str | os.PathLike,
+    *,
+    preview: Callable[[TrainState, Views], str] | None = None,
+) -> bool:
     """Runs the loop of `train` on the Views of the split "train"; returns whether it has completed."""
     options = experiment.train
     run, state, data, seconds = _compile(experiment, views)
@@ -83,13 +94,15 @@ def run_training(experiment: build.Experiment, views: Views, folder: str | os.Pa
     before = log.rows[-1]["seconds"] if log.rows else 0.0
     processes.print_once(*unreadable, *metric_log.header(experiment, views, state, **seconds))
     progress = metric_log.Progress(options.max_steps, show=processes.is_first())
+    previews = _PreviewTimes(options.preview_every if preview else 0.0, before)
     clock = _Clock(before, first * options.batch_size - int(state.counters.get("rays_dropped", 0)))
     reinitialize_dead = make_reinitializer(experiment, folder)
+    pace = _Pace(experiment, clock, data)
     recent = []
     done = processes.any_of(first >= options.max_steps or 0 < options.max_seconds <= before)
     with _Interrupt() as interrupt:
         for step in range(first + 1, first + 1 if done else options.max_steps + 1):
-            state, metrics = reinitialize_dead(step, *run(state, data))
+            state, metrics = reinitialize_dead(step, *run(state, pace.data_of(step)))
             recent.append(metrics)
             jax.block_until_ready(recent[-2:][0])  # at most one step in flight, so that stopping is prompt
             out_of_time = 0 < options.max_seconds <= clock.seconds()
@@ -105,7 +118,9 @@ def run_training(experiment: build.Experiment, views: Views, folder: str | os.Pa
                     rate=clock.rate,
                     compile_seconds=seconds["compile_seconds"],
                 )
+                row["lr"] *= pace.scale
                 log.append(row)
+                progress.note(*metric_log.warnings(log.rows, experiment))
                 progress.show(step, metric_log.line(row, options, out_of_time=out_of_time))
                 recent = []
                 _check_finite(row, options, folder)
@@ -114,6 +129,10 @@ def run_training(experiment: build.Experiment, views: Views, folder: str | os.Pa
                     checkpoints.save(state)
             if last:
                 break
+            if processes.any_of(previews.is_due(clock.seconds()), step):
+                jax.block_until_ready(state)  # its step counts
+                with clock.paused(), previews.timed(clock.seconds()):
+                    progress.note(preview(state, views))
     progress.close()
     checkpoints.close()
     log.close()
@@ -127,14 +146,18 @@ def _compile(experiment, views):
     """Returns run, state, data, see `devices.compile_step`; and the seconds that it took, by name."""
     options = experiment.train
     started = time.perf_counter()
-    valid, data = experiment.prepare(views)
+    cells, data = experiment.prepare(views)
     prepared = time.perf_counter()
+    if options.max_seconds and jax.process_count() == 1 and options.lr_final != options.lr_init:
+        data = data._replace(lr_scale=np.float32(1))
     pixels, gather = views.pixels, _stay_on_host(views.pixels)
     if gather:
         rows = np.zeros_like(pixels, shape=(options.batch_size, pixels.shape[1]))
         gathered = Gathered(rows=rows, shape=pixels.shape)
         data = data._replace(views=dataclasses.replace(data.views, pixels=gathered))
-    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
+    step = make_train_step(
+        experiment.model, experiment.optimizer, experiment.draw, experiment.losses, experiment.cameras
+    )
 
     def compile_step(state, data, microbatch_size):
         sizes = {"batch_size": options.batch_size, "microbatch_size": microbatch_size}
@@ -142,7 +165,7 @@ def _compile(experiment, views):
 
     run, *placed = memory.fit_step(
         compile_step,
-        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, valid),
+        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, cells),
         data,
         min(options.microbatch_size, options.batch_size // len(devices.devices_of(options.parallel))),
     )
@@ -215,6 +238,47 @@ class _Clock:
         entered = time.perf_counter()
         yield
         self._started += time.perf_counter() - entered
+
+
+class _Pace:
+    """The learning rate of a run of limited time: it reaches its end when the time does, if not before.
+
+    The seconds used so far take the place of the steps where they are a larger fraction of their limit. Such a run
+    depends on the clock. Several processes have several clocks, so their learning rate depends on the steps alone.
+    """
+
+    def __init__(self, experiment: build.Experiment, clock: _Clock, data: Any):
+        self.scale, self._data, self._clock = 1.0, data, clock
+        self._options = experiment.train
+
+    def data_of(self, step: int) -> Any:
+        if self._data.lr_scale is None:
+            return self._data
+        by_steps = min((step - 1) / self._options.lr_steps, 1.0)
+        by_time = min(self._clock.seconds() / self._options.max_seconds, 1.0)
+        ratio = self._options.lr_final / self._options.lr_init
+        self.scale = ratio ** (max(by_steps, by_time) - by_steps)
+        return self._data._replace(lr_scale=devices.place(np.float32(self.scale), self._data.lr_scale.sharding))
+
+
+class _PreviewTimes:
+    """When previews are due: every so many seconds of training, and less often in long runs or where they are slow."""
+
+    def __init__(self, every: float, seconds: float):
+        self._every, self._next = every, 0.0
+        self._plan(seconds, 0.0)
+
+    def is_due(self, seconds: float) -> bool:
+        return bool(self._every) and seconds >= self._next
+
+    @contextlib.contextmanager
+    def timed(self, seconds: float) -> Iterator[None]:
+        entered = time.perf_counter()
+        yield
+        self._plan(seconds, time.perf_counter() - entered)
+
+    def _plan(self, seconds, spent):
+        self._next = seconds + max(self._every, 0.1 * seconds, 10 * spent)
 
 
 class _Interrupt:

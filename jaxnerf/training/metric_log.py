@@ -2,11 +2,13 @@
 
 import json
 import logging
+import math
 import os
 import pathlib
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any, TextIO
 
 import jax
@@ -18,6 +20,9 @@ from jaxnerf.runtime.atomic_files import naming, write_text
 from jaxnerf.runtime.devices import devices_of
 from jaxnerf.training.dead_networks import dead_networks
 from jaxnerf.training.state import TrainState
+
+_MAX_DROPPED = 0.1  # fraction of the rays
+_DROPPED_ROWS = 3  # in a row; at first most cells are occupied and many samples do not fit
 
 
 class MetricLog:
@@ -146,9 +151,9 @@ class _Events:
 class Progress:
     """A progress bar on a terminal; plain lines in a log file."""
 
-    def __init__(self, total: int, stream: TextIO = sys.stderr, show: bool = True):
-        self._total, self._stream, self._shown = total, stream, show
-        self._terminal = show and stream.isatty()
+    def __init__(self, total: int, stream: TextIO | None = None, show: bool = True):
+        self._total, self._stream, self._shown = total, stream or sys.stderr, show
+        self._terminal = show and self._stream.isatty()
 
     def show(self, done: int, text: str) -> None:
         """Shows how many of the total steps are done, followed by a text."""
@@ -161,6 +166,12 @@ class Progress:
         else:
             self._stream.write(f"{done}/{self._total}  {text}\n")
         self._stream.flush()
+
+    def note(self, *lines: str) -> None:
+        """Prints lines of their own, above the bar."""
+        if self._shown:
+            self._stream.write("".join(("\r\033[K" if self._terminal else "") + line + "\n" for line in lines))
+            self._stream.flush()
 
     def close(self) -> None:
         if self._terminal:
@@ -255,6 +266,27 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
         f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{_minutes(row['seconds'])} elapsed, {_minutes(0.0 if out_of_time else left)} left{notes}"
     )
+
+
+def warnings(rows: Sequence[dict[str, Any]], experiment: Any) -> list[str]:
+    """Returns a line, once in a run, if the sample buffer has been too small for many rays over the last rows.
+
+    Args:
+        rows: all rows of the run, the new one last.
+        experiment: of the run.
+    """
+    dropped = np.diff([row.get("rays_dropped", 0) for row in rows], prepend=0)
+    drawn = np.diff([row["step"] for row in rows], prepend=0) * experiment.train.batch_size
+    many = dropped > _MAX_DROPPED * drawn
+    runs = np.convolve(many, np.ones(_DROPPED_ROWS, int))[: len(many)] == _DROPPED_ROWS
+    if not runs.any() or runs[:-1].any():
+        return []
+    found = dropped[-_DROPPED_ROWS:].sum() / drawn[-_DROPPED_ROWS:].sum()
+    size = experiment.model.samples_per_ray
+    return [
+        f"warning       {found:.0%} of rays are dropped, as their samples do not fit into the sample buffer: set "
+        f"--config.occupancy.pool_samples_per_ray to {math.ceil(1.5 * size)} or more (now {size:g}) in a new --workdir"
+    ]
 
 
 def _minutes(seconds):

@@ -7,17 +7,22 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxnerf.training.camera_parameters import CAMERAS
 from jaxnerf.training.state import TrainState
 
 _MIN_SIDE = 8  # least inputs and outputs of a layer that Muon updates; smaller layers gain nothing
 _ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one, they compile once, as a loop
 
 
-def make_optimizer(train: Any) -> tuple[optax.GradientTransformation, Callable[[Any], Any]]:
+def make_optimizer(train: Any, cameras: Any = None) -> tuple[optax.GradientTransformation, Callable[[Any], Any]]:
     """Makes the optimizer of a config's section `train`.
 
+    Args:
+        train: the section.
+        cameras: the section `cameras`; None where no parameters of images are trained.
+
     Returns:
-        The optimizer, and its learning rate: step -> float.
+        The optimizer, and the learning rate of the networks: step -> float.
 
     Raises:
         ValueError: names the field that is below 0.
@@ -29,7 +34,48 @@ def make_optimizer(train: Any) -> tuple[optax.GradientTransformation, Callable[[
     optimizer = optax.adam(schedule, train.beta1, train.beta2, train.epsilon)
     if train.muon:
         optimizer = with_muon(optimizer, schedule, train.muon)
+    if cameras is not None:
+        optimizer = _with_cameras(optimizer, train, schedule, cameras)
+    optimizer = _with_scale(optimizer)
     return with_averaging(optimizer, train.averaging_power) if train.averaging_power else optimizer, schedule
+
+
+def _with_scale(optimizer):
+    """Returns an optimizer whose update takes lr_scale, a factor of the learning rate; without it nothing changes."""
+
+    def update(grads, state, params=None, *, lr_scale=None):
+        updates, state = optimizer.update(grads, state, params)
+        if lr_scale is not None:
+            updates = jax.tree.map(lambda leaf: leaf * lr_scale, updates)
+        return updates, state
+
+    return optax.GradientTransformationExtraArgs(optimizer.init, update)
+
+
+def _with_cameras(optimizer, train, schedule, cameras):
+    """Returns an optimizer that updates the entry "cameras" of the parameters by Adam with learning rates of its own.
+
+    They decay as that of the networks. Cameras do not move before refine_start_step, while the scene is fog.
+    """
+
+    def adam(initial, first_step):
+        def rate(step):
+            return jnp.where(step < first_step, 0.0, initial / train.lr_init * schedule(step))
+
+        return optax.adam(rate, train.beta1, train.beta2, train.epsilon)
+
+    updates = {
+        "networks": optimizer,
+        "log_gains": adam(cameras["exposure_lr"], 0),
+        "poses": adam(cameras["refine_lr"], cameras["refine_start_step"]),
+    }
+
+    def label(path, _):
+        if path[0].key != CAMERAS:
+            return "networks"
+        return "log_gains" if path[1].key == "log_gains" else "poses"
+
+    return optax.partition(updates, lambda params: jax.tree_util.tree_map_with_path(label, params))
 
 
 def with_muon(
@@ -95,15 +141,15 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
     def init(params):
         return Averaging(jnp.zeros((), jnp.int32), jax.tree.map(jnp.array, params), optimizer.init(params))
 
-    def update(grads, state, params):
-        updates, inner = optimizer.update(grads, state.inner, params)
+    def update(grads, state, params, **scale):
+        updates, inner = optimizer.update(grads, state.inner, params, **scale)
         count = state.count + 1
         fraction = (power + 1) / (power + count)
         new = optax.apply_updates(params, updates)
         average = jax.tree.map(lambda old, new: old + fraction * (new - old), state.average, new)
         return updates, Averaging(count, average, inner)
 
-    return optax.GradientTransformation(init, update)
+    return optax.GradientTransformationExtraArgs(init, update)
 
 
 def averaged_params(state: TrainState) -> Any:

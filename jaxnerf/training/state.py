@@ -9,6 +9,8 @@ import optax
 from jaxnerf.core.occupancy.grid import OccupancyGrid
 from jaxnerf.core.types import pytree
 from jaxnerf.models.base import Model
+from jaxnerf.models.grid_schedule import InitialCells
+from jaxnerf.training.camera_parameters import networks
 
 
 @pytree()
@@ -17,7 +19,7 @@ class TrainState:
 
     Attributes:
         step: int32 [], steps taken.
-        params: network name -> its parameters, float32.
+        params: network name -> its parameters, float32; and "cameras" -> those of the training images, if any.
         opt_state: of the optax optimizer.
         grid: OccupancyGrid; None where the model has none.
         counters: name -> int32 [], see `make_train_step`.
@@ -31,7 +33,7 @@ class TrainState:
 
 
 def create_state(
-    model: Model, optimizer: optax.GradientTransformation, seed: jax.typing.ArrayLike, valid: Any = None
+    model: Model, optimizer: optax.GradientTransformation, seed: jax.typing.ArrayLike, cells: InitialCells | None = None
 ) -> TrainState:
     """Creates the TrainState at step 0, the same for the same seed.
 
@@ -39,22 +41,22 @@ def create_state(
         model: see `Model`.
         optimizer: an optax gradient transformation.
         seed: int [], of the initial parameters.
-        valid: [X, Y, Z] bool, the cells of the grid that may be occupied; None: all. Ignored without a grid.
+        cells: of the grid; None: nothing is known of them. Ignored without a grid.
     """
     schedule = model.grid_schedule
-    if schedule is not None and valid is None:
-        valid = jnp.ones(schedule.shape, bool)
+    if schedule is not None and cells is None:
+        cells = InitialCells(jnp.ones(schedule.shape, bool))
 
     @jax.jit  # op by op, initialization would take longer than its compilation
-    def create(key, valid):
+    def create(key, cells):
         params = model.init(key)
-        names = ["nonfinite", "nonfinite_in_a_row", "num_reinits", *(f"dead_{name}" for name in params)]
+        names = ["nonfinite", "nonfinite_in_a_row", "num_reinits", *(f"dead_{name}" for name in networks(params))]
         grid = None
         if schedule is not None:
             names.append("rays_dropped")
-            grid = schedule.create(valid)
+            grid = schedule.create(*cells)
         zero = jnp.zeros((), jnp.int32)
         counters = dict.fromkeys(names, zero)
         return TrainState(step=zero, params=params, opt_state=optimizer.init(params), grid=grid, counters=counters)
 
-    return create(jax.random.key(seed), valid)
+    return create(jax.random.key(seed), cells)

@@ -12,6 +12,7 @@ from jaxnerf.core.types import Views
 from jaxnerf.data import ray_batches
 from jaxnerf.data.active_pixels import PixelRuns
 from jaxnerf.models.base import Model
+from jaxnerf.training.camera_parameters import CameraParameters, networks
 from jaxnerf.training.dead_networks import count_dead_steps
 from jaxnerf.training.state import TrainState
 
@@ -24,12 +25,15 @@ class TrainData(NamedTuple):
         views: of the split "train".
         active_pixels: the pixels to draw from; None: all.
         cells: [M] int32, the cells of the grid that are updated; None without a grid.
+        lr_scale: float32 [], the factor of the learning rate in a run of limited time, the only value here that
+            changes; None: 1.
     """
 
     seed: Any
     views: Views
     active_pixels: PixelRuns | None
     cells: Any
+    lr_scale: Any = None
 
 
 class StepLoss(NamedTuple):
@@ -49,7 +53,11 @@ class StepLoss(NamedTuple):
 
 
 def make_train_step(
-    model: Model, optimizer: optax.GradientTransformation, draw: Callable[..., tuple], losses: Sequence[StepLoss]
+    model: Model,
+    optimizer: optax.GradientTransformation,
+    draw: Callable[..., tuple],
+    losses: Sequence[StepLoss],
+    cameras: CameraParameters | None = None,
 ) -> Callable[..., tuple]:
     """Makes the pure training step.
 
@@ -58,6 +66,7 @@ def make_train_step(
         optimizer: an optax gradient transformation.
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see `draw_batch`.
         losses: at least one must be a loss of the renderings.
+        cameras: the parameters of the training images; None: none.
 
     Returns:
         train_step(state, data, positions, *, axis_name=None) -> (state, metrics).
@@ -77,8 +86,12 @@ def make_train_step(
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
     regularizers = [loss for loss in losses if loss.on == "params"]
 
-    def loss_fn(params, grid, step, keys, batch):
+    def loss_fn(params, grid, step, keys, batch, views):
+        if cameras is not None:
+            batch = cameras.refined_batch(params, batch, views)
         renderings = model.render(keys, params, grid, batch.rays, step)
+        if cameras is not None:
+            renderings = cameras.exposed(params, renderings, batch)
         complete = renderings[-1].num_dropped == 0
 
         def total(values):
@@ -98,17 +111,17 @@ def make_train_step(
     def microbatch(state, data, positions):
         keys, batch = draw(state.step, positions, data)
         (loss, sums), grads = jax.value_and_grad(loss_fn, has_aux=True)(
-            state.params, state.grid, state.step, keys, batch
+            state.params, state.grid, state.step, keys, batch, None if cameras is None else data.views
         )
         return {"loss": loss, **sums}, grads
 
     def regularize(state, metrics, grads):
         for loss in regularizers:
-            value, gradient = jax.value_and_grad(loss.function)(state.params)
+            value, gradient = jax.value_and_grad(loss.function)(networks(state.params))
             weight = loss.weight(state.step)
             metrics[f"loss_{loss.name}"] = value
             metrics["loss"] += weight * value
-            grads = jax.tree.map(lambda a, b, weight=weight: a + weight * b, grads, gradient)
+            grads |= jax.tree.map(lambda a, b, weight=weight: a + weight * b, networks(grads), gradient)
         return metrics, grads
 
     def train_step(state, data, positions, *, axis_name=None):
@@ -117,14 +130,17 @@ def make_train_step(
         if axis_name is not None:
             total = jax.lax.psum(total, axis_name)
         metrics, grads, rays = _mean_over_rays(*total)
-        errors = {name: metrics["mse" if name == "fine" else "mse_coarse"] for name in grads}
-        dead = count_dead_steps(state.counters, grads, errors, model.input_layers)
+        errors = {name: metrics["mse" if name == "fine" else "mse_coarse"] for name in networks(grads)}
+        dead = count_dead_steps(state.counters, networks(grads), errors, model.input_layers, model.color_layers)
         metrics, grads = regularize(state, metrics, grads)
         metrics["grad_norm"] = optax.tree.norm(grads)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
 
+        lr_scale = getattr(data, "lr_scale", None)
+        scale = {} if lr_scale is None else {"lr_scale": lr_scale}
+
         def descend():
-            updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+            updates, opt_state = optimizer.update(grads, state.opt_state, state.params, **scale)
             return optax.apply_updates(state.params, updates), opt_state
 
         # A branch: selecting between old and new arrays would take about as long as the update itself.

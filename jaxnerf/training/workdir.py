@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 from ml_collections import ConfigDict
 
+from jaxnerf.configs import default
 from jaxnerf.runtime import atomic_files
 
 try:
@@ -30,6 +31,7 @@ CHANGEABLE = (
     "train.parallel",
     "train.max_nonfinite",
     "train.max_reinits",
+    "train.preview_every",
     "eval.",
 )
 SECTIONS = ("data", "coarse", "fine", "sampling", "hash_grid", "occupancy", "losses", "train", "eval")
@@ -76,6 +78,17 @@ def read_config(workdir: str | os.PathLike) -> ConfigDict:
     if not isinstance(content, dict) or not all(isinstance(content.get(name), dict) for name in SECTIONS):
         raise ValueError(f"{path}: is not a config, expected an object with {SECTIONS}; restore it or train again")
     return ConfigDict(content, type_safe=False)  # JSON does not hold the types of "auto" fields
+
+
+def config_to_resume(workdir: str | os.PathLike) -> ConfigDict:
+    """Reads the config of the run in a workdir with the types of configs/default.py, so that flags can set its fields.
+
+    Fields that an older version did not have get the default; `claim` rejects them if finished steps depend on them.
+    """
+    config = default.get_config()
+    with config.ignore_type():  # JSON has lists for tuples
+        config.update(read_config(workdir))
+    return config
 
 
 def _flat(config):

@@ -16,6 +16,8 @@ from jaxnerf.capture_check.cameras import Axes
 from jaxnerf.capture_check.report import inspect
 from jaxnerf.core import cameras, types
 from jaxnerf.core import poses as poses_module
+from jaxnerf.data.geometry import path_poses, world
+from jaxnerf.data.images import load_images
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "experiments" / "capture_check"))
@@ -266,12 +268,16 @@ def test_triangulation_finds_the_point_of_a_track():
     assert np.isinf(tracks.triangulate(track, behind)[1]).all()
 
 
-def test_the_plot_shows_cameras_with_findings_in_red(folders, tmp_path):
+def test_the_plot_shows_cameras_with_findings_in_red_and_the_path_that_render_selects(folders, tmp_path):
     report = inspect(folders / "llff")
+    poses = world.poses_of(report.capture)[load_images.split_indices(report.capture, "train")]
+    kind, reason = path_poses.default_kind(poses)
+    assert dict(report.facts)["path"] == f"jaxnerf-render selects {kind}, as {reason}"
+    np.testing.assert_array_equal(report.path, path_poses.make_poses(kind, poses))
     wrong = findings.Finding("error", "pose", "", "", "", (2,))
     camera_plot.save(camera_plot.plot_cameras(report._replace(findings=(wrong,))), tmp_path / "plot.png", folders)
     pixels = np.int32(Image.open(tmp_path / "plot.png").convert("RGB"))
-    for colour in (camera_plot.FLAGGED, camera_plot.CAMERA):
+    for colour in (camera_plot.FLAGGED, camera_plot.CAMERA, camera_plot.PATH):
         assert (np.abs(pixels - ImageColor.getrgb(colour)).max(axis=-1) < 40).sum() > 20
     assert camera_plot.is_plot_of(tmp_path / "plot.png", folders)
     assert not camera_plot.is_plot_of(tmp_path / "plot.png", tmp_path)

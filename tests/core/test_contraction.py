@@ -97,7 +97,7 @@ def test_samples_reach_from_near_to_far_and_grow_only_outside():
     x = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
     largest = np.abs((x - CENTER) / INNER).max(axis=-1)
     length = delta * speed[:, None]
-    assert (length[used & (largest < 0.5)] < 1.3 * step).all() and (length[used] > 0.99 * step)[3:].all()
+    assert (length[used & (largest < 0.5)] < 1.6 * step).all() and (length[used] > 0.99 * step)[3:].all()
     assert (length[used & (largest > 8)] > 4 * step).all()
     # As contracted cells do: no step crosses more of them than a plain step does, by far.
     start, end = (

@@ -1,4 +1,4 @@
-"""The distortion loss (arXiv:2111.12077, Eq. 15): closed forms, gradients, degenerate rays, dense and packed."""
+"""Losses and regularizers: closed forms, gradients, degenerate rays, dense and packed."""
 
 import dataclasses
 
@@ -10,9 +10,9 @@ from jax.extend.core import jaxprs_in_params
 
 import jaxnerf
 from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compiled, full_grid, rays_past_origin
-from jaxnerf.core.losses import mse_loss
+from jaxnerf.core.losses import depth_loss, hash_decay, mse_loss, opaque_loss, total_variation
 from jaxnerf.core.occupancy.grid import mask_samples
-from jaxnerf.core.types import without_samples
+from jaxnerf.core.types import TableLevel, without_samples
 
 KEPT, FINITE_FAR, INFINITE_FAR = 0.7, (1.0, 7.0), (1.5, np.inf)
 
@@ -168,7 +168,7 @@ RAYS, SEGMENTS = 24, 40
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("rule", ["segments", pytest.param("points", marks=pytest.mark.slow)])
-def test_dense_and_packed_renderings_have_the_same_loss(masked, rule):
+def test_dense_and_packed_renderings_have_the_same_losses(masked, rule):
     """Also in value and gradient where the occupancy grid skips samples, or the buffer has unused slots."""
     rays = rays_past_origin(0, RAYS)
     edges = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=SEGMENTS)
@@ -176,7 +176,9 @@ def test_dense_and_packed_renderings_have_the_same_loss(masked, rule):
     samples = segments if rule == "segments" else jaxnerf.samples_from_points(segments.t)
     grid = checked_grid() if masked else full_grid()
     samples, _ = mask_samples(grid, rays, samples)
-    batch = jaxnerf.Batch(rays=rays, rgb=np.zeros((RAYS, 3), np.float32))
+    depth = rays.near + np.linspace(0.2, 0.8, RAYS, dtype=np.float32) * (rays.far - rays.near)
+    fields = {"alpha": np.full(RAYS, 0.5, np.float32), "depth": depth, "depth_weight": np.arange(RAYS) % 3 / 2.0}
+    batch = jaxnerf.Batch(rays=rays, rgb=np.zeros((RAYS, 3), np.float32), **fields)
 
     def scene(scale, x, viewdirs):
         return scale * jnp.exp(-2 * (x**2).sum(axis=-1)), jax.nn.sigmoid(x)
@@ -189,14 +191,16 @@ def test_dense_and_packed_renderings_have_the_same_loss(masked, rule):
 
     def loss_and_slope(render):
         def total(scale):
-            losses = jaxnerf.distortion_loss([render(lambda x, viewdirs: scene(scale, x, viewdirs))], batch)
+            outputs = [render(lambda x, viewdirs: scene(scale, x, viewdirs))]
+            losses = jnp.stack([loss(outputs, batch) for loss in (jaxnerf.distortion_loss, depth_loss, opaque_loss)])
             return losses.sum(), losses
 
         return jax.jit(jax.value_and_grad(total, has_aux=True))(jnp.float32(4.0))
 
     ((_, want), want_slope), ((_, got), slope) = loss_and_slope(dense), loss_and_slope(packed)
-    assert got.shape == (RAYS,) and np.max(want) > 1e-3
-    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
+    assert got.shape == (3, RAYS) and np.max(want, axis=1).min() > 1e-3
+    np.testing.assert_allclose(got[0], want[0], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(got[1:], want[1:], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(slope, want_slope, rtol=1e-4)
 
 
@@ -262,3 +266,67 @@ def test_mse_is_the_sum_over_all_renderings():
     want = sum(((rgb - colours[2]) ** 2).mean(axis=-1) for rgb in colours[:2])
     np.testing.assert_allclose(mse_loss(outputs, batch), want, rtol=1e-6)
     np.testing.assert_allclose(mse_loss(outputs[1:], batch).mean(), ((colours[1] - colours[2]) ** 2).mean(), rtol=1e-6)
+
+
+def depth_of(weights, t, delta, depth, confidence=1.0):
+    """Returns the depth loss of one ray."""
+    batch = dataclasses.replace(
+        make_batch(0.0, 9.0), depth=jnp.float32(depth), depth_weight=jnp.asarray(confidence, jnp.float32)
+    )
+    return depth_loss([make_rendering(weights, t, delta)], batch)
+
+
+def test_the_depth_loss_is_the_mean_relative_distance_from_the_depth():
+    """Also its gradient; the transmitted fraction counts as infinitely far."""
+    weights, t, delta = random_samples(7, 30, 1.0, 7.0)
+    used, depth = delta > 0, 3.0
+    distance = np.abs(t - depth) / (t + depth)
+    want = (weights * distance)[used].sum() + 1 - weights[used].sum()
+    value, slope = jax.jit(jax.value_and_grad(depth_of))(weights, np.where(used, t, np.nan), delta, depth, 0.5)
+    np.testing.assert_allclose(value, 0.5 * want, rtol=1e-5)
+    np.testing.assert_allclose(slope, np.where(used, 0.5 * (distance - 1), 0), atol=1e-6)
+
+
+def test_the_depth_loss_is_least_where_the_ray_ends_at_the_depth():
+    t = np.float32([1.0, 3.0, 6.0])
+    at = [depth_of(np.eye(3, dtype=np.float32)[index], t, np.ones_like(t), 3.0) for index in range(3)]
+    fog = depth_of(np.float32([0.6, 0.0, 0.4]), t, np.ones_like(t), 3.0)  # its mean depth is 3, too
+    np.testing.assert_allclose([*at, fog], [0.5, 0, 1 / 3, 0.6 / 2 + 0.4 / 3], atol=1e-6)
+
+
+def test_a_depth_of_weight_0_has_no_loss_and_no_gradient():
+    given = random_samples(8, 9, 1.0, 7.0)
+    for depth, confidence in ((0.0, 0.0), (3.0, 0.0), (0.0, 1.0)):
+        value, slope = jax.jit(jax.value_and_grad(depth_of))(*given, depth, confidence)
+        assert value == confidence and not np.any(slope)
+
+
+def test_the_opaque_loss_is_the_squared_transmittance_of_opaque_pixels():
+    opacity = np.float32([0, 0.25, 1, 0.25])
+    rendering = dataclasses.replace(make_rendering(np.zeros((4, 1)), None, None), opacity=opacity)
+    batch = dataclasses.replace(make_batch(np.ones(4), 2.0), alpha=np.float32([1, 1, 1, 0]))
+    np.testing.assert_allclose(opaque_loss([rendering], batch), [1, 0.5625, 0, 0])
+
+
+LEVELS = (TableLevel((2, 3, 2), range(12)), TableLevel((4, 4, 4), range(12, 32)), TableLevel((3, 2, 2), range(32, 44)))
+
+
+def test_hash_decay_weights_all_levels_alike():
+    table = np.float32(np.random.default_rng(0).normal(size=(44, 2)))
+    value, slope = jax.value_and_grad(lambda table: hash_decay({"fine": {"table": table}}, LEVELS))(table)
+    each = [table[level.rows.start : level.rows.stop] for level in LEVELS]
+    np.testing.assert_allclose(value, np.mean([(part**2).mean() for part in each]), rtol=1e-5)
+    np.testing.assert_allclose(slope, np.concatenate([2 * part / part.size / 3 for part in each]), rtol=1e-5)
+
+
+def test_total_variation_compares_neighbours_in_levels_that_are_not_hashed():
+    table = np.float32(np.random.default_rng(0).normal(size=(44, 2)))
+    loss = jax.value_and_grad(lambda table: total_variation({"fine": {"table": table}}, LEVELS))
+    value, slope = jax.jit(loss)(table)
+    want = 0.0
+    for level in (LEVELS[0], LEVELS[2]):
+        vertices = table[level.rows.start : level.rows.stop].reshape(*level.size, 2)
+        want += sum((np.diff(vertices, axis=axis) ** 2).mean() for axis in range(3)) / 2
+    np.testing.assert_allclose(value, want, rtol=1e-5)
+    assert not slope[12:32].any() and slope[:12].any() and abs(slope.sum()) < 1e-5
+    assert total_variation({"fine": {"table": table}}, LEVELS[1:2]) == 0

@@ -8,6 +8,7 @@ import skimage.metrics
 import oracle
 from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import mse, psnr, round_to_8_bits, ssim
+from jaxnerf.core.metrics import align_colors
 from jaxnerf.data.readers import blender
 from jaxnerf.evaluation.evaluate import reference
 
@@ -149,3 +150,31 @@ def test_wrong_shapes():
         ssim(image, jnp.ones((12, 12, 1)))
     with pytest.raises(ValueError, match="11 x 11"):
         jax.eval_shape(ssim, jnp.ones((10, 12, 3)), jnp.ones((10, 12, 3)))
+
+
+def test_alignment_finds_the_gains_and_nothing_else():
+    image = 0.6 * pair(4, 0)[0]
+    gains = np.float32([0.8, 1.1, 1.2])
+    np.testing.assert_allclose(align_colors(gains * image, image), image, atol=1e-6)
+    assert psnr(align_colors(image, gains * image), gains * image) > 100
+    # Fog lowers the contrast. That is no difference in exposure, so little of it is removed.
+    foggy = 0.5 * image + 0.25
+    assert psnr(align_colors(foggy, image), image) < psnr(foggy, image) + 6
+
+
+def test_alignment_counts_the_pixels_in_the_mask_only():
+    image, target = pair(5, 0.05)
+    mask = np.zeros(image.shape[:2], bool)
+    mask[3:9, 2:15] = True
+    expected = align_colors(image[3:9, 2:15], target[3:9, 2:15])
+    spoiled = np.where(mask[..., None], image, np.nan)
+    np.testing.assert_allclose(align_colors(spoiled, target, mask=mask)[3:9, 2:15], expected, atol=1e-6)
+
+
+def test_alignment_keeps_a_black_channel_and_nan():
+    image, target = pair(6, 0.05)
+    image[..., 1] = 0
+    aligned = align_colors(image, target)
+    assert all_finite(aligned) and not aligned[..., 1].any()
+    image[0, 0, 0] = np.nan
+    assert np.isnan(align_colors(image, target)[..., 0]).all()

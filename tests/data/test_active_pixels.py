@@ -50,7 +50,8 @@ def test_valid_cells_contain_all_matter_of_the_embedded_scene(views, resolution)
 @pytest.mark.parametrize("step_size", [0.05, 0.3])
 def test_pixels_with_alpha_are_active(views, step_size):
     schedule = a_schedule(resolution=32, step_size=step_size)
-    valid, active, cells = active_region(views, schedule, use_alpha=True)
+    (valid, empty), active, cells = active_region(views, schedule, use_alpha=True)
+    assert empty is None
     np.testing.assert_array_equal(cells, np.flatnonzero(valid))
     ids = active.all_ids()
     assert ids.dtype == cells.dtype == np.int32 and (np.diff(ids) > 0).all()

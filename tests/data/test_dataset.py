@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import captures
-from jaxnerf import Camera, Views, load_dataset
+from jaxnerf import Camera, SparsePoints, Views, load_dataset
 from jaxnerf.configs import capture
 from jaxnerf.data import dataset
 from jaxnerf.data.dataset import held_out, load_split, select_views
@@ -39,7 +39,38 @@ def views():
         mask=np.arange(view.size) % 2 == 0,
         names=tuple("abcd"),
         background=(1.0, 0.0, 1.0),
+        sparse=SparsePoints(
+            positions=np.arange(15, dtype=np.float32).reshape(5, 3),
+            view=np.int32([0, 0, 2, 3, 3, 3]),
+            point=np.int32([4, 1, 0, 1, 2, 3]),
+            pixel=np.arange(12, dtype=np.float32).reshape(6, 2) / 6,
+        ),
     )
+
+
+@pytest.mark.parametrize(
+    "split, number, names",
+    [("train", 3, ["train_000", "train_020", "train_040"]), ("test", 99, None), ("held_out", 2, None)],
+)
+def test_at_most_some_views_are_read(split, number, names):
+    data = smoke_config().data
+    data.hold_out = 10 if split == "held_out" else 0
+    whole, some = load_split(data, split), load_split(data, split, max_views=number)
+    count = min(number, len(whole.names))
+    places = np.arange(count) * len(whole.names) // count
+    assert list(some.names) == [whole.names[place] for place in places] and (names is None or list(some.names) == names)
+
+
+def test_a_relative_folder_is_saved_as_an_absolute_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    captures.write_transforms(tmp_path / "scene", captures.noise(captures.orbit(8)))
+    data = capture.get_config().data
+    data.dir = "scene"
+    assert dataset.resolve(data)[0].dir == str(tmp_path / "scene")
+    (tmp_path / "below").mkdir()
+    monkeypatch.chdir(tmp_path / "below")
+    monkeypatch.setenv("JAXNERF_SCENES", str(tmp_path))
+    assert dataset.resolve(data)[0].dir == "scene"
 
 
 @pytest.mark.parametrize("indices", [[2], [3, 0], [1, 2, 3], np.arange(4)])
@@ -58,12 +89,17 @@ def test_a_selected_view_keeps_its_arrays(views, indices):
             np.testing.assert_array_equal(getattr(got, name)[place], getattr(views, name)[index])
         for name in ("to_world", "focal", "center", "distortion"):
             np.testing.assert_array_equal(getattr(got.cameras, name)[place], getattr(views.cameras, name)[index])
+        mine, theirs = got.sparse.view == place, views.sparse.view == index
+        np.testing.assert_array_equal(got.sparse.point[mine], views.sparse.point[theirs])
+        np.testing.assert_array_equal(got.sparse.pixel[mine], views.sparse.pixel[theirs])
+    assert len(got.sparse.view) == np.isin(views.sparse.view, indices).sum() and (np.diff(got.sparse.view) >= 0).all()
+    np.testing.assert_array_equal(got.sparse.positions, views.sparse.positions)
     kinds = [[leaf.dtype for leaf in jax.tree.leaves(one)] for one in (got, views)]
     assert kinds[0] == kinds[1]
 
 
 def test_selecting_all_views_changes_nothing(views):
-    for given in (views, dataclasses.replace(views, mask=None, names=())):
+    for given in (views, dataclasses.replace(views, mask=None, names=(), sparse=None)):
         got = select_views(given, range(4))
         assert jax.tree.structure(got) == jax.tree.structure(given)
         jax.tree.map(np.testing.assert_array_equal, got, given)

@@ -118,6 +118,8 @@ def test_without_its_masks_the_dataset_fails_the_check(tmp_path):
     for frame in content["frames"]:
         del frame["mask_path"]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert_shows_the_scene(dataset.load_split(a_data(tmp_path), "train"))  # they are found beside the images
+    (tmp_path / "masks").rename(tmp_path / "other")
     assert np.quantile(errors(dataset.load_split(a_data(tmp_path), "train")), 0.97) > 0.1
 
 

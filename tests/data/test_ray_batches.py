@@ -1,5 +1,6 @@
 """Drawn rays have the colours of their pixels, uniformly over pixels, and do not depend on how a batch is split."""
 
+import dataclasses
 import functools
 
 import jax
@@ -8,10 +9,14 @@ import numpy as np
 import pytest
 
 from helpers import assert_same
-from jaxnerf import Camera, Views
+from jaxnerf import Camera, SparsePoints, Views
+from jaxnerf.core.cameras import project
+from jaxnerf.core.types import Batch
 from jaxnerf.data import ray_batches
 from jaxnerf.data.active_pixels import unmasked_pixels
 
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
 SIZES = np.int32([[3, 4], [5, 2], [4, 4]])  # height, width
 OFFSET = np.int32([0, 12, 22])
 FOCAL = 10.0
@@ -153,3 +158,123 @@ def test_world_depth_is_the_distance_in_the_files_units(ndc):
     file = np.block([[0.01 * turn, np.full((3, 1), 7.0)], [np.zeros((1, 3)), 1.0]])
     scaled = Views(**{**vars(alike), "to_file": file})
     np.testing.assert_allclose(ray_batches.world_depth(scaled, 2, pixels, t, ndc=ndc), 0.01 * expected, rtol=1e-5)
+
+
+DEPTH, POSITIONS = ("depth", "depth_weight", "image_index", "pixel"), np.arange(2560)
+
+
+def views_with_points(per_view=(5, 0, 7)):
+    """Returns views of one size and their sparse points: random positions between near and far of one view each."""
+    rng, scene = np.random.default_rng(1), views()
+    view = np.repeat(np.arange(3), per_view).astype(np.int32)
+    pixel = np.float32(rng.uniform(0, 1, (view.size, 2)) * SIZES[view, ::-1])
+    depth = rng.uniform(scene.near[view], scene.far[view]).astype(np.float32)
+    local = (pixel - SIZES[view, ::-1] / 2) / FOCAL * [1, -1] * depth[:, None]
+    positions = np.float32(np.column_stack([local, -depth]) + scene.cameras.to_world[view, :, 3])
+    order = rng.permutation(view.size)
+    points = np.empty_like(positions)
+    points[order] = positions
+    confidence = np.linspace(0.5, 1, view.size, dtype=np.float32)
+    sparse = SparsePoints(positions=points, view=view, point=order.astype(np.int32), pixel=pixel, confidence=confidence)
+    return dataclasses.replace(scene, sparse=sparse), depth
+
+
+@functools.partial(jax.jit, static_argnames=("batching", "extras", "pixel_offset", "ndc"))
+def draw_with(step, positions, views, *, extras=DEPTH, **options):
+    return ray_batches.draw_batch(7, step, positions, views, None, extras=extras, **options)[1]
+
+
+@pytest.mark.parametrize("pixel_offset", [0.5, pytest.param(0.0, marks=pytest.mark.slow)])
+def test_one_ray_in_16_goes_through_an_observation_of_a_sparse_point(pixel_offset):
+    scene, depths = views_with_points()
+    batch = draw_with(3, POSITIONS, scene, pixel_offset=pixel_offset)
+    observed = POSITIONS % 16 == 0
+    assert not batch.depth[~observed].any() and not batch.depth_weight[~observed].any()
+    chosen = np.argmin(np.abs(np.asarray(batch.depth)[observed, None] - depths), axis=1)
+    assert set(chosen) == set(range(12))  # each is drawn
+    np.testing.assert_allclose(np.asarray(batch.depth)[observed], depths[chosen], rtol=1e-6)
+    np.testing.assert_array_equal(np.asarray(batch.depth_weight)[observed], scene.sparse.confidence[chosen])
+    rays = jax.tree.map(lambda leaf: np.asarray(leaf)[observed], batch.rays)
+    if pixel_offset == 0.5:  # otherwise rays are half a pixel off, as all others
+        hit = rays.origins + depths[chosen, None] * rays.directions
+        np.testing.assert_allclose(hit, scene.sparse.positions[scene.sparse.point[chosen]], atol=1e-5)
+        for index, (view, x) in enumerate(zip(scene.sparse.view[chosen], hit, strict=True)):
+            camera = jax.tree.map(lambda leaf, view=view: leaf[view], scene.cameras)
+            np.testing.assert_allclose(project(camera, x)[0], scene.sparse.pixel[chosen[index]], atol=1e-4)
+    column, row = np.floor(np.asarray(batch.pixel)[observed] + 0.5 - pixel_offset).astype(int).T
+    view = np.asarray(batch.image_index)[observed]
+    np.testing.assert_array_equal(view, scene.sparse.view[chosen])
+    pixels = scene.pixels[OFFSET[view] + row * SIZES[view, 1] + column]
+    np.testing.assert_allclose(np.asarray(batch.rgb)[observed], ray_batches.pixel_colors(pixels, WHITE), atol=1e-6)
+
+
+def test_other_rays_are_those_of_a_run_without_depth():
+    scene, _ = views_with_points()
+    positions = np.arange(64)
+    with_depth, without = (
+        draw_with(3, positions, scene, extras=extras) for extras in (DEPTH, ("image_index", "pixel"))
+    )
+    others = positions % 16 != 0
+    plain = jax.tree.map(lambda leaf: leaf[others], dataclasses.replace(with_depth, depth=None, depth_weight=None))
+    assert_same(plain, jax.tree.map(lambda leaf: leaf[others], without), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("batching", ray_batches.BATCHINGS)
+def test_batches_with_depth_do_not_depend_on_how_they_are_split(batching):
+    scene, _ = views_with_points()
+    whole = draw_with(5, POSITIONS, scene, batching=batching)
+    backwards = draw_with(5, POSITIONS[::-1], scene, batching=batching)
+    assert_same(backwards, jax.tree.map(lambda leaf: leaf[::-1], whole), rtol=0, atol=0)
+
+
+def test_the_ids_of_drawn_pixels_are_those_of_observations_too():
+    """Pixels that are gathered by these ids give the same batch."""
+    scene, _ = views_with_points()
+    options = {"batching": "single_image", "extras": DEPTH}
+    ids = jax.jit(lambda scene: ray_batches.draw_pixels(7, 5, POSITIONS, scene, **options)[1])(scene)
+    rows = ray_batches.Gathered(rows=scene.pixels[np.asarray(ids)], shape=scene.pixels.shape)
+    found = draw_with(5, POSITIONS, dataclasses.replace(scene, pixels=rows), batching="single_image")
+    assert_same(found, draw_with(5, POSITIONS, scene, batching="single_image"), rtol=0, atol=0)
+
+
+def test_single_image_batches_take_the_observations_of_that_image():
+    scene, _ = views_with_points()
+    found = {}
+    for step in range(12):
+        batch = draw_with(step, POSITIONS, scene, batching="single_image")
+        assert len(set(batch.image_index.tolist())) == 1
+        found.setdefault(int(batch.image_index[0]), []).append(int((batch.depth_weight > 0).sum()))
+    assert set(found[0] + found[2]) == {len(POSITIONS) // 16} and set(found[1]) == {
+        0
+    }  # the second view has no observation
+
+
+def test_the_depth_of_ndc_rays_is_theirs():
+    scene, depths = views_with_points()
+    cameras = dataclasses.replace(scene.cameras, height=4, width=4)
+    scene = dataclasses.replace(scene, cameras=cameras, near=scene.near * 0)
+    batch = draw_with(3, POSITIONS, scene, ndc=True)
+    seen = np.asarray(batch.depth_weight) > 0
+    assert seen.sum() == len(POSITIONS) // 16
+    hit = (batch.rays.origins + batch.depth[:, None] * batch.rays.directions)[seen]  # z = 1 + 2 / world z
+    np.testing.assert_allclose(hit[:, 2], 2 * np.asarray(batch.depth)[seen] - 1, atol=1e-5)
+    world = 1 / (1 - np.asarray(batch.depth)[seen])
+    assert np.abs(world[:, None] - depths).min(axis=1).max() < 1e-4
+
+
+def test_depths_outside_near_and_far_have_no_weight():
+    scene, depths = views_with_points()
+    scene = dataclasses.replace(scene, far=scene.near + 0.5 * (scene.far - scene.near))
+    batch = draw_with(3, POSITIONS, scene)
+    inside = (depths < scene.far[scene.sparse.view]).mean()
+    assert 0 < (batch.depth_weight > 0).sum() < len(POSITIONS) // 16 and 0 < inside < 1
+    assert (batch.depth < batch.rays.far).all()
+
+
+def test_a_depth_without_observations_is_an_error():
+    for sparse in (None, views_with_points((0, 0, 0))[0].sparse):
+        scene = dataclasses.replace(views(), sparse=sparse)
+        with pytest.raises(ValueError, match="the views have no observations of sparse points"):
+            draw_with(0, np.arange(2), scene)
+    assert draw_with(0, np.arange(2), views(), extras=()).depth is None
+    assert set(ray_batches.DEPTH_FIELDS) < {field.name for field in dataclasses.fields(Batch)}

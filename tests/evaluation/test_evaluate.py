@@ -55,7 +55,8 @@ def test_results_hold_the_metrics_and_the_protocol(scored):
         "split": "test",
     }
     assert [row["comparable"] for row in results["comparable_with"]] == [False] * 5
-    for key in ("psnr", "ssim", "psnr_float", "psnr_truncated"):
+    assert results["exposure"] is False
+    for key in ("psnr", "ssim", "psnr_float", "psnr_truncated", "psnr_aligned", "ssim_aligned"):
         assert results[key] == pytest.approx(np.mean([row[key] for row in results["images"]]))
     assert [row["name"] for row in results["images"]] == [f"test_{index:03d}" for index in range(8)]
 

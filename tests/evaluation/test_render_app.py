@@ -164,5 +164,5 @@ def test_the_program_selects_a_path_and_reports_it(run):
     assert code == 0, err
     target = run / "renders" / "turntable-20"
     assert out.split() == [str(target), f"{target}.gif"]
-    assert "path: turntable, as the cameras look from all around; --path selects another" in err
+    assert "path: turntable, as the cameras surround what they look at, with gaps of at most" in err
     assert iio.imread(f"{target}.gif", index=...).shape == (2, 10, 10, 3)

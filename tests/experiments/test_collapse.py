@@ -1,5 +1,7 @@
 """The study of dead networks counts runs that died, were reinitialized, or did not change."""
 
+import pytest
+
 from studies import study
 
 
@@ -16,3 +18,22 @@ def test_collapse_counts_dead_reinitialized_and_unaffected_runs():
     assert collapse.unaffected(rows).startswith("Of 2 runs in which no network died, 2 end with the same")
     rows[3]["parameters"] = "c"
     assert collapse.unaffected(rows).startswith("Of 2 runs in which no network died, 1 end with the same")
+
+
+def test_painted_backgrounds_count_runs_hardly_better_than_the_background():
+    collapse = study("stability/collapse")
+    row = {"background": "white", "output": "sigmoid", "psnr_alone": 20.0}
+    rows = [row | {"psnr": psnr} for psnr in (21.9, 22.1, 30.0)]
+    cells = ("white", "`sigmoid`", "3", "1", "20.00 dB", "22.10 dB", "21.90 dB")
+    assert collapse.painted_summary(rows) == cells
+
+
+@pytest.mark.slow
+def test_captures_with_painted_backgrounds_train():
+    """With a plain sigmoid, seed 0 in front of black and most seeds in front of white collapse."""
+    collapse = study("stability/collapse")
+    trained = collapse.PaintedStudy(240, "color_activation")
+    for background in collapse.BACKGROUNDS:
+        for seed in range(2):
+            row = trained.run(seed, background)
+            assert row["psnr"] > row["psnr_alone"] + 2, row

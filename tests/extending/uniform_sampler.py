@@ -42,6 +42,7 @@ def make_uniform_model(context):
         scene=scene,
         samples_per_ray=num_samples,
         input_layers={"fine": field.input_layers},
+        color_layers={"fine": field.color_layers},
     )
 
 

@@ -3,10 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
-from jaxnerf.fields.hash_grid import harmonics, hash_grid_field, interpolate, vertices
+from jaxnerf.fields.hash_grid import color_activation, harmonics, hash_grid_field, interpolate, vertices
 
 BOX = {"lower": (-1.0, 0.0, 2.0), "upper": (1.0, 3.0, 3.0)}
 SIZE = (3, 5, 4)  # vertices of the level that is dense
@@ -209,6 +210,34 @@ def test_outputs_and_gradients_are_finite_for_features_of_any_size(field, size, 
     (_, (density, rgb)), slopes = run(params, inside((6, 4)), directions((6, 1)))
     assert all_finite((density, rgb, slopes))
     assert density.max() <= np.exp(15) * 1.001 and (density >= 0).all()
+
+
+def test_colour_is_the_sigmoid_and_its_derivative_never_vanishes():
+    logits = np.linspace(-200, 200, 4001, dtype=np.float32)
+    values, slopes = compiled(jax.vmap(jax.value_and_grad(color_activation)))(logits)
+    expected, own = compiled(jax.vmap(jax.value_and_grad(jax.nn.sigmoid)))(logits)
+    np.testing.assert_array_equal(values, expected)
+    assert own.min() == 0 and slopes.min() == np.float32(1e-3)
+    np.testing.assert_allclose(slopes, np.maximum(own, 1e-3), rtol=1e-6)
+    assert (slopes[np.abs(logits) < 6.9] > 1e-3).all()
+
+
+def test_saturated_colour_learns(field):
+    """A white field becomes black; through a sigmoid no gradient would return."""
+    plain, params, apply, _ = field
+    x, viewdirs = inside((6, 4)), directions((6, 1))
+    params = {**params, "rgb": {**params["rgb"], "bias": np.full(3, 40.0, np.float32)}}
+    assert (apply(params, x, viewdirs)[1] == 1).all()
+    optimizer = optax.adam(1.0)
+
+    def step(carry, _):
+        params, state = carry
+        grad = jax.grad(lambda params: jnp.square(plain.apply(params, x, viewdirs)[1]).mean())(params)
+        updates, state = optimizer.update(grad, state)
+        return (optax.apply_updates(params, updates), state), None
+
+    params, _ = compiled(lambda carry: jax.lax.scan(step, carry, length=40)[0])((params, optimizer.init(params)))
+    assert apply(params, x, viewdirs)[1].max() < 0.1
 
 
 def test_the_initial_parameters_depend_on_the_key_alone(field):

@@ -85,6 +85,28 @@ def test_a_wrong_config_name_lists_the_names():
         cli.config_path("lego_slow")
 
 
+@pytest.mark.parametrize(
+    "flags, added",
+    [
+        (["--workdir=run"], True),
+        (["--workdir", "run", "--config.train.max_steps=3"], True),
+        (["-workdir=run", "--nomultihost"], True),
+        (["--workdir=run", "--config=smoke"], False),
+        (["--config", "smoke", "--workdir=run"], False),
+        (["--workdir=other"], False),
+        (["--workdir"], False),
+        ([], False),
+    ],
+)
+def test_the_saved_config_is_used_without_another_one(tmp_path, monkeypatch, flags, added):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text("{}")
+    monkeypatch.setattr(sys, "argv", ["program", *flags])
+    cli.use_saved_config()
+    assert sys.argv == ["program", *(["--config=run/config.json"] if added else []), *flags]
+
+
 def test_a_plugin_registers_a_field(tmp_path):
     plugin = "import jaxnerf\n\njaxnerf.register_field('mine', lambda options, box: None)\n"
     (tmp_path / "my_plugin.py").write_text(plugin)

@@ -28,12 +28,14 @@ EMPTY, WALL = -1e6, 1e6  # biases of the density
 
 
 @functools.cache
-def network():
+def network(detect_color=True):
     """Returns (the model of one small network, the state at step 0, the step on a Batch)."""
     config = smoke_config()
     config.sampling.num_fine = 0
     config.fine.use_viewdirs = False
     model = build_model(config)
+    if not detect_color:
+        model = model._replace(color_layers={})
 
     def draw(step, positions, batch):
         keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(step)))(positions)
@@ -75,6 +77,27 @@ def follow(state, batch, steps=3):
 )
 def test_empty_image_wall_and_uniform_fog_are_dead(biases):
     assert follow(with_biases(network()[1], **biases), images())[1] == [1, 2, 3]
+
+
+def test_saturated_colour_is_dead_while_density_learns():
+    """Black fog in front of white."""
+    state = with_biases(network()[1], density=1.0, rgb=-100.0)
+    later, counts = follow(state, images())
+    assert counts == [1, 2, 3]
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), later.params["fine"], state.params["fine"])
+    assert moved["trunk_0"]["kernel"] and not moved["rgb"]["kernel"] and not moved["rgb"]["bias"]
+
+
+@pytest.mark.slow
+def test_detection_of_saturated_colour_changes_no_bit():
+    states = []
+    for detect_color in (True, False):
+        _, state, run = network(detect_color)
+        for _ in range(30):
+            state, metrics = run(state, images())
+        states.append(state)
+    assert int(metrics["dead_fine"]) == 0
+    assert_same(*states, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("matter, noise", [(RAYS, 0.0), (2, 0.0), (2, 0.05), (0, 0.5)])
@@ -258,5 +281,5 @@ def test_networks_of_any_structure_and_number_are_counted_by_name():
     grads = {"fine": [jnp.zeros(3)], "proposal": jnp.ones(2), "warp": {"a": jnp.zeros(1)}}
     counters = {f"dead_{name}": jnp.int32(4) for name in grads}
     errors = {"fine": jnp.float32(0.1), "proposal": jnp.float32(0.1), "warp": jnp.float32(0.0)}
-    got = dead_networks.count_dead_steps(counters, grads, errors, {"fine": ()})
+    got = dead_networks.count_dead_steps(counters, grads, errors, {"fine": ()}, {"fine": ()})
     assert jax.tree.map(int, got) == {"dead_fine": 5, "dead_proposal": 0, "dead_warp": 4}

@@ -20,7 +20,7 @@ from jaxnerf.evaluation.evaluate import reference, train_and_evaluate
 from jaxnerf.fields.base import Field
 from jaxnerf.fields.hash_grid import hash_grid_field
 from jaxnerf.models import occupancy as occupancy_module
-from jaxnerf.models.grid_schedule import make_grid_schedule
+from jaxnerf.models.grid_schedule import InitialCells, make_grid_schedule
 from jaxnerf.models.occupancy import occupancy_model
 from jaxnerf.training import loop
 from jaxnerf.training.auto_config import DEVICE_FIELDS, auto_fields, resolve, resolve_for_device
@@ -60,7 +60,7 @@ class Tiny:
         config = resolve_for_device(resolve(tiny_config(), views).config)[0]
         self.experiment = experiment = build(config)
         self.field = hash_grid_field(lower=config.occupancy.lower, upper=config.occupancy.upper, **config.hash_grid)
-        self.valid, data = experiment.prepare(views)
+        self.cells, data = experiment.prepare(views)
         self.data = jax.tree.map(jnp.asarray, data)
         self.train = jax.jit(self._train)
         pixels = np.moveaxis(np.indices((SIZE, SIZE)), 0, -1)[..., ::-1] + np.float32(0.5)
@@ -85,7 +85,8 @@ class Tiny:
             self.field,
             experiment.model.grid_schedule,
             pool_samples_per_ray=16,
-            long_steps_until=20,
+            min_samples_per_ray=0,
+            near_gradient_distance=0.0,
             max_optical_depth=3.0,  # a transmittance of 5 %
             occlusion_start_step=occlusion_start_step,
             early_stop_eps=0.0,
@@ -101,7 +102,7 @@ class Tiny:
         def maybe_treated(rendering, occluded, background):
             return over_background(rendering, occluded & treated, background)
 
-        state = create_state(model, experiment.optimizer, seed, self.valid)
+        state = create_state(model, experiment.optimizer, seed, self.cells)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(occupancy_module, "_over_background", maybe_treated)
             step = make_train_step(model, experiment.optimizer, draw, experiment.losses)
@@ -141,7 +142,7 @@ def test_empty_cells_hold_no_matter(tiny):
     """Images with all valid cells occupied are no better."""
     state, _ = tiny.run(0, NEVER)
     occupied, valid = np.asarray(state.grid.occupied), np.asarray(state.grid.valid)
-    np.testing.assert_array_equal(valid, tiny.valid)
+    np.testing.assert_array_equal(valid, tiny.cells.valid)
     assert not (occupied & ~valid).any() and occupied.sum() < 0.98 * valid.sum()
     everywhere = dataclasses.replace(state, grid=dataclasses.replace(state.grid, occupied=state.grid.valid))
     assert abs(tiny.score(everywhere) - tiny.score(state)) < 0.1
@@ -180,8 +181,8 @@ def test_without_a_grid_the_step_has_no_state_for_it():
         "dead_fine",
     }
     views = experiment.load_split("train")
-    valid, data = experiment.prepare(views)
-    assert valid is None and data.active_pixels is None and data.cells is None
+    cells, data = experiment.prepare(views)
+    assert cells is None and data.active_pixels is None and data.cells is None
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
     after, metrics = jax.eval_shape(step, state, data, jnp.arange(64)[None])
     assert jax.tree.structure(after) == jax.tree.structure(state)
@@ -228,7 +229,8 @@ def toy():
         field,
         schedule,
         pool_samples_per_ray=1,
-        long_steps_until=4,
+        min_samples_per_ray=0,
+        near_gradient_distance=0.0,
         max_optical_depth=1.0,
         occlusion_start_step=8,
         early_stop_eps=0.0,
@@ -249,7 +251,10 @@ def toy():
         model=model,
         optimizer=optax.adam(1e-2),
         draw=draw,
-        prepare=lambda views: (np.ones(schedule.shape, bool), TrainData(np.uint32(0), views, rays, cells)),
+        prepare=lambda views: (
+            InitialCells(np.ones(schedule.shape, bool)),
+            TrainData(np.uint32(0), views, rays, cells),
+        ),
     )
 
 
@@ -257,12 +262,12 @@ def toy():
 def toy_runs(unoptimized, toy):
     """Twelve steps in each mode of parallelism."""
     views = toy.load_split("train")
-    valid, data = toy.prepare(views)
+    cells, data = toy.prepare(views)
     step = make_train_step(toy.model, toy.optimizer, toy.draw, toy.losses)
     return {
         mode: run_steps(
             step,
-            create_state(toy.model, toy.optimizer, 0, valid),
+            create_state(toy.model, toy.optimizer, 0, cells),
             data,
             12,
             mode,

@@ -1,5 +1,6 @@
 """The config's losses in the training step: weights, schedules, absent losses, regularizers, fields of the batch."""
 
+import dataclasses
 import functools
 
 import jax
@@ -9,6 +10,7 @@ import optax
 import pytest
 
 import jaxnerf
+from jaxnerf.core.cameras import project
 from jaxnerf.fields.base import Field
 from jaxnerf.registry import FIELDS, LOSSES
 from jaxnerf.training import auto_config
@@ -97,7 +99,8 @@ def test_a_loss_of_weight_0_is_absent_from_the_step(packed):
         return jax.jit(step).lower(*given).as_text()
 
     alone = text({"mse": 1.0})
-    assert text({"mse": 1.0, "distortion": 0.0}) == alone
+    names = ("distortion", "depth", "opaque", "hash_decay", "total_variation")
+    assert text({"mse": 1.0, **dict.fromkeys(names, 0.0)}) == alone
     assert len(text({"mse": 1.0, "distortion": 0.1})) > len(alone)
 
 
@@ -162,9 +165,9 @@ def test_an_unknown_loss_names_the_registration():
 
 
 def test_a_loss_that_needs_what_no_dataset_gives_is_an_error():
-    jaxnerf.register_loss("depth", lambda outputs, batch: batch.depth, needs=("depth",))
-    with pytest.raises(ValueError, match="losses.depth needs depth in the batch"):
-        build_losses({"mse": 1.0, "depth": 0.1})
+    jaxnerf.register_loss("normal", lambda outputs, batch: batch.normal, needs=("normal",))
+    with pytest.raises(ValueError, match="losses.normal needs normal in the batch"):
+        build_losses({"mse": 1.0, "normal": 0.1})
 
 
 @pytest.mark.parametrize("weights", [{}, {"mse": 0.0}])
@@ -181,3 +184,66 @@ def test_the_distortion_loss_gathers_the_weights_of_a_ray(packed):
     last = [train({"mse": 1.0, "distortion": weight}, 12, packed)[1][-1] for weight in (1e-6, 1.0)]
     assert last[1]["loss_distortion"] < 0.9 * last[0]["loss_distortion"]
     assert all(np.isfinite(row["grad_norm"]) for row in last)
+
+
+def experiment_of(views, **losses):
+    """Returns the Experiment of a blob trained with these losses on Views, its TrainData, and the compiled step."""
+    config = smoke_config()
+    config.update_from_flattened_dict(PACKED)
+    config.field = "blob"
+    config.losses.update(losses)
+    config.train.batch_size = RAYS
+    config = auto_config.resolve_for_device(auto_config.resolve(config, views).config)[0]
+    experiment = build(config)
+    valid, data = experiment.prepare(views)
+    step = make_train_step(experiment.model, optax.sgd(LEARNING_RATE), experiment.draw, experiment.losses)
+    return experiment, data, jax.jit(step), create_state(experiment.model, optax.sgd(LEARNING_RATE), 0, valid)
+
+
+@pytest.fixture
+def observed_views():
+    """Returns the Views of the embedded scene with points at the origin, which lies in the middle of each image."""
+    views = experiment_and_data()[0].load_split("train")
+    origin = np.zeros((1, 3), np.float32)
+    pixel = np.asarray(jax.jit(jax.vmap(lambda camera: project(camera, origin[0])[0]))(views.cameras))
+    view = np.arange(len(pixel), dtype=np.int32)
+    sparse = jaxnerf.SparsePoints(positions=origin, view=view, point=np.zeros_like(view), pixel=pixel)
+    return dataclasses.replace(views, sparse=sparse)
+
+
+def test_depth_supervision_is_absent_unless_its_loss_is_on(observed_views):
+    plain = dataclasses.replace(observed_views, sparse=None)
+    texts = []
+    for views in (plain, observed_views):
+        experiment, data, step, state = experiment_of(views, depth=0.0)
+        assert data.views.sparse is None
+        texts.append(step.lower(state, data, jnp.arange(RAYS)[None]).as_text())
+    assert texts[0] == texts[1]
+    with pytest.raises(ValueError, match="losses.depth is set, and the dataset has no observations"):
+        experiment_of(plain, depth=0.1)
+
+
+def test_the_depth_loss_moves_matter_to_the_sparse_points(observed_views):
+    experiment, data, step, state = experiment_of(observed_views, depth=200.0)
+    assert data.views.sparse.confidence.shape == observed_views.sparse.view.shape
+    positions, rows = jnp.arange(RAYS)[None], []
+    for _ in range(8):
+        again = state
+        state, row = step(state, data, positions)
+        rows.append(float(row["loss_depth"]))
+    assert rows[-1] < 0.9 * rows[0]
+    resumed, _ = step(again, data, positions)
+    jax.tree.map(np.testing.assert_array_equal, resumed.params, state.params)
+
+
+def test_a_regularizer_of_levels_gets_those_of_the_hash_grid():
+    config = smoke_config()
+    config.update_from_flattened_dict(PACKED)
+    config.losses.hash_decay = 0.5
+    config = auto_config.resolve_for_device(auto_config.resolve(config).config)[0]
+    experiment = build(config)
+    (decay,) = [loss for loss in experiment.losses if loss.name == "hash_decay"]
+    params = experiment.model.init(jax.random.key(0))
+    assert decay.needs == () and decay.function(params) == pytest.approx(0.025**2 / 3, rel=0.1)  # uniform entries
+    with pytest.raises(ValueError, match="losses.hash_decay needs a hash grid, which the field does not have"):
+        build_losses({"mse": 1.0, "hash_decay": 0.1})

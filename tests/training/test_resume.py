@@ -13,9 +13,9 @@ import pytest
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.training import metric_log
+from jaxnerf.training import metric_log, workdir
 from jaxnerf.training.checkpoint import Checkpoints
-from runs import SMOKE_FLAGS, smoke_config, start
+from runs import SMOKE_FLAGS, run, smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -75,6 +75,38 @@ def test_finished_run_does_not_change(trained, tmp_path, capsys):
     assert Checkpoints(folder).steps() == [10, 15, 20]
     assert logged_steps(folder) == [5, 10, 15, 20]
     assert_equal(variables(folder, 20), before)
+
+
+def test_a_run_resumes_from_its_workdir_alone(trained, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    for step in (15, 20):
+        shutil.rmtree(folder / "checkpoints" / str(step))
+    assert train_and_evaluate(workdir.config_to_resume(folder), folder)
+    assert Checkpoints(folder).steps() == [10, 15, 20]
+    assert_equal(variables(folder, 20), variables(trained, 20))
+
+
+@pytest.mark.slow
+def test_the_program_resumes_with_flags_and_rejects_an_empty_workdir(trained, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    code, _, err = run("train", f"--workdir={folder}", "--config.train.max_steps=25")
+    assert code == 0 and "20 of 25 done" in err and Checkpoints(folder).steps()[-1] == 25, err
+    code, _, err = run("train", f"--workdir={tmp_path / 'none'}")
+    assert code == 1 and err.count("\n") == 1 and "holds no config.json, so there is no run to resume" in err
+    code, _, err = run("train", f"--workdir={tmp_path / 'none'}", "--config.train.max_steps=25")
+    assert code == 2 and err.count("\n") == 1 and "give --config=NAME" in err
+
+
+def test_a_config_to_resume_has_the_types_of_its_fields(trained, tmp_path):
+    saved = json.loads((trained / "config.json").read_text())
+    del saved["train"]["max_reinits"]  # as an older version would have saved it
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    config = workdir.config_to_resume(tmp_path)
+    assert config.train.max_reinits == 10 and config.train.max_steps == 20
+    config.hash_grid.resolutions = "auto"
+    config.train.lr_init = 1
+    with pytest.raises(TypeError):
+        config.train.max_steps = 1.5
 
 
 def test_resumed_run_does_not_exceed_its_limit_of_seconds(trained, tmp_path):

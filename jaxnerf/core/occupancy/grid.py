@@ -45,7 +45,7 @@ def create_grid(
     upper: Vector,
     valid: Bool[ArrayLike, "X Y Z"],
     *,
-    initial_density: float,
+    initial_density: Float[ArrayLike, ""] | Float[ArrayLike, "X Y Z"],
     contracted: bool = False,
 ) -> OccupancyGrid:
     """Creates the grid of a box before any update, when only the valid cells are known (as in arXiv:2201.05989).
@@ -53,27 +53,30 @@ def create_grid(
     Args:
         lower, upper: [3] world units.
         valid: [X, Y, Z] bool, x first.
-        initial_density: 1 / world unit, the density_max of every cell. An empty cell stays occupied until
-            updates bring that down to the threshold: log(initial_density / threshold) / log(1 / decay) of them.
+        initial_density: 1 / world unit, the density_max of every cell, a number or [X, Y, Z]. An empty cell stays
+            occupied until updates bring that down to the threshold: log(initial_density / threshold) /
+            log(1 / decay) of them. In an array, a cell of density 0 is not occupied until an update finds density.
         contracted: whether the box holds all of space: the cells of its inner half are then not contracted,
             and those of its outer half hold all the rest, see contraction.contract.
 
     Returns:
-        OccupancyGrid with fields [X, Y, Z], occupied wherever it is valid.
+        OccupancyGrid with fields [X, Y, Z], occupied wherever it is valid, unless its own density is 0.
 
     Raises:
         ValueError: on other shapes.
     """
     lower, upper, valid = (jnp.asarray(value) for value in (lower, upper, valid))
     check_shapes("create_grid", lower=(lower, "3"), upper=(upper, "3"), valid=(valid, "X Y Z"))
-    mean = jnp.where(valid, 0.0, -1.0)
+    density = jnp.broadcast_to(jnp.asarray(initial_density, jnp.float32), valid.shape)
+    # Without an update a single number says nothing about any cell.
+    occupied = valid if jnp.ndim(initial_density) == 0 else valid & (density > 0)
     return OccupancyGrid(
         lower=lower,
         upper=upper,
         valid=valid,
-        density_max=jnp.full_like(mean, initial_density),
-        density_mean=mean,
-        occupied=valid,
+        density_max=density,
+        density_mean=jnp.where(occupied, 0.0, -1.0),
+        occupied=occupied,
         contracted=contracted,
     )
 
@@ -127,7 +130,7 @@ def update_grid(
     largest = largest.at[cells].set(jnp.maximum(decay * largest[cells], found)).reshape(grid.density_max.shape)
     mean = mean.at[cells].add(smoothing * (found - mean[cells])).reshape(grid.density_mean.shape)
     dense = ~(largest <= threshold)  # NaN counts as dense, so that it is visible
-    occupied = jnp.where(spread, _widen(dense), dense) & grid.valid
+    occupied = jnp.where(spread, widen(dense), dense) & grid.valid
     return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
 
 
@@ -168,6 +171,12 @@ def grid_from_scene(
     return jax.lax.fori_loop(0, num_updates, update, grid)
 
 
+def cells_along(grid: OccupancyGrid, rays: Rays, samples: Samples) -> Int[Array, "*batch samples"]:
+    """Returns the flat index of the cell around each sample; X Y Z where its length is 0 or it is outside the box."""
+    index, inside = _cells_of(grid, _along_rays(grid, rays, samples.t))
+    return jnp.where(inside & (samples.delta > 0), index, grid.valid.size)
+
+
 def mark_cells(
     marked: Bool[ArrayLike, "X Y Z"],
     grid: OccupancyGrid,
@@ -189,6 +198,15 @@ def keep_cells(grid: OccupancyGrid, marked: Bool[ArrayLike, "X Y Z"]) -> Occupan
         between |= before & after
     occupied = grid.occupied & between
     return dataclasses.replace(grid, density_mean=jnp.where(occupied, grid.density_mean, -1), occupied=occupied)
+
+
+def widen(occupied: Bool[ArrayLike, "X Y Z"]) -> Bool[Array, "X Y Z"]:
+    """Returns the cells that are occupied or share a side with one that is."""
+    wide = occupied
+    for axis in range(3):
+        window = tuple(3 if i == axis else 1 for i in range(3))
+        wide |= jax.lax.reduce_window(occupied, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
+    return wide
 
 
 def clip_rays_to_box(grid: OccupancyGrid, rays: Rays) -> Rays:
@@ -288,15 +306,6 @@ def flat_index(places: Sequence[Int[Array, "*batch"]], shape: tuple[int, ...]) -
     """
     strides = jnp.array([shape[1] * shape[2], shape[2], 1]).reshape(3, *(1,) * places[0].ndim)
     return (jnp.stack(places) * strides).sum(axis=0)
-
-
-def _widen(occupied):
-    """Returns the cells that are occupied or share a side with one that is."""
-    wide = occupied
-    for axis in range(3):
-        window = tuple(3 if i == axis else 1 for i in range(3))
-        wide |= jax.lax.reduce_window(occupied, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
-    return wide
 
 
 def _along_rays(grid, rays, t):

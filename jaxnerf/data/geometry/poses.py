@@ -76,3 +76,15 @@ def up_of(poses: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, "3"]:
     across = axes[:, 0] if axes[:, 0] @ mean > 0 else -axes[:, 0]
     # The spreads sum to 1; cameras on an arc of +-25 degrees have a second spread of 0.05.
     return across if spread[1] > 0.05 and spread[0] < 0.25 * spread[1] else mean
+
+
+def look_one_way(poses: Float[np.ndarray, "V 3 4"], *, cosine: float = 0.85) -> bool:
+    """Returns whether all cameras, two or more, look in one direction.
+
+    Args:
+        poses: of the cameras.
+        cosine: of the largest angle between an axis and the mean axis. In LLFF's datasets it is 20 degrees.
+    """
+    backs = poses[:, :, 2]
+    mean = backs.mean(axis=0)
+    return len(backs) > 1 and bool((backs @ mean > cosine * np.linalg.norm(mean)).all())

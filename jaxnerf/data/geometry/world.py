@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxnerf.data.geometry.poses import gaze_center, up_of
+from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.data.readers.base import Capture
 
 
@@ -21,9 +21,7 @@ def looks_forward(capture: Capture, *, cosine: float = 0.85) -> bool:
         capture: any.
         cosine: of the largest angle between an axis and the mean axis. In LLFF's datasets it is 20 degrees.
     """
-    backs = poses_of(capture)[:, :, 2]
-    mean = backs.mean(axis=0)
-    return len(backs) > 1 and bool((backs @ mean > cosine * np.linalg.norm(mean)).all())
+    return look_one_way(poses_of(capture), cosine=cosine)
 
 
 def recenter(capture: Capture, *, bound_factor: float = 0.75) -> tuple[Capture, Float[np.ndarray, "4 4"]]:

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnerf.data.images.image_files import image_size
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size
 from jaxnerf.data.readers.base import Capture, Frame
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt, UInt16
 from PIL import Image
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _ORIENTATION = 0x0112  # the EXIF tag
 _UPRIGHT = {  # value of the tag -> function that makes the image upright
     2: np.fliplr,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from jaxnerf.core.types import Camera, Views
+from jaxnerf.core.types import Camera, SparsePoints, Views
 from jaxnerf.data.images.downscaled_copies import choose_copies
 from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_image, read_mask
 from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers
@@ -98,6 +98,7 @@ def load_capture(
         mask=masks,
         names=tuple(frame.name for frame in chosen),
         background=background if pixels.shape[-1] == 4 else None,
+        sparse=_sparse_points(capture.points, chosen, forms, shrink),
     )
 
 
@@ -171,14 +172,33 @@ def _form(frame, shrink, background):
     return _Form((height, width), (height // shrink, width // shrink), channels, np.dtype(np.uint16))
 
 
+def _scale(frame, form, shrink):
+    """Returns [2], pixels of the shrunk image per pixel of the frame's camera, along x and y."""
+    return np.array(form.full[::-1]) / (frame.camera.width, frame.camera.height) / shrink
+
+
 def _scaled_camera(frame, form, shrink):
     """Returns the frame's camera for the shrunk image."""
-    camera = frame.camera
-    scale = np.array(form.full[::-1]) / (camera.width, camera.height) / shrink
+    camera, scale = frame.camera, _scale(frame, form, shrink)
     height, width = form.size
     return dataclasses.replace(
         camera, focal=camera.focal * scale, center=camera.center * scale, height=height, width=width
     )
+
+
+def _sparse_points(points, frames, forms, shrink):
+    """Returns the SparsePoints of the shrunk images, or None if there are no points."""
+    if points is None:
+        return None
+    parts = []
+    for index, (frame, form) in enumerate(zip(frames, forms, strict=True)):
+        seen = np.zeros(0, np.int32) if frame.seen is None else np.asarray(frame.seen, np.int32)
+        at = np.zeros((0, 2)) if frame.seen is None else frame.seen_at
+        pixel = np.float32(at * _scale(frame, form, shrink))
+        inside = ((pixel >= 0) & (pixel < form.size[::-1])).all(axis=1)  # shrinking may crop the image
+        parts.append((np.full(inside.sum(), index, np.int32), seen[inside], pixel[inside]))
+    view, point, pixel = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return SparsePoints(positions=np.float32(points), view=view, point=point, pixel=pixel)
 
 
 def _read_pixels(frames, forms, offset, shrink, background):

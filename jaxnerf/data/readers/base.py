@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera
+from jaxnerf.data.readers.colmap_model import check_complete
+from jaxnerf.data.readers.masks import find_masks
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
@@ -47,7 +49,7 @@ class Capture(NamedTuple):
         splits: indices into frames by the name of the split; None: the dataset defines none.
         points: [N, 3] float64, points on surfaces, world units; None: not known.
         box: (lower [3], upper [3]), outside which the format states that there is no matter; None: not known.
-        notes: one line for each part of the dataset that was skipped, with the reason.
+        notes: one line for each part of the dataset that was skipped or found at another place, with the reason.
     """
 
     format: str
@@ -79,6 +81,7 @@ def detect_formats(folder: str | os.PathLike) -> list[str]:
     folder = Path(folder)
     found = [name for name in READERS.names() if READERS.get(name).detect(folder)]
     if not found:
+        check_complete(folder)
         raise ValueError(
             f"{folder}: holds no dataset, expected transforms_train.json (Blender), transforms.json, a COLMAP "
             "model in sparse/0, or poses_bounds.npy (LLFF); correct the folder, or import the module that "
@@ -93,4 +96,16 @@ def read_capture(folder: str | os.PathLike, format: str = "auto") -> Capture:
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    return READERS.get(detect_formats(folder)[0] if format == "auto" else format).read(Path(folder))
+    capture = READERS.get(detect_formats(folder)[0] if format == "auto" else format).read(Path(folder))
+    return capture if capture.format == "blender" else _with_masks(capture, Path(folder))
+
+
+def _with_masks(capture, folder):
+    """Returns the Capture with the masks that lie in its folder, unless its format states masks."""
+    if any(frame.mask is not None for frame in capture.frames):
+        return capture
+    masks, notes = find_masks(folder, [(frame.name, frame.image.suffix) for frame in capture.frames])
+    frames = capture.frames
+    if masks is not None:
+        frames = tuple(frame._replace(mask=mask) for frame, mask in zip(frames, masks, strict=True))
+    return capture._replace(frames=frames, notes=(*capture.notes, *notes))

@@ -11,6 +11,7 @@ from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.colmap_model import (
     AGAIN,
     UNDISTORT,
+    check_complete,
     count_images,
     model_file,
     model_suffix,
@@ -64,6 +65,7 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     folder = Path(folder)
     model = find_model(folder)
     if model is None:
+        check_complete(folder)
         raise ValueError(
             f"{folder}: has no cameras and images, .bin or .txt, in sparse/0, sparse, colmap/sparse/0 or "
             "itself, expected a COLMAP model; correct the folder"

@@ -92,6 +92,20 @@ def model_suffix(folder: Path) -> str | None:
     return None
 
 
+def check_complete(folder: str | os.PathLike) -> None:
+    """Raises a ValueError if a dataset's folder holds a part of a model, but not its cameras and images."""
+    for base in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."):
+        for suffix in (".bin", ".txt"):
+            names = [f"{name}{suffix}" for name in ("cameras", "images", "points3D")]
+            found = [name for name in names if os.path.isfile(Path(folder, base, name))]
+            missing = [name for name in names[:2] if name not in found]
+            if found and missing:
+                raise ValueError(
+                    f"{Path(folder, base)}: has {' and '.join(found)} but no {' and '.join(missing)}, expected all "
+                    f"files of a COLMAP model; {AGAIN}"
+                )
+
+
 def model_file(folder: Path, name: str) -> Path:
     """Returns the path of a model's file "cameras", "images" or "points3D"."""
     return folder / f"{name}{model_suffix(folder)}"

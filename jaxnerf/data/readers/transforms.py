@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,8 +10,7 @@ import numpy as np
 
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.images.downscaled_copies import IMAGE_SUFFIXES
-from jaxnerf.data.images.image_files import image_size
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.ply import read_points
 from jaxnerf.data.readers.validation import check_inside, is_number, read_json, required, short_repr
@@ -27,6 +27,8 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     """Returns the Capture of the images that <folder>/transforms.json lists.
 
     A field of a frame's camera overrides the file's field. Frames whose image is missing are skipped and noted.
+    Of an absolute path, such as one of another computer, the longest end that exists in the folder is used; this
+    is noted, too.
     The world is that of the file's poses: applied_transform and applied_scale are checked for their form, but
     neither undone nor stored.
 
@@ -34,7 +36,7 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     cube of side aabb_scale around 0.5. That cube, mapped back to the file's world, is the Capture's box.
 
     Args:
-        folder: holds transforms.json. Paths in that file that lead out of the folder are errors.
+        folder: holds transforms.json. Relative paths in that file that lead out of the folder are errors.
 
     Returns:
         Capture. Its splits are the file's lists of names that are not empty. A camera's height and width are
@@ -92,9 +94,9 @@ def _entries(content, source):
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise _wrong(source, "frames", frames, "a list of one object {...} per image; export it again")
     places = [f"{source}, frame {index}" for index in range(len(frames))]
+    stated = [required(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
     paths = [
-        check_inside(required(frame, "file_path", where), key="file_path", source=where)
-        for frame, where in zip(frames, places, strict=True)
+        _path(source.parent, path, key="file_path", source=where) for path, where in zip(stated, places, strict=True)
     ]
     images = [_find(source.parent, path) for path in paths]
     base = os.path.commonpath([os.path.dirname(path) for path in paths])
@@ -109,7 +111,33 @@ def _entries(content, source):
             raise ValueError(f"{source}: {found}, expected different names; remove or rename one")
     depths = sum("depth_file_path" in frame or "depth_path" in frame for frame in frames)
     notes = [f"{source}: depth files of {depths} frames are not used"] if depths else []
+    absolute = [index for index, path in enumerate(stated) if _parts_of_absolute(path)]
+    if absolute:
+        example = f"{short_repr(stated[absolute[0]])} as {paths[absolute[0]]}"
+        notes.append(f"{source}: has {len(absolute)} absolute file_paths, read from its own folder: {example}")
     return entries, [*_missing(entries, source), *notes]
+
+
+def _path(folder, name, *, key, source):
+    """Returns a path of the file relative to its folder; see `check_inside`, and `read_capture` for absolute ones."""
+    parts = _parts_of_absolute(name)
+    if not parts or ".." in parts:
+        return check_inside(name, key=key, source=source)
+    ends = ["/".join(parts[start:]) for start in range(len(parts))] + [f"images/{parts[-1]}"]
+    ends = list(dict.fromkeys(ends))
+    for end in ends:
+        if _find(folder, end):
+            return check_inside(end, key=key, source=source)
+    raise ValueError(
+        f"{source}: {key} {short_repr(name)} leaves the folder, and {folder} has no {' or '.join(ends[-2:])} either; "
+        "copy the file there, or correct the path"
+    )
+
+
+def _parts_of_absolute(name):
+    """Returns the folders and the name of an absolute path of any system; [] if it is relative."""
+    match = re.match(r"([A-Za-z]:)?[/\\](.*)", name, re.DOTALL) if isinstance(name, str) else None
+    return [part for part in re.split(r"[/\\]", match[2]) if part not in ("", ".")] if match else []
 
 
 def _find(folder, path):
@@ -140,7 +168,7 @@ def _masks(entries, kept, source):
         raise ValueError(f"{without[0]}: has no mask_path, other frames have; expected all or none; complete them")
     masks = []
     for entry in kept:
-        path = check_inside(entry.content["mask_path"], key="mask_path", source=entry.where)
+        path = _path(source.parent, entry.content["mask_path"], key="mask_path", source=entry.where)
         masks.append(_find(source.parent, path))
         if masks[-1] is None:
             raise ValueError(f"{entry.where}: mask {path!r} does not exist, expected its file; copy it")
@@ -159,7 +187,7 @@ def _splits(content, source, entries, kept):
             raise _wrong(source, key, names, "a list of file_paths; correct or remove it")
         chosen = set()
         for name in names:
-            path = check_inside(name, key=key, source=source)
+            path = _path(source.parent, name, key=key, source=source)
             if path not in places:
                 found = "which has no file" if path in known else "which is not among the frames"
                 raise ValueError(
@@ -181,7 +209,7 @@ def _points(content, source):
     """Returns the points of the file's PLY file, or None; and notes."""
     if "ply_file_path" not in content:
         return None, []
-    path = source.parent / check_inside(content["ply_file_path"], key="ply_file_path", source=source)
+    path = source.parent / _path(source.parent, content["ply_file_path"], key="ply_file_path", source=source)
     if not os.path.isfile(path):
         return None, [f"{source}: ply_file_path {path.name} does not exist, so no points are used"]
     try:

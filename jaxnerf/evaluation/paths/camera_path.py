@@ -2,20 +2,18 @@
 
 import dataclasses
 import pathlib
-import re
 from typing import NamedTuple
 
-import jax
 import numpy as np
+from jaxtyping import Float
 
-from jaxnerf.core import poses as core_poses
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Camera, Views
-from jaxnerf.data.geometry.poses import gaze_center, up_of
+from jaxnerf.data.geometry import path_poses
 from jaxnerf.evaluation.paths.path_files import read_path_file
 from jaxnerf.runtime.fingerprint import fingerprint
 
-_interpolate = jax.jit(core_poses.interpolate, static_argnames=("num_frames", "closed"))
+_SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
 
 
 class CameraPath(NamedTuple):
@@ -48,40 +46,30 @@ def make_path(
     """Makes a CameraPath with the lens and the size of the first view.
 
     Args:
-        kind: "turntable", a circle at the cameras' mean distance and elevation around what they look at;
-            "spiral", as in the LLFF code; "ellipse", through the spread of the cameras' positions;
-            "interpolate", through the views in the order of their names; or a file, see `read_path_file`.
+        kind: "turntable", "arc", "spiral" or "ellipse", see `path_poses.make_poses`; "interpolate", through the
+            views in the natural order of their names; or a file, see `read_path_file`.
         views: Views, for their cameras.
-        num_frames: N; when None 48 for a turntable, 120 for a spiral or ellipse, 6 from view to view.
+        num_frames: N; when None 48 for a turntable, 96 for an arc, 120 for a spiral or ellipse, 6 from view to view.
         closed: whether "interpolate" returns from the last view to the first.
 
     Raises:
-        ValueError: if there is no such kind or file, or the file is wrong.
+        ValueError: if there is no such kind or file, the file is wrong, or the cameras define no such path.
     """
     if str(kind).endswith(".json"):
         if num_frames:
             raise ValueError(f"{kind}: states its own frames, expected no --frames; drop the flag")
         return _from_file(pathlib.Path(kind), views)
-    if kind not in (*_KINDS, "interpolate"):
-        names = ", ".join((*_KINDS, "interpolate"))
+    if kind not in path_poses.KINDS:
+        names = ", ".join(path_poses.KINDS)
         raise ValueError(f"path is {kind!r}, expected one of {names}, or a file ending in .json")
     if kind == "interpolate":
         poses, focal = _through_views(views, num_frames, closed)
     else:
-        make, frames = _KINDS[kind]
-        poses = np.asarray(make(np.asarray(views.cameras.to_world, np.float64), views, num_frames or frames))
+        poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames)
         focal = np.tile(np.float64(views.cameras.focal)[:1], (len(poses), 1))
     height, width = (int(side) for side in views.size[0])
     center = np.tile(np.float64(views.cameras.center)[:1], (len(poses), 1))
     return CameraPath(kind, kind, poses, focal, center, width, height)
-
-
-def default_kind(views: Views, angle: float = 60.0) -> str:
-    """Returns "spiral" where all cameras look within an angle (degrees) of their mean, else "turntable"."""
-    axes = np.asarray(views.cameras.to_world, np.float64)[:, :, 2]
-    mean = axes.sum(axis=0)
-    least = np.cos(np.radians(angle)) * np.linalg.norm(mean)
-    return "spiral" if (axes @ mean > least).all() else "turntable"
 
 
 def resize(path: CameraPath, width: int | None = None, height: int | None = None) -> CameraPath:
@@ -101,9 +89,11 @@ def resize(path: CameraPath, width: int | None = None, height: int | None = None
 def posed_views(views: Views, path: CameraPath) -> Views:
     """Returns Views without pixels, in the poses of a CameraPath, all with the first view's pinhole.
 
-    NDC depend on a camera's focal length and size, so no frame's own may replace them; see `path_pixels`.
+    NDC depend on a camera's focal length and size, so no frame's own may replace them; see `path_pixels`. Near and
+    far are those of the views nearby, see `frame_bounds`.
     """
     count = len(path.poses)
+    near, far = frame_bounds(path.poses, views)
     height, width = (int(side) for side in views.size[0])
     cameras = Camera(
         to_world=np.asarray(path.poses, np.float32),
@@ -118,11 +108,34 @@ def posed_views(views: Views, path: CameraPath) -> Views:
         offset=np.zeros(count, np.int32),
         size=np.tile(np.int32([[height, width]]), (count, 1)),
         cameras=cameras,
-        near=np.full(count, np.min(views.near), np.float32),
-        far=np.full(count, np.max(views.far), np.float32),
+        near=near,
+        far=far,
         mask=None,
         names=tuple(f"{index:04d}" for index in range(count)),
     )
+
+
+def frame_bounds(
+    poses: Float[np.ndarray, "N 3 4"], views: Views
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Returns near and far of frames, interpolated between the views (Shepard 1968).
+
+    At the pose of a view they are that view's, so that the frame equals what evaluation renders. Elsewhere they are
+    the distances to the near and far planes of the views nearby in position and direction, within the range of the
+    views' near and of their far.
+    """
+    cameras = np.asarray(views.cameras.to_world, np.float64)
+    bounds = np.stack([views.near, views.far], axis=-1).astype(np.float64)
+    spread = np.linalg.norm(cameras[:, :, 3] - cameras[:, :, 3].mean(axis=0), axis=1).mean()
+    result = []
+    for pose in np.asarray(poses, np.float32).astype(np.float64):  # the precision of the views' poses
+        moved = pose[:, 3] - cameras[:, :, 3]
+        apart = np.linalg.norm(moved, axis=1) / max(spread, 1e-12)
+        apart += np.linalg.norm(pose[:, 2] - cameras[:, :, 2], axis=1)
+        weights = np.maximum(apart, 1e-12) ** -_SHEPARD
+        result.append(weights @ (bounds + (moved @ pose[:, 2])[:, None]) / weights.sum())
+    near, far = np.clip(result, bounds.min(axis=0), bounds.max(axis=0)).astype(np.float32).T
+    return near, far
 
 
 def path_pixels(posed: Views, path: CameraPath, index: int, *, offset: float = 0.5) -> np.ndarray:
@@ -163,51 +176,12 @@ def _in_run(poses, to_file):
     return np.concatenate([rotation.T @ poses[:, :, :3], eyes[:, :, None]], axis=-1)
 
 
-def _turntable(poses, views, num_frames):
-    """Circles the point nearest to all optical axes, at the cameras' mean distance and elevation."""
-    center, up = gaze_center(poses), up_of(poses)
-    offsets = poses[:, :, 3] - center
-    distances = np.linalg.norm(offsets, axis=-1)
-    elevation = np.arcsin(np.clip(offsets @ up / np.maximum(distances, 1e-30), -1, 1)).mean()
-    return core_poses.turntable(num_frames, center=center, radius=distances.mean(), elevation=elevation, up=up)
-
-
-def _spiral(poses, views, num_frames):
-    """Follows the LLFF code: amplitudes are the cameras' 90th percentiles, the focus is at 3/4 in disparity."""
-    pose = np.float64(core_poses.mean_pose(poses))
-    radii = np.percentile(np.abs((poses[:, :, 3] - pose[:, 3]) @ pose[:, :3]), 90, axis=0)
-    far = 5 * np.max(views.far)
-    near = max(0.9 * np.min(views.near), far / 1000)  # a near of 0 would put the focus at the eye
-    return core_poses.spiral(num_frames, pose=pose, radii=radii, focus=1 / (0.25 / near + 0.75 / far))
-
-
-def _ellipse(poses, views, num_frames):
-    """Passes through the cameras' spread in the horizontal plane, at their mean height; looks as the turntable."""
-    eyes, up = poses[:, :, 3], up_of(poses)
-    middle = eyes.mean(axis=0)
-    across = (eyes - middle) @ (np.eye(3) - np.outer(up, up))
-    _, spread, axes = np.linalg.svd(across, full_matrices=False)
-    # Points all around an ellipse have a variance of half its squared half axis.
-    axes = axes[:2] * (spread[:2] * np.sqrt(2 / len(eyes)))[:, None]
-    axes = np.concatenate([axes, np.zeros((2 - len(axes), 3))])  # of a single view
-    return core_poses.ellipse(num_frames, middle=middle, axes=axes, target=gaze_center(poses), up=up)
-
-
-_KINDS = {"turntable": (_turntable, 48), "spiral": (_spiral, 120), "ellipse": (_ellipse, 120)}  # default frames
-
-
 def _through_views(views, num_frames, closed):
-    """Returns poses [N, 3, 4] and focal [N, 2] through the views in the order of their names."""
-
-    def natural(index):  # r_2 before r_10
-        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", views.names[index])]
-
-    order = sorted(range(len(views.size)), key=natural) if views.names else np.arange(len(views.size))
-    count = len(order)
-    num_frames = num_frames or (6 * count if closed else 6 * (count - 1) + 1)
-    poses = _interpolate(num_frames, poses=np.asarray(views.cameras.to_world)[order], closed=closed)
+    """Returns poses [N, 3, 4] and focal [N, 2] through the views in the natural order of their names."""
+    count = len(views.size)
+    order = path_poses.natural_order(views.names) if views.names else np.arange(count)
+    poses, times = path_poses.poses_through(np.asarray(views.cameras.to_world)[order], num_frames, closed=closed)
     height = np.float64(views.size)[order, :1]
     focal = np.float64(views.cameras.focal)[order] * (views.size[0, 0] / height)  # as if all were of one size
-    times = np.asarray(core_poses.path_times(num_frames, count, closed=closed))
     focal = [np.interp(times, np.arange(count), side, period=count if closed else None) for side in focal.T]
-    return np.asarray(poses), np.stack(focal, axis=-1)
+    return poses, np.stack(focal, axis=-1)

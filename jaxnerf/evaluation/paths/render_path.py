@@ -11,9 +11,10 @@ import numpy as np
 
 from jaxnerf.core.types import Views
 from jaxnerf.data import dataset
+from jaxnerf.data.geometry import path_poses
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path, video
-from jaxnerf.evaluation.restore import TrainedRun, newest_step, render_settings, restore_run
+from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.metric_log import Progress
@@ -46,7 +47,7 @@ def render_path(
 
     Args:
         workdir: the folder that training wrote.
-        path: see `camera_path.make_path`; when None `camera_path.default_kind` selects one, and it is printed.
+        path: see `camera_path.make_path`; when None `path_poses.default_kind` selects one, and it is printed.
         step: of the checkpoint; the newest when None.
         data_dir, settings: see `restore_run`.
         size: (width, height) px, see `camera_path.resize`.
@@ -72,7 +73,9 @@ def render_path(
     run = restore_run(workdir, data_dir=data_dir, settings=settings)
     step = newest_step(run, workdir, step)
     views = run.experiment.load_split("train")
-    path = camera_path.make_path(path or _default_kind(views), views, num_frames=num_frames, closed=closed)
+    if run.experiment.cameras is not None:
+        views = refined_views(run, views, "train", run.variables(step)[0])
+    path = camera_path.make_path(_select_kind(path, views), views, num_frames=num_frames, closed=closed)
     path = camera_path.resize(path, *size)
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
     shards.refuse_overwrite(overwrite, shard, target)
@@ -137,10 +140,16 @@ def write_frames(
     return len(missing())
 
 
-def _default_kind(views):
-    kind = camera_path.default_kind(views)
-    seen_from = "one way" if kind == "spiral" else "from all around"
-    print(f"path: {kind}, as the cameras look {seen_from}; --path selects another", file=sys.stderr)
+def _select_kind(kind, views):
+    """Returns the kind of path, the default for None. Prints that one, and whether a turntable leaves the cameras."""
+    poses = np.asarray(views.cameras.to_world)
+    if kind is None:
+        kind, reason = path_poses.default_kind(poses)
+        print(f"path: {kind}, as {reason}; --path selects another", file=sys.stderr)
+    elif kind == "turntable":
+        default, reason = path_poses.default_kind(poses)
+        if default != kind:
+            print(f"path: a turntable leaves the cameras, as {reason}; --path={default} does not", file=sys.stderr)
     return kind
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 
 import imageio.v3 as iio
+import jax
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -219,3 +220,29 @@ def test_a_damaged_image_is_read_or_a_one_line_error(tmp_path, data, kind):
             assert np.size(read(path)) <= 2**28
         except ValueError as error:
             assert str(path) in str(error) and "\n" not in str(error)
+
+
+def test_observations_of_sparse_points_follow_the_images(tmp_path):
+    """Those of the chosen frames are in pixels of the shrunk images; those in cropped rows and columns are dropped."""
+    capture = a_capture(tmp_path, [pixels(index, 7, 9) for index in range(3)], points=np.arange(12.0).reshape(4, 3))
+    at = [np.array([[1.0, 2.0], [8.5, 1.0]]), np.array([[2.0, 5.0]]), np.array([[7.9, 5.9], [1.0, 6.5], [0.0, 0.0]])]
+    frames = [
+        frame._replace(seen=np.arange(len(where)), seen_at=where)
+        for frame, where in zip(capture.frames, at, strict=True)
+    ]
+    frames[1] = frames[1]._replace(seen=None, seen_at=None)
+    capture = capture._replace(frames=tuple(frames), splits={"train": (0, 1, 2)})
+    sparse = load_images.load_capture(capture).sparse
+    np.testing.assert_array_equal(sparse.positions, capture.points)
+    np.testing.assert_array_equal(sparse.view, [0, 0, 2, 2, 2])
+    np.testing.assert_array_equal(sparse.point, [0, 1, 0, 1, 2])
+    np.testing.assert_allclose(sparse.pixel, np.concatenate([at[0], at[2]]), rtol=1e-6)
+    halved = load_images.load_capture(capture, factor=2, select=lambda count: [2, 0]).sparse
+    np.testing.assert_array_equal(halved.view, [0, 0, 1])
+    np.testing.assert_array_equal(halved.point, [0, 2, 0])
+    np.testing.assert_allclose(halved.pixel, np.array([[7.9, 5.9], [0, 0], [1, 2]]) / 2, rtol=1e-6)
+    assert [leaf.dtype.name for leaf in jax.tree.leaves(halved)] == ["float32", "int32", "int32", "float32"]
+    unseen = capture._replace(frames=tuple(frame._replace(seen=None, seen_at=None) for frame in frames))
+    sparse = load_images.load_capture(unseen).sparse
+    assert sparse.positions.shape == (4, 3) and sparse.pixel.shape == (0, 2) and sparse.view.dtype == np.int32
+    assert load_images.load_capture(capture._replace(points=None, frames=unseen.frames)).sparse is None

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnerf.core.cameras import project
+from jaxnerf.data.readers import base as readers
 from jaxnerf.data.readers import colmap
 from jaxnerf.data.readers.validation import check_inside
 
@@ -321,6 +322,16 @@ def test_errors_of_a_text_file(tmp_path, name, content, message):
 def test_a_folder_without_a_model_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="expected a COLMAP model; correct the folder"):
         colmap.read_capture(tmp_path)
+
+
+@pytest.mark.parametrize("base", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_an_incomplete_model_is_reported(tmp_path, base):
+    put(tmp_path, {name: content for name, content in binary(*model()).items() if name != "images.bin"}, base=base)
+    message = r"has cameras.bin and points3D.bin but no images.bin, expected all files of a COLMAP model"
+    for format in ("auto", "colmap"):
+        with pytest.raises(ValueError, match=message) as caught:
+            readers.read_capture(tmp_path, format)
+        assert str(caught.value).startswith(str(tmp_path / base))
 
 
 def read_damaged(folder, name, content):

@@ -112,6 +112,34 @@ def test_frames_are_sorted_by_name_and_named_below_their_folder(dataset):
     assert names == [f"{index:03d}" for index in range(1, 8)] + ["b/0.0"]
 
 
+@pytest.mark.parametrize("prefix", ["/home/other/scene/", "C:\\Users\\other\\scene\\", "/"])
+def test_absolute_paths_of_another_computer_are_found_in_the_folder(tmp_path, shots, prefix):
+    content = captures.write_transforms(tmp_path, shots, masks=True, splits={"train": range(6), "test": [6, 7]})
+    own = read_capture(tmp_path)
+    for frame in content["frames"]:
+        frame.update({key: prefix + frame[key] for key in ("file_path", "mask_path")})
+    for key in ("train_filenames", "test_filenames"):
+        content[key] = [prefix + name for name in content[key]]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    found = read_capture(tmp_path)
+    assert_cameras(found, shots)
+    assert [frame.mask for frame in found.frames] == [frame.mask for frame in own.frames]
+    assert found.splits == own.splits
+    assert len(found.notes) == 1 and "has 8 absolute file_paths, read from its own folder: " in found.notes[0]
+    assert found.notes[0].endswith(" as images/000.png")
+
+
+def test_images_of_a_folder_of_another_name_are_found_in_images(tmp_path, shots):
+    content = captures.write_transforms(tmp_path, shots)
+    for frame in content["frames"]:
+        frame["file_path"] = "/home/other/photos/" + frame["file_path"].removeprefix("images/")
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert_cameras(read_capture(tmp_path), shots)
+    os.remove(tmp_path / "images" / "003.png")
+    with pytest.raises(ValueError, match=r"leaves the folder, and .* has no 003.png or images/003.png either"):
+        read_capture(tmp_path)
+
+
 @pytest.mark.parametrize("kind", ["png", "jpg", "webp"])
 def test_file_paths_may_lack_extension_or_begin_with_a_dot(tmp_path, shots, kind):
     content = captures.write_transforms(tmp_path, shots, kind=kind)

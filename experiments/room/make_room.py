@@ -1,0 +1,57 @@
+"""Writes a capture of the embedded room: images with lens, a hand-held path, far novel views, and the ground truth.
+
+    python experiments/room/make_room.py --out=DIR [--nolens] [--exposure=0.25] [--white_balance=0.08]
+        [--pose_noise=0.3] [--width=200] [--height=150] [--views=70] [--points=4000] [--image_format=png] [--seed=0]
+
+Then `jaxnerf-train --config=capture --data_dir=DIR --workdir=W`, and score_room.py with the same folders.
+"""
+
+import time
+
+from absl import flags
+
+from jaxnerf.data import synthetic_capture
+from jaxnerf.runtime import cli
+
+_OUT = flags.DEFINE_string("out", None, "Folder of the capture, missing or empty.", required=True)
+_LENS = flags.DEFINE_bool("lens", True, "Whether the lens distorts as a phone's.")
+_EXPOSURE = flags.DEFINE_float("exposure", 0.0, "Standard deviation of the exposure, stops.", lower_bound=0.0)
+_WHITE_BALANCE = flags.DEFINE_float(
+    "white_balance", 0.0, "Standard deviation of red and of blue, stops.", lower_bound=0.0
+)
+_POSE_NOISE = flags.DEFINE_float("pose_noise", 0.0, "Standard deviation of rotations, degrees.", lower_bound=0.0)
+_WIDTH = flags.DEFINE_integer("width", 200, "px", lower_bound=8)
+_HEIGHT = flags.DEFINE_integer("height", 150, "px", lower_bound=8)
+_VIEWS = flags.DEFINE_integer("views", 70, "Number of training views.", lower_bound=8)
+_HELD_OUT = flags.DEFINE_integer("held_out", 10, "Number of held-out views near the path.", lower_bound=0)
+_FAR = flags.DEFINE_integer("far", 12, "Number of far novel views.", lower_bound=0)
+_POINTS = flags.DEFINE_integer("points", 4000, "Number of sparse points.", lower_bound=0)
+_FORMAT = flags.DEFINE_enum("image_format", "png", ["png", "jpg"], "Format of the images.")
+_SEED = flags.DEFINE_integer("seed", 0, "Of everything random.", lower_bound=0)
+
+
+def main(argv: list[str]) -> None:
+    """Writes the capture."""
+    del argv
+    started = time.perf_counter()
+    truth = synthetic_capture.write_capture(
+        _OUT.value,
+        num_views=_VIEWS.value,
+        num_held_out=_HELD_OUT.value,
+        num_far=_FAR.value,
+        width=_WIDTH.value,
+        height=_HEIGHT.value,
+        distortion=synthetic_capture.PHONE_LENS if _LENS.value else None,
+        exposure=_EXPOSURE.value,
+        white_balance=_WHITE_BALANCE.value,
+        pose_noise=_POSE_NOISE.value,
+        num_points=_POINTS.value,
+        image_format=_FORMAT.value,
+        seed=_SEED.value,
+    )
+    found = f"{len(truth.names)} views, {len(truth.points)} points, {time.perf_counter() - started:.0f} s"
+    print(f"wrote {_OUT.value}: {found}")
+
+
+if __name__ == "__main__":
+    cli.run(main)

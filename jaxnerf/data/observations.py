@@ -1,0 +1,66 @@
+"""The observations of sparse points that supervise depth, and how far each can be trusted."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from jaxnerf.core.cameras import project
+from jaxnerf.core.types import SparsePoints, Views
+
+_ACCURATE = 0.5  # px, standard deviation of an observation below which points do not differ in confidence
+_LEAST = 0.05  # confidence below which an observation is dropped
+
+
+def check_observed(views: Views) -> None:
+    """Raises a ValueError if the views have no observations of sparse points."""
+    if views.sparse is None or not len(views.sparse.view):
+        raise ValueError(
+            "losses.depth is set, and the dataset has no observations of sparse points, expected those of a COLMAP "
+            "model with points3D; set losses.depth to 0, or add the model"
+        )
+
+
+def confident_observations(views: Views) -> SparsePoints:
+    """Returns the views' SparsePoints with the confidence of each observation, without those that are unreliable.
+
+    The n observations of a point determine its 3 coordinates, so its mean squared reprojection error per degree of
+    freedom is s^2 = sum_i |e_i|^2 / (2 n - 3) px^2. The confidence is exp(-s^2 / m), where m is the median of s^2 over
+    all observations, at least 0.25 px^2. It follows DS-NeRF (arXiv:2107.02791), which takes exp(-(e / mean e)^2) and
+    ignores n: a wrong match of two views shows in one of their four equations only.
+
+    Args:
+        views: with `sparse`.
+
+    Returns:
+        SparsePoints. Observations are dropped whose confidence is below 0.05, as that of points that one view alone
+        shows, or that lie behind one of their cameras; and those in masked pixels.
+
+    Raises:
+        ValueError: if no observation is left.
+    """
+    check_observed(views)
+    sparse = views.sparse
+    positions, point = np.asarray(sparse.positions), np.asarray(sparse.point)
+    cameras = jax.tree.map(lambda leaf: np.asarray(leaf)[sparse.view], views.cameras)
+    projected = np.asarray(jax.jit(jax.vmap(lambda camera, x: project(camera, x)[0]))(cameras, positions[point]))
+    errors = ((projected - sparse.pixel) ** 2).sum(axis=-1)  # inf behind the camera
+    count = np.bincount(point, minlength=len(positions))
+    variance = np.bincount(point, errors, minlength=len(positions)) / np.maximum(2 * count - 3, 1)
+    variance = np.where(count >= 2, variance, np.inf)[point]
+    usual = max(np.median(variance), _ACCURATE**2)
+    confidence = np.exp(-variance / usual) if np.isfinite(usual) else np.zeros_like(variance)
+    kept = confidence >= _LEAST
+    if views.mask is not None:
+        column, row = np.floor(sparse.pixel).astype(int).T
+        kept &= np.asarray(views.mask)[
+            np.asarray(views.offset)[sparse.view] + row * views.size[sparse.view, 1] + column
+        ]
+    if not kept.any():
+        raise ValueError(
+            f"losses.depth is set, and none of {len(kept)} observations of sparse points fits the cameras and masks, "
+            "expected most to; set losses.depth to 0, or copy cameras, images and points of one model"
+        )
+    view, point, pixel = (np.asarray(values)[kept] for values in (sparse.view, sparse.point, sparse.pixel))
+    confidence = np.float32(confidence[kept])
+    return dataclasses.replace(sparse, view=view, point=point, pixel=pixel, confidence=confidence)

@@ -1,0 +1,238 @@
+"""The stages of structure from motion that pycolmap computes, each in a process of its own.
+
+COLMAP logs to stderr, cannot be interrupted from Python, and may end its process when it meets an error. Its wheel
+carries copies of image libraries that corrupt the memory of a process that also uses Pillow. In a process of its
+own it can be ended at any time: COLMAP commits finished work to its database, and repeats none of it.
+"""
+
+import contextlib
+import itertools
+import math
+import multiprocessing
+import os
+import shutil
+import signal
+import sqlite3
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+SEED = 0
+_MIN_INLIERS, _MAX_DEGREES = 50, 60.0  # of a pair that can contradict a model, and the angle at which it does
+_PAIRS_AT_A_TIME = 200  # after which matches are committed; an interruption loses no more
+
+
+class Model(NamedTuple):
+    """A reconstruction that COLMAP has written.
+
+    Attributes:
+        folder: of its files.
+        images: names of the registered images.
+        num_points: points in space.
+        track_length: the mean number of images that show a point.
+        error: mean reprojection error, px.
+        contradictions: the pairs of consecutive images whose matches contradict the model, see `map_images`.
+    """
+
+    folder: Path
+    images: tuple[str, ...]
+    num_points: int
+    track_length: float
+    error: float
+    contradictions: tuple[tuple[str, str], ...] = ()
+
+
+def call(stage: Callable, *arguments, log: Path, progress: Callable[[int | None], None]) -> Any:
+    """Calls a stage in a new process, and ends the process if this one is interrupted.
+
+    Args:
+        stage: a function below that takes `report` by keyword.
+        *arguments: its other arguments.
+        log: the file to which COLMAP's messages are appended.
+        progress: called about every second, with the number that the stage has reported last, or None.
+
+    Returns:
+        What the stage returns.
+
+    Raises:
+        ValueError: if the stage fails.
+    """
+    context = multiprocessing.get_context("spawn")  # a fork would copy JAX's locked mutexes
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_run, args=(stage, arguments, sender, log), daemon=True)
+    process.start()
+    sender.close()
+    count, reason = None, None
+    try:
+        while True:
+            if receiver.poll(1.0):
+                kind, value = receiver.recv()
+                if kind != "count":
+                    process.join(timeout=10)  # terminated now, it would leave a stack trace, or no reason, in the log
+                if kind == "result":
+                    return value
+                if kind == "error":
+                    reason = value
+                    break
+                count = value
+            progress(count)
+    except EOFError:  # the process has ended without a result
+        process.join()
+        number = process.exitcode
+        reason = signal.Signals(-number).name if number < 0 else f"exit code {number}"
+    finally:
+        process.terminate()
+        process.join()
+    raise ValueError(f"{log}: COLMAP failed ({reason}); its messages are there. The same command continues")
+
+
+def count_rows(database: Path, table: str, condition: str = "1") -> int:
+    """Returns the number of rows of a table of COLMAP's database, also while COLMAP writes to it."""
+    try:
+        with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+            return connection.execute(f"SELECT COUNT(*) FROM {table} WHERE {condition}").fetchone()[0]
+    except sqlite3.Error:  # not created yet, or locked for a moment
+        return 0
+
+
+def select_pairs(database: Path, target: Path, pairs: Sequence[tuple[str, str]]) -> None:
+    """Writes a copy of a database that has the matches of the given pairs of images only."""
+    target.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(database)) as source, contextlib.closing(sqlite3.connect(target)) as copy:
+        source.backup(copy)
+        ids = dict(copy.execute("SELECT name, image_id FROM images"))
+        chosen = [sorted((ids[first], ids[second])) for first, second in pairs]
+        copy.execute("CREATE TEMP TABLE chosen (pair_id INTEGER PRIMARY KEY)")
+        copy.executemany("INSERT INTO chosen VALUES (? * 2147483647 + ?)", chosen)  # COLMAP's id of a pair
+        copy.execute("DELETE FROM two_view_geometries WHERE pair_id NOT IN chosen")
+        copy.commit()
+
+
+def import_images(
+    database: Path, folder: Path, groups: Sequence[Sequence[str]], camera_model: str, *, report: Callable
+) -> list[str]:
+    """Creates a database with the images of a folder; those of a group have one camera in common.
+
+    Returns:
+        The names of the images that COLMAP could read.
+    """
+    import pycolmap
+
+    pycolmap.Database.open(database).close()
+    options = pycolmap.ImageReaderOptions(camera_model=camera_model)
+    for group in groups:
+        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, list(group), options)
+    with pycolmap.Database.open(database) as opened:
+        return [image.name for image in opened.read_all_images()]
+
+
+def extract_features(
+    database: Path, folder: Path, names: Sequence[str], max_size: int, num_threads: int, *, report: Callable
+) -> None:
+    """Adds the SIFT features of those images to a database that have none."""
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=num_threads)
+    pycolmap.extract_features(database, folder, list(names), extraction_options=options, device=pycolmap.Device.cpu)
+
+
+def match_features(database: Path, pairs: Path, num_threads: int, *, report: Callable) -> None:
+    """Adds the geometrically verified matches of pairs of images, one pair a line, to a database."""
+    import pycolmap
+
+    pycolmap.set_random_seed(SEED)
+    pycolmap.match_image_pairs(
+        database,
+        pycolmap.FeatureMatchingOptions(num_threads=num_threads),
+        pycolmap.ImportedPairingOptions(match_list_path=pairs, block_size=_PAIRS_AT_A_TIME),
+        pycolmap.TwoViewGeometryOptions(ransac=pycolmap.RANSACOptions(random_seed=SEED)),
+        device=pycolmap.Device.cpu,
+    )
+
+
+def map_images(
+    database: Path, folder: Path, names: Sequence[str], models: Path, num_threads: int, *, report: Callable
+) -> list[Model]:
+    """Estimates cameras and points incrementally, and writes each model to a folder 0, 1, ... below `models`.
+
+    Where a scene repeats itself, as a can with the same label on its front and back, images of different sides
+    match, and the model may fold a circle of cameras into a half. It then contradicts consecutive images of `names`:
+    they match well with a small rotation between them, but the model has them far apart.
+
+    Returns:
+        The models, that with most images first. Of the others, those without images of their own are deleted:
+        COLMAP has begun and abandoned them.
+    """
+    import pycolmap
+
+    num_registered = 0
+
+    def registered(count):
+        nonlocal num_registered
+        num_registered += count
+        report(num_registered)
+
+    pycolmap.set_random_seed(SEED)
+    found = pycolmap.incremental_mapping(
+        database,
+        folder,
+        models,
+        pycolmap.IncrementalPipelineOptions(num_threads=num_threads, random_seed=SEED, min_model_size=3),
+        initial_image_pair_callback=lambda: registered(2),
+        next_image_callback=lambda: registered(1),
+    )
+    listed = [
+        Model(
+            models / str(index),
+            tuple(model.image(key).name for key in model.reg_image_ids()),
+            model.num_points3D(),
+            model.compute_mean_track_length(),
+            model.compute_mean_reprojection_error(),
+            _contradictions(model, database, names),
+        )
+        for index, model in found.items()
+    ]
+    listed.sort(key=lambda model: -len(model.images))
+    abandoned = [model for model in listed[1:] if set(model.images) <= set(listed[0].images)]
+    for model in abandoned:
+        shutil.rmtree(model.folder)
+    return [model for model in listed if model not in abandoned]
+
+
+def _contradictions(model, database, names):
+    """Returns the consecutive images whose two-view rotation differs much from the model's."""
+    import pycolmap
+
+    registered, found = {model.image(key).name: model.image(key) for key in model.reg_image_ids()}, []
+    with pycolmap.Database.open(database) as opened:
+        for pair in itertools.pairwise(name for name in names if name in registered):
+            first, second = (registered[name] for name in pair)
+            matches = opened.read_two_view_geometry(first.image_id, second.image_id)
+            if len(matches.inlier_matches) < _MIN_INLIERS:
+                continue
+            points = [opened.read_keypoints(image.image_id)[:, :2].astype(float) for image in (first, second)]
+            cameras = [model.camera(image.camera_id) for image in (first, second)]
+            if pycolmap.estimate_two_view_geometry_pose(cameras[0], points[0], cameras[1], points[1], matches):
+                turn = second.cam_from_world().rotation * first.cam_from_world().rotation.inverse()
+                if math.degrees((matches.cam2_from_cam1.rotation * turn.inverse()).angle()) > _MAX_DEGREES:
+                    found.append(pair)
+    return tuple(found)
+
+
+def _run(stage, arguments, sender, log):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the other one ends this one
+    with open(log, "a") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        sender.send(("result", stage(*arguments, report=lambda count: sender.send(("count", count)))))
+    except Exception as error:
+        sender.send(("error", f"{type(error).__name__}: {error}"))
+        raise  # with its traceback, to the log
+
+
+def _end_with_parent():
+    multiprocessing.parent_process().join()
+    os._exit(1)

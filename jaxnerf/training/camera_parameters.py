@@ -1,0 +1,148 @@
+"""Parameters of the training images that are trained with the networks: exposure, and corrections of the cameras.
+
+They are in the entry "cameras" of the parameters. All start at values that change nothing. What the images leave
+open, the common exposure and the position, orientation and scale of the world, is fixed by means over all images:
+the scene keeps the colours of an average image, and the cameras of other splits still fit.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxnerf.core.poses import se3_exponential
+from jaxnerf.core.safe_math import norm
+from jaxnerf.core.types import Batch, Camera, Rays, Rendering, Views
+from jaxnerf.models.base import Model
+
+CAMERAS = "cameras"  # the entry of the parameters; all other entries are networks
+
+
+class CameraParameters(NamedTuple):
+    """The parameters that a run trains per image.
+
+    Attributes:
+        num_images: V of the split "train".
+        exposure: whether each image has a gain per colour channel.
+        refine: whether poses and focal length are corrected.
+        view_rays: (Views, index, pixels) -> Rays.
+        background: [3] the colour behind alpha, which exposure leaves as it is; None: black.
+    """
+
+    num_images: int
+    exposure: bool
+    refine: bool
+    view_rays: Callable[..., Rays]
+    background: Sequence[float] | None = None
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The optional fields of Batch that are read."""
+        return ("image_index", *(["alpha"] if self.exposure else []), *(["pixel"] if self.refine else []))
+
+    def init(self) -> dict[str, jax.Array]:
+        """Returns the parameters before training: no exposure, no correction."""
+        exposure = {"log_gains": jnp.zeros((self.num_images, 3))} if self.exposure else {}
+        poses = {"twists": jnp.zeros((self.num_images, 6)), "log_focal": jnp.zeros(())} if self.refine else {}
+        return exposure | poses
+
+    def added_to(self, model: Model) -> Model:
+        """Returns a Model whose parameters have the entry "cameras"."""
+        return model._replace(init=lambda key: {**model.init(key), CAMERAS: self.init()})
+
+    def refined_batch(self, params: Mapping[str, Any], batch: Batch, views: Views) -> Batch:
+        """Returns the batch with rays that depend on the parameters; as it is unless cameras are refined."""
+        if not self.refine:
+            return batch
+        views = self.refined_views(params, views, "train")
+        rays = jax.vmap(lambda index, pixel: self.view_rays(views, index, pixel))(batch.image_index, batch.pixel)
+        return dataclasses.replace(batch, rays=rays)
+
+    def exposed(
+        self, params: Mapping[str, Any], renderings: Sequence[Rendering], batch: Batch
+    ) -> tuple[Rendering, ...]:
+        """Returns the renderings with the exposure of their images; as they are unless exposure is trained."""
+        if not self.exposure:
+            return tuple(renderings)
+        gains = exposure_gains(params[CAMERAS]["log_gains"])[batch.image_index]
+        behind = 0.0
+        if self.background is not None:
+            behind = (1 - batch.alpha[:, None]) * jnp.asarray(self.background, gains.dtype)[None]
+        return tuple(dataclasses.replace(each, rgb=behind + gains * (each.rgb - behind)) for each in renderings)
+
+    def refined_views(self, params: Mapping[str, Any], views: Views, split: str) -> Views:
+        """Returns Views with the refined cameras.
+
+        The focal length is a property of the camera, so its correction applies to all splits. Poses of other splits
+        than "train" have no correction.
+        """
+        if not self.refine:
+            return views
+        cameras, found = views.cameras, params[CAMERAS]
+        if split == "train":
+            cameras = corrected_cameras(cameras, found["twists"])
+        cameras = dataclasses.replace(cameras, focal=jnp.asarray(cameras.focal) * jnp.exp(found["log_focal"]))
+        return dataclasses.replace(views, cameras=cameras)
+
+    def summary(self, params: Mapping[str, Any], views: Views) -> list[str]:
+        """Returns lines that say how far exposures and cameras of the split "train" are from their start."""
+        lines = []
+        if self.exposure:
+            gains = exposure_gains(params[CAMERAS]["log_gains"])
+            lines.append(f"exposure      images have {gains.min():.3f} to {gains.max():.3f} times the mean exposure")
+        if self.refine:
+            refined = self.refined_views(params, views, "train")
+            before, after = (jnp.asarray(each.cameras.to_world) for each in (views, refined))
+            turned = norm((after - before)[:, :, :3].reshape(-1, 9)) / math.sqrt(8)
+            angle = jnp.degrees(2 * jnp.arcsin(jnp.median(turned)))
+            moved = jnp.median(norm((after - before)[:, :, 3]))
+            zoom = jnp.exp(params[CAMERAS]["log_focal"])
+            lines.append(
+                f"cameras       refined by {angle:.2g} degrees and {moved:.2g} world units (medians); "
+                f"focal length times {zoom:.4f}"
+            )
+        return lines
+
+
+def networks(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the entries of parameters, or of their gradients, that are networks."""
+    return {name: part for name, part in params.items() if name != CAMERAS}
+
+
+def exposure_gains(log_gains: Float[ArrayLike, "V 3"]) -> Float[Array, "V 3"]:
+    """Computes the gain of each image and colour channel; its geometric mean over the images is 1.
+
+    A change of exposure or white balance multiplies linear light by a factor per channel. After a tone curve that is
+    a power, as sRGB nearly is, it still is a factor.
+    """
+    return jnp.exp(log_gains - log_gains.mean(axis=0, keepdims=True))
+
+
+def corrected_cameras(cameras: Camera, twists: Float[ArrayLike, "V 6"]) -> Camera:
+    """Returns cameras that are moved by rigid motions about their own positions, along the axes of the world.
+
+    A common rotation, translation or scaling of all cameras is removed: the mean rotation vector and the mean
+    translation are 0, and so is the component of the translations along the cameras' offsets from their mean.
+
+    Args:
+        cameras: stacked, [V].
+        twists: [V, 6] see `se3_exponential`; in radians, and in units of the RMS distance of the cameras from their
+            mean position. Without such a distance, as in a panorama, there is no translation.
+    """
+    to_world = jnp.asarray(cameras.to_world)
+    eyes, twists = to_world[:, :, 3], jnp.asarray(twists)
+    offsets = eyes - eyes.mean(axis=0, keepdims=True)
+    squares = (offsets**2).sum()
+    twists = twists - twists.mean(axis=0, keepdims=True)
+    turns, moves = twists[:, :3], twists[:, 3:]
+    scaling = (moves * offsets).sum() / jnp.where(squares > 0, squares, 1)
+    moves = (moves - scaling * offsets) * jnp.sqrt(squares / len(eyes))
+    motions = se3_exponential(jnp.concatenate([turns, moves], axis=-1))
+    # Sums of products instead of a matmul, which may round the camera to ten bits.
+    axes = (motions[:, :, :3, None] * to_world[:, None, :, :3]).sum(axis=2)
+    positions = eyes + motions[:, :, 3]
+    return dataclasses.replace(cameras, to_world=jnp.concatenate([axes, positions[:, :, None]], axis=-1))

@@ -1,0 +1,146 @@
+"""What cameras and sparse points tell of the cells of a grid before training."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxnerf.core.types import Camera, SparsePoints, Views
+from jaxnerf.data.active_pixels import active_region
+from jaxnerf.data.geometry.free_space import surface_range
+from jaxnerf.data.geometry.seen_cells import free_cells, seen_cells
+from jaxnerf.models.grid_schedule import make_grid_schedule
+
+SIZE, FOCAL = 48, 48.0  # px: each view covers 53 degrees
+WALL = -4.0  # z of a wall that faces the cameras
+
+
+def a_schedule(**options):
+    sizes = {"resolution": 32, "step_size": 0.1, "threshold": 0.01, "update_every": 16, "cells_per_update": 2**18}
+    return make_grid_schedule((-4.0,) * 3, (4.0,) * 3, field=None, **{**sizes, **options})
+
+
+def some_views(x=(-0.25, 0.25), **fields):
+    """Cameras at (x, 0, 0), all looking along -z."""
+    count = len(x)
+    to_world = np.tile(np.float32(np.eye(3, 4)), (count, 1, 1))
+    to_world[:, 0, 3] = x
+    cameras = Camera(
+        to_world=to_world,
+        focal=np.full((count, 2), FOCAL, np.float32),
+        center=np.full((count, 2), SIZE / 2, np.float32),
+        height=SIZE,
+        width=SIZE,
+    )
+    views = Views(
+        pixels=np.zeros((count * SIZE**2, 3), np.uint8),
+        offset=np.arange(count, dtype=np.int32) * SIZE**2,
+        size=np.full((count, 2), SIZE, np.int32),
+        cameras=cameras,
+        near=np.full(count, 0.05, np.float32),
+        far=np.full(count, 3.9, np.float32),
+        names=tuple(map(str, range(count))),
+    )
+    return dataclasses.replace(views, **fields)
+
+
+def with_wall(views, rows=7):
+    """Adds the observations of a grid of points on the wall, and one of a wrong point close to the first camera."""
+    x, y = np.meshgrid(np.linspace(-1.5, 1.5, rows), np.linspace(-1.5, 1.5, rows))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, WALL)], axis=-1)
+    points = np.vstack([points, [-0.25, 0.3, -0.6]])
+    view, point, pixel = [], [], []
+    for index, pose in enumerate(views.cameras.to_world):
+        local = points - pose[:, 3]
+        at = FOCAL * local[:, :2] / -local[:, 2:] * (1, -1) + SIZE / 2
+        shown = np.arange(len(points) - (index > 0))
+        view.append(np.full(shown.size, index)), point.append(shown), pixel.append(at[shown])
+    sparse = SparsePoints(
+        positions=np.float32(points),
+        view=np.concatenate(view),
+        point=np.concatenate(point),
+        pixel=np.float32(np.concatenate(pixel)),
+    )
+    return dataclasses.replace(views, sparse=sparse)
+
+
+def centers(schedule):
+    """Returns the centers [X, Y, Z, 3] of the cells."""
+    lower, upper = np.array(schedule.lower), np.array(schedule.upper)
+    return lower + (np.stack(np.indices(schedule.shape), axis=-1) + 0.5) * (upper - lower) / schedule.shape
+
+
+def in_view(x, eye, slack):
+    """Returns whether points are inside the frustum of the camera at (eye, 0, 0), widened by a slack."""
+    depth, half = -x[..., 2], SIZE / 2 / FOCAL
+    across = np.maximum(np.abs(x[..., 0] - eye), np.abs(x[..., 1]))
+    return (depth > 0.05 - slack) & (depth < 3.9 + slack) & (across < half * depth + slack)
+
+
+@pytest.mark.parametrize("min_views", [1, 2])
+def test_seen_cells_are_those_in_the_frusta(min_views):
+    schedule, views = a_schedule(), some_views((-1.0, 1.0))
+    seen, x = seen_cells(views, schedule, min_views=min_views), centers(schedule)
+    counts = [sum(in_view(x, eye, slack).astype(int) for eye in (-1.0, 1.0)) for slack in (-0.3, 2.1)]
+    assert seen[counts[0] >= min_views].all()
+    assert not seen[counts[1] < min_views].any()
+
+
+def test_a_masked_pixel_sees_nothing():
+    schedule, views = a_schedule(), some_views((0.0,))
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[:, : SIZE // 2] = True
+    seen = seen_cells(dataclasses.replace(views, mask=mask.reshape(-1)), schedule, min_views=1)
+    x = centers(schedule)
+    assert seen[in_view(x, 0.0, -0.3) & (x[..., 0] < -0.3)].all() and not seen[x[..., 0] > 2.1].any()
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_the_space_in_front_of_the_stated_depth_is_free(contracted):
+    schedule = a_schedule(contracted=contracted)
+    views = some_views((0.0,), free_until=np.float32([1.9]))
+    free, empty = free_cells(views, schedule)
+    depth = -centers(schedule)[..., 2]  # the same in the inner half of a contracted box
+    inside = in_view(centers(schedule), 0.0, -0.3)
+    assert free[inside & (depth > 0.3) & (depth < 1.7)].all() and not free[depth > 2.1].any()
+    assert contracted or not empty[inside & (depth > 2.2) & (depth < 3.7)].any()
+    assert not free_cells(some_views((0.0,)), schedule)[0].any()
+
+
+def test_surface_range_holds_the_wall_and_ignores_a_wrong_point():
+    views = with_wall(some_views(free_until=np.float32([0.3, 0.4])))
+    pixels = np.float32([[24, 24], [24, 12], [14, 30], [0.5, 0.5]])
+    for view in (0, 1):
+        near, far = surface_range(views, view, pixels)
+        np.testing.assert_allclose(near[:3], -0.85 * WALL, rtol=1e-5)
+        np.testing.assert_allclose(far[:3], -1.15 * WALL, rtol=1e-5)
+        assert near[3] == np.float32([0.3, 0.4])[view] and np.isinf(far[3])  # outside all triangles
+
+
+def test_without_enough_points_nothing_is_known_of_surfaces():
+    pixels = np.float32([[24, 24]])
+    for views in (some_views(), with_wall(some_views(), rows=3)):
+        near, far = surface_range(views, 0, pixels)
+        assert near[0] == 0 and np.isinf(far[0])
+
+
+def test_cells_between_cameras_and_surfaces_are_likely_to_be_empty():
+    views, schedule = with_wall(some_views()), a_schedule()
+    _, empty = free_cells(views, schedule)
+    x = centers(schedule)
+    between = (np.abs(x[..., :2]) < 0.2).all(axis=-1) & (x[..., 2] < -0.8) & (x[..., 2] > 0.75 * WALL)
+    at_wall = (np.abs(x[..., :2]) < 0.8).all(axis=-1) & (np.abs(x[..., 2] - WALL) < 0.4)
+    assert between.any() and empty[between].all() and at_wall.any() and not empty[at_wall].any()
+    _, sure = free_cells(views, schedule, min_views=3)
+    assert not sure[between & in_view(x, -0.25, -0.3)].any()
+
+
+def test_training_starts_from_what_is_known():
+    views, schedule = with_wall(some_views(free_until=np.float32([1.0, 1.0]))), a_schedule()
+    cells, _, indices = active_region(views, schedule, use_alpha=False, min_views=1)
+    grid = schedule.create(*cells)
+    assert cells.empty.any() and not (cells.empty & ~cells.valid).any()
+    np.testing.assert_array_equal(grid.occupied, cells.valid & ~cells.empty)
+    np.testing.assert_array_equal(indices, np.flatnonzero(cells.valid))
+    unknown, _, _ = active_region(dataclasses.replace(views, sparse=None), schedule, use_alpha=False, min_views=1)
+    assert unknown.empty is None and (unknown.valid == cells.valid).all()
