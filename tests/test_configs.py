@@ -200,7 +200,11 @@ def _render_jaxpr(experiment):
 
 
 # The fields of a config that other modules than build.py and auto_config.py read, or set from flags.
-MAY_READ = {"evaluation/restore.py": {"data", "eval"}, "interop/convert.py": {"data", "train"}}
+MAY_READ = {
+    "evaluation/evaluate.py": {"eval"},
+    "evaluation/restore.py": {"data", "eval"},
+    "interop/convert.py": {"data", "train"},
+}
 PROGRAMS_MAY_SET = {"data", "train", "eval"}
 
 

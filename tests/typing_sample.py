@@ -127,6 +127,12 @@ def fields_and_data(folder: str) -> jaxnerf.Views:
         mask=None,
         names=("first",),
         background=(1.0, 1.0, 1.0),
+        sparse=jaxnerf.SparsePoints(
+            positions=jnp.zeros((1, 3)),
+            view=jnp.zeros(1, jnp.int32),
+            point=jnp.zeros(1, jnp.int32),
+            pixel=jnp.zeros((1, 2)),
+        ),
     )
 
 

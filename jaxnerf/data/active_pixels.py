@@ -187,7 +187,17 @@ def _fingerprint(views, schedule, options):
         (schedule.lower, schedule.upper, schedule.shape, schedule.step_size, schedule.contracted),
         (views.cameras.lens, views.pixels.shape, options),
     )
-    arrays = [views.offset, views.size, views.near, views.far, views.free_until, views.mask, views.box, views.cameras]
+    arrays = [
+        views.offset,
+        views.size,
+        views.near,
+        views.far,
+        views.free_until,
+        views.mask,
+        views.box,
+        views.cameras,
+        views.sparse,
+    ]
     if options["use_alpha"] and views.pixels.shape[-1] == 4:
         ends = np.append(views.offset[1:], len(views.pixels))
         arrays += [views.pixels[first:end, 3] for first, end in zip(views.offset, ends, strict=True)]

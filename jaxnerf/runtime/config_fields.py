@@ -21,7 +21,7 @@ def auto(kind: type, value: Any = AUTO) -> FieldReference:
     return FieldReference(value, field_type=_AUTO_TYPES[kind])
 
 
-def schedule(value: float | tuple) -> FieldReference:
+def schedule(value: float | tuple | str) -> FieldReference:
     """Declares a field that holds a number, a schedule ((step, value), ...), linear between its points, or "auto"."""
     return FieldReference(value, field_type=Schedule)
 

@@ -2,7 +2,6 @@
 
 import shutil
 import time
-import types
 
 import imageio.v3 as iio
 import jax
@@ -15,6 +14,7 @@ from jaxnerf.evaluation.metrics import reference
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import build, loop, metric_log
+from jaxnerf.training.state import TrainState
 from runs import smoke_config
 
 pytest_plugins = ["run_fixtures"]
@@ -118,7 +118,7 @@ def test_a_preview_that_fails_is_reported(folder, views, monkeypatch):
 
     monkeypatch.setattr(output_images, "write_image", full)
     params, grid = restore_run(folder).variables(20)
-    state = types.SimpleNamespace(step=20, params=params, opt_state=None, grid=grid)
+    state = TrainState(step=20, params=params, opt_state=None, grid=grid, counters={})
     assert Previews(folder).write(state, views).startswith("preview       none: [Errno 28] No space left on device")
     assert "scores        none: [Errno 28] No space left on device" in "\n".join(with_summary(folder).summary(views))
 

@@ -37,6 +37,11 @@ AUTO_FIELDS = {
     "occupancy.upper": (1.0, 2.0, 3.5),
     "occupancy.step_size": 0.25,
     "occupancy.resolution": 32,
+    "occupancy.near_gradient_distance": 0.5,
+    "occupancy.min_views": 2,
+    "data.near": 0.5,
+    "cameras.num_images": 60,
+    "losses.depth": 0.5,
     "train.microbatch_size": 128,
     "train.max_steps": 300,
     "train.lr_steps": 300,
@@ -159,7 +164,9 @@ def test_explicit_values_do_not_change(views):
     assert given.to_json_best_effort() == before and unresolved(given)
     changed = {name for name, value in fields(config).items() if value != fields(given)[name]}
     names = ("contracted", "lower", "upper", "step_size", "resolution")
+    names += ("near_gradient_distance", "min_views")
     expected = {"data.world", "data.fingerprint", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
+    expected |= {"data.near", "cameras.num_images", "losses.depth"}
     assert changed == expected
 
 

@@ -91,8 +91,8 @@ def free_cells(
                 near = np.full_like(near, views.free_until[view])
                 free[np.asarray(cells_between(rays, near, near)[0])] = True
         num_views += in_front
-    empty = ~surface | (num_views >= min_views)
-    return tuple(cells[:-1].reshape(schedule.shape) for cells in (free, empty))
+    free, surface, num_views = (cells[:-1].reshape(schedule.shape) for cells in (free, surface, num_views))
+    return free, ~np.asarray(widen(surface)) | (num_views >= min_views)
 
 
 def _grid(schedule: GridSchedule, shape: tuple[int, int, int]) -> OccupancyGrid:

@@ -125,7 +125,7 @@ def test_without_enough_points_nothing_is_known_of_surfaces():
 
 
 def test_cells_between_cameras_and_surfaces_are_likely_to_be_empty():
-    views, schedule = with_wall(some_views()), a_schedule()
+    views, schedule = with_wall(some_views(far=np.full(2, 9.0, np.float32))), a_schedule()
     _, empty = free_cells(views, schedule)
     x = centers(schedule)
     between = (np.abs(x[..., :2]) < 0.2).all(axis=-1) & (x[..., 2] < -0.8) & (x[..., 2] > 0.75 * WALL)
@@ -141,6 +141,7 @@ def test_training_starts_from_what_is_known():
     grid = schedule.create(*cells)
     assert cells.empty.any() and not (cells.empty & ~cells.valid).any()
     np.testing.assert_array_equal(grid.occupied, cells.valid & ~cells.empty)
+    assert 0 < np.asarray(grid.occupied).mean() < 0.9 * cells.valid.mean()
     np.testing.assert_array_equal(indices, np.flatnonzero(cells.valid))
     unknown, _, _ = active_region(dataclasses.replace(views, sparse=None), schedule, use_alpha=False, min_views=1)
     assert unknown.empty is None and (unknown.valid == cells.valid).all()

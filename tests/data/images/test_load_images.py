@@ -242,7 +242,7 @@ def test_observations_of_sparse_points_follow_the_images(tmp_path):
     np.testing.assert_array_equal(halved.point, [0, 2, 0])
     np.testing.assert_allclose(halved.pixel, np.array([[7.9, 5.9], [0, 0], [1, 2]]) / 2, rtol=1e-6)
     assert [leaf.dtype.name for leaf in jax.tree.leaves(halved)] == ["float32", "int32", "int32", "float32"]
-    unseen = capture._replace(frames=tuple(frame._replace(seen=None, seen_at=None) for frame in frames))
-    sparse = load_images.load_capture(unseen).sparse
+    without_observations = capture._replace(frames=tuple(frame._replace(seen=None, seen_at=None) for frame in frames))
+    sparse = load_images.load_capture(without_observations).sparse
     assert sparse.positions.shape == (4, 3) and sparse.pixel.shape == (0, 2) and sparse.view.dtype == np.int32
-    assert load_images.load_capture(capture._replace(points=None, frames=unseen.frames)).sparse is None
+    assert load_images.load_capture(capture._replace(points=None, frames=without_observations.frames)).sparse is None
