@@ -20,7 +20,7 @@ from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 
-_COUNTING_STEP = 4  # times the step size: in training, steps that only count a ray's samples
+_COUNTING_STEP = 8  # times the step size: in training, steps that only count a ray's samples
 _MAX_STRETCH = 8.0  # times the step size, the longest step of training
 _FILLED = 0.95  # of the sample buffer: the counts are estimates
 _SMALLEST_EPS = 1e-30  # replaces an early_stop_eps of 0: below this transmittance no light is left

@@ -41,7 +41,6 @@ AUTO_FIELDS = {
     "occupancy.min_views": 2,
     "data.near": 0.5,
     "cameras.num_images": 60,
-    "losses.depth": 0.5,
     "train.microbatch_size": 128,
     "train.max_steps": 300,
     "train.lr_steps": 300,
