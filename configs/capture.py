@@ -10,9 +10,11 @@ def get_config():
     data.format, data.dir, data.factor, data.width = "auto", "", "auto", 200
     data.background, data.ndc = "auto", "auto"
     # Without alpha no cell is known to be empty at first. In real scenes thin density is mostly spurious fog.
-    config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 27.0
+    config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 13.5
     train = config.train
     # lego_fast.py has other values here, chosen on lego alone.
-    config.hash_grid.view_width, config.eval.sample_multiplier, train.averaging_power = 128, 1.0, 0.0
-    train.batch_size, train.max_steps, train.lr_steps, train.max_seconds = 384, 12_000, 12_000, 600.0
+    config.hash_grid.view_width, train.averaging_power = 128, 0.0
+    train.batch_size, train.max_steps, train.lr_steps, train.max_seconds = 384, 40_000, 40_000, 600.0
+    # Less than 0.1 dB from finer steps without early termination, and twice as fast.
+    config.eval.sample_multiplier, config.eval.early_stop_eps = 0.7, 0.02
     return config

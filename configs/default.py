@@ -46,7 +46,7 @@ def get_config():
                 "size": 100,  # px, side of the embedded scene's images
                 "finish": "usual",  # surfaces of the embedded scene: "usual", "matt" (no view dependence), "shiny"
                 # Distances along the camera's axis in the file's units. 0: each image has its own, from the dataset.
-                # near "auto": one small distance with the occupancy sampler in the world "around"; otherwise 0.
+                # near "auto": one small distance where the occupancy sampler contracts space; otherwise 0.
                 "near": auto(float),
                 "far": 0.0,
                 # The colour behind alpha and behind the scene: "white", "black", "none" or "auto".

@@ -183,11 +183,11 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
 def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:
     """Fills what concerns the space in front of the cameras into a config; returns the views with their near.
 
-    In captures each image's own near follows from what it shows. No ray would then train the space between
+    In unbounded captures each image's own near follows from what it shows. No ray would then train the space between
     a camera and its near, so that another camera could see fog there.
     """
     infer, section = _inferring(lines), config.occupancy
-    everywhere = config.sampler == "occupancy" and config.data.world == "around" and not config.data.ndc
+    everywhere = config.sampler == "occupancy" and section.contracted
     distance = float(np.median(_LookAt(views).distance)) if everywhere else 0.0
     line = f"near space    gradients are reduced within {distance:.3g} of a camera"
     infer(section, "near_gradient_distance", distance, line, used=everywhere)

@@ -32,7 +32,7 @@ def test_painted_backgrounds_count_runs_hardly_better_than_the_background():
 def test_captures_with_painted_backgrounds_train():
     """With a plain sigmoid, seed 0 in front of black and most seeds in front of white collapse."""
     collapse = study("stability/collapse")
-    trained = collapse.PaintedStudy(240, "color_activation")
+    trained = collapse.PaintedStudy(480, "color_activation")
     for background in collapse.BACKGROUNDS:
         for seed in range(2):
             row = trained.run(seed, background)
