@@ -81,6 +81,7 @@ def test_mypy_accepts_typed_code(mypy):
     assert status == 0, output
 
 
+@pytest.mark.slow
 def test_mypy_finds_wrong_arguments(mypy, tmp_path):
     lines = ["Rays(origins=1)", "pixel_grid('4', 4)", "no_such_name", "load_dataset(3)", "psnr('a', 'b')"]
     path = tmp_path / "wrong.py"

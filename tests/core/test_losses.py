@@ -166,7 +166,7 @@ def test_nan_weights_show():
 RAYS, SEGMENTS = 24, 40
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("rule", ["segments", pytest.param("points", marks=pytest.mark.slow)])
 def test_dense_and_packed_renderings_have_the_same_losses(masked, rule):
     """Also in value and gradient where the occupancy grid skips samples, or the buffer has unused slots."""

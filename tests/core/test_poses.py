@@ -31,6 +31,7 @@ def test_it_is_the_matrix_exponential(angle):
     np.testing.assert_allclose(se3_exponential(np.float32(twist)), expected, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0, 1e-9, 0.9, 1.1])
 def test_its_derivatives_are_finite_differences(angle):
     twist, step = twist_of_angle(angle), 1e-6

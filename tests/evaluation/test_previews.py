@@ -90,6 +90,7 @@ def test_without_held_out_views_training_views_are_shown(folder, views, monkeypa
     np.testing.assert_array_equal(image[:, 24:], output_images.to_8_bits(reference(views, 30)))
 
 
+@pytest.mark.slow
 def test_previews_change_no_bit_of_training(trained, tmp_path, capsys):
     assert train_and_evaluate(smoke_config(preview_every=1e-9), tmp_path)
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("preview ")]
@@ -99,6 +100,7 @@ def test_previews_change_no_bit_of_training(trained, tmp_path, capsys):
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
+@pytest.mark.slow
 def test_the_time_of_previews_does_not_count(tmp_path):
     steps = []
 

@@ -56,6 +56,7 @@ def test_another_folder_of_the_same_dataset_replaces_that_of_the_run(scene, tmp_
     assert len(run.experiment.load_split("train").offset) == 7
 
 
+@pytest.mark.slow
 def test_a_run_without_resolved_sizes_is_baked(trained, tmp_path):
     """A run that was converted without its dataset keeps "auto" fields, which are inferred when they are used."""
     folder = shutil.copytree(trained, tmp_path / "run")

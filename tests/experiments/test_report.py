@@ -72,6 +72,7 @@ def test_the_page_has_every_run_and_names_unreadable_workdirs(runs, tmp_path):
     assert ("psnr.png" in names) == ("![PSNR over time](psnr.png)" in page)
 
 
+@pytest.mark.slow
 def test_missing_matplotlib_is_reported_and_a_page_is_replaced_only_with_overwrite(runs, tmp_path):
     (tmp_path / "matplotlib.py").write_text("raise ImportError")
     code, errors = report(runs[0], f"--out={tmp_path}", first=[str(tmp_path)])

@@ -12,6 +12,7 @@ from jaxnerf.data.dataset import load_dataset
 from jaxnerf.fields import room
 from studies import study
 
+pytestmark = pytest.mark.slow
 score_room = study("room/score_room")
 SCHEDULE = SimpleNamespace(lower=(-2.0,) * 3, upper=(2.0,) * 3, cell=(0.1, 0.1, 0.1), contracted=True)
 

@@ -223,6 +223,7 @@ def test_depth_supervision_is_absent_unless_its_loss_is_on(observed_views):
         experiment_of(plain, depth=0.1)
 
 
+@pytest.mark.slow
 def test_the_depth_loss_moves_matter_to_the_sparse_points(observed_views):
     experiment, data, step, state = experiment_of(observed_views, depth=200.0)
     assert data.views.sparse.confidence.shape == observed_views.sparse.view.shape
@@ -236,6 +237,7 @@ def test_the_depth_loss_moves_matter_to_the_sparse_points(observed_views):
     jax.tree.map(np.testing.assert_array_equal, resumed.params, state.params)
 
 
+@pytest.mark.slow
 def test_a_regularizer_of_levels_gets_those_of_the_hash_grid():
     config = smoke_config()
     config.update_from_flattened_dict(PACKED)
