@@ -14,6 +14,8 @@ from jaxnerf.runtime import cli
 def _load_saved(path):
     from jaxnerf.training.workdir import config_to_resume
 
+    if os.path.basename(path) != "config.json":
+        raise ValueError(f"--config={path} is not a run's config.json; give that, a name, or a Python file")
     return config_to_resume(os.path.dirname(path))
 
 

@@ -205,8 +205,8 @@ class Views:
         names: V file names without folder and extension.
         background: the colour that alpha is composited over; None for images without alpha.
         box: [2, 3] lower and upper corner in world units; the dataset states that space outside is empty.
-        free_until: [V] in t, the depth up to which the dataset states that nothing stands in front of each camera;
-            None: not known.
+        free_until: [V] in t, the depth up to which the dataset states that nothing stands in front of each camera, or
+            its points tell; 0 where they do not, None: not known.
         to_file: [4, 4] maps this world to that of the dataset's files; None where they are the same.
         sparse: points of the dataset's own model and their observations in these views; None without points.
     """

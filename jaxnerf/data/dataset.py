@@ -148,6 +148,7 @@ def load_split(data: ConfigDict, split: str, *, max_views: int | None = None) ->
             f"{folder}: holds {found}, expected {data.fingerprint} as in training: other images would be in each "
             "split, and the world would differ; restore the dataset, or train again in another --workdir"
         )
+    known = bounds.known_bounds(capture)
     capture = bounds.with_bounds(capture)
     to_file = np.eye(4)
     if data.world == "forward":
@@ -159,7 +160,8 @@ def load_split(data: ConfigDict, split: str, *, max_views: int | None = None) ->
         capture, to_file = world.recenter(capture)
     elif data.world == "around":
         capture, to_file = world.center(capture)
-    free_until = {frame.name: frame.bounds[0] for frame in capture.frames}
+    nearest = [frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)]
+    free_until = dict(zip((frame.name for frame in capture.frames), nearest, strict=True))
     capture = bounds.override_bounds(capture, near, data.far, to_file)
     box = None if capture.box is None else np.float32(capture.box)
     views = load_images.load_capture(capture, **reading)

@@ -12,6 +12,14 @@ _ACCURATE = 0.5  # px, standard deviation of an observation below which points d
 _LEAST = 0.05  # confidence below which an observation is dropped
 
 
+def num_shared(views: Views) -> int:
+    """Returns the number of observations of points that at least two of the views show; 0 without points."""
+    if views.sparse is None or not len(views.sparse.point):
+        return 0
+    count = np.bincount(views.sparse.point)
+    return int(count[count >= 2].sum())
+
+
 def check_observed(views: Views) -> None:
     """Raises a ValueError if the views have no observations of sparse points."""
     if views.sparse is None or not len(views.sparse.view):
@@ -48,8 +56,9 @@ def confident_observations(views: Views) -> SparsePoints:
     count = np.bincount(point, minlength=len(positions))
     variance = np.bincount(point, errors, minlength=len(positions)) / np.maximum(2 * count - 3, 1)
     variance = np.where(count >= 2, variance, np.inf)[point]
-    usual = max(np.median(variance), _ACCURATE**2)
-    confidence = np.exp(-variance / usual) if np.isfinite(usual) else np.zeros_like(variance)
+    finite = variance[np.isfinite(variance)]
+    usual = max(np.median(finite), _ACCURATE**2) if finite.size else 1.0
+    confidence = np.exp(-variance / usual)
     kept = confidence >= _LEAST
     if views.mask is not None:
         column, row = np.floor(sparse.pixel).astype(int).T

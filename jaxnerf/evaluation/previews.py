@@ -18,12 +18,14 @@ from jaxnerf.core.types import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask, reference
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
-from jaxnerf.runtime import processes
+from jaxnerf.runtime import memory, processes
 from jaxnerf.training import metric_log
 from jaxnerf.training.optimizer import averaged_params
 from jaxnerf.training.state import TrainState
 
 _MAX_VIEWS = 8  # of a split that the summary scores
+# What may go wrong with an image must not end a run: files, and the memory of a device that is full of training.
+_FAILURES = (ValueError, OSError, memory.OutOfMemory, jax.errors.JaxRuntimeError)
 _MAX_RAYS = 2**16  # of an image; of larger ones only every n-th row and column is rendered
 
 
@@ -47,7 +49,7 @@ class Previews:
         """
         try:
             return self._write(_on_one_device((averaged_params(state), state.grid)), int(state.step), views)
-        except (ValueError, OSError) as error:
+        except _FAILURES as error:
             return f"preview       none: {error}"
 
     def summary(self, views: Views) -> list[str]:
@@ -106,7 +108,7 @@ class Previews:
                 if held_out is not None and not results.exists():
                     lines.append(f"held-out      {self._mean_psnr(variables, held_out)} images of the split {split!r}")
                 lines.append(self._write(variables, step, views))
-            except (ValueError, OSError) as error:
+            except _FAILURES as error:
                 lines.append(f"scores        none: {error}")
         if results.exists():
             found = json.loads(results.read_text())

@@ -44,10 +44,10 @@ def from_context(context: SamplerContext) -> Model:
         field,
         schedule_from_section(section, field),
         pool_samples_per_ray=section["pool_samples_per_ray"],
-        min_samples_per_ray=section["min_samples_per_ray"],
+        min_samples_per_ray=section.get("min_samples_per_ray", 0.0),
         max_optical_depth=section["max_optical_depth"],
         occlusion_start_step=section["occlusion_start_step"],
-        near_gradient_distance=section["near_gradient_distance"],
+        near_gradient_distance=section.get("near_gradient_distance", 0.0),
         **view_options(context),
     )
 

@@ -12,7 +12,8 @@ from ml_collections import ConfigDict
 
 from jaxnerf.core.types import Views
 from jaxnerf.data import dataset
-from jaxnerf.data.geometry import poses, visual_hull
+from jaxnerf.data.geometry import poses, visual_hull, world
+from jaxnerf.data.observations import num_shared
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.runtime import devices
 from jaxnerf.runtime.config_fields import is_auto
@@ -23,6 +24,7 @@ _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 _MAX_STATED_BOX = 3.0  # times the box of contraction; a stated box that is larger is no better than contraction
+_MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
@@ -125,7 +127,7 @@ def _inferring(lines: list[str]) -> Callable[..., None]:
     """Returns the function that fills in a field if it is "auto", and adds a line if the run uses the field."""
 
     def infer(section: Any, name: str, value: Any, line: str, *, used: bool = True) -> None:
-        if is_auto(section[name]):
+        if name in section and is_auto(section[name]):  # configs of older versions lack some fields
             section[name] = value
             if used:
                 lines.append(line)
@@ -193,8 +195,8 @@ def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:
     infer(section, "near_gradient_distance", distance, line, used=everywhere)
     line = "valid cells   those that a training view sees"
     infer(section, "min_views", 1 if everywhere else 0, line, used=everywhere)
-    observed = everywhere and views.sparse is not None and len(views.sparse.view) > 0
-    count = len(views.sparse.view) if observed else 0
+    count = num_shared(views) if everywhere else 0
+    observed = count >= _MIN_OBSERVATIONS
     line = f"depth         {count:,} observations of sparse points guide the start of training"
     infer(config.losses, "depth", _DEPTH_WEIGHT if observed else 0.0, line, used=observed)
     if not is_auto(config.data.near):
@@ -202,7 +204,7 @@ def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:
     if not everywhere:
         config.data.near = 0.0
         return views
-    unit = 1.0 if views.to_file is None else float(np.cbrt(np.linalg.det(np.float64(views.to_file)[:3, :3])))
+    unit = 1.0 if views.to_file is None else world.unit_of(views.to_file)
     config.data.near = float(f"{_NEAR * distance * unit:.4g}")
     near = np.float32(config.data.near / unit)
     lines.append(f"near          {near:.3g} for all images, so that the space in front of each camera is trained")

@@ -16,7 +16,7 @@ from jaxnerf.core.types import TableLevel, Views
 from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.geometry.free_space import interpolated_depths
-from jaxnerf.data.observations import check_observed, confident_observations
+from jaxnerf.data.observations import confident_observations
 from jaxnerf.fields.base import Field, contract_field, make_field
 from jaxnerf.models.base import Model, SamplerContext, make_model
 from jaxnerf.models.occupancy import bake_occupancy, schedule_from_section, view_options
@@ -177,7 +177,7 @@ def check_views(config: ConfigDict, views: Views) -> None:
     """Raises a ValueError if a loss of a resolved config needs what the views lack, before training starts."""
     losses = build_losses(dict(config.losses), functools.partial(_levels, config))
     if any(not set(ray_batches.DEPTH_FIELDS).isdisjoint(loss.needs) for loss in losses):
-        check_observed(views)
+        confident_observations(views)
 
 
 def _of_levels(name, regularizer, levels):
@@ -306,7 +306,7 @@ def _prepare(config, model, extras, views):
             views,
             model.grid_schedule,
             use_alpha=config.occupancy.use_alpha and not config.data.ndc,
-            min_views=config.occupancy.min_views,
+            min_views=config.occupancy.get("min_views", 0),
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
         )

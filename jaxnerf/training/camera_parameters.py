@@ -84,6 +84,11 @@ class CameraParameters(NamedTuple):
             return views
         cameras, found = views.cameras, params[CAMERAS]
         if split == "train":
+            if len(cameras.to_world) != self.num_images:
+                raise ValueError(
+                    f"the run has refined the cameras of {self.num_images} training images, and the dataset has "
+                    f"{len(cameras.to_world)}, expected those that it was trained on; give its own --data_dir"
+                )
             cameras = corrected_cameras(cameras, found["twists"])
         cameras = dataclasses.replace(cameras, focal=jnp.asarray(cameras.focal) * jnp.exp(found["log_focal"]))
         return dataclasses.replace(views, cameras=cameras)

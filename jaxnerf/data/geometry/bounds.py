@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import gaze_center
-from jaxnerf.data.geometry.world import poses_of
+from jaxnerf.data.geometry.world import poses_of, unit_of
 from jaxnerf.data.readers.base import Capture
 
 _OUTLIERS = 1.0  # percent of points at each end that may be wrong matches
@@ -32,6 +32,11 @@ def with_bounds(capture: Capture) -> Capture:
     return capture._replace(frames=tuple(frames))
 
 
+def known_bounds(capture: Capture) -> list[bool]:
+    """Returns for each frame whether its bounds are stated or follow from the points that it shows."""
+    return [frame.bounds is not None or _of_points(capture, frame) is not None for frame in capture.frames]
+
+
 def override_bounds(capture: Capture, near: float, far: float, to_file: Float[np.ndarray, "4 4"]) -> Capture:
     """Returns the Capture with near and far in place of its frames' bounds, each unless it is 0.
 
@@ -43,7 +48,7 @@ def override_bounds(capture: Capture, near: float, far: float, to_file: Float[np
     Raises:
         ValueError: if a frame's near is not less than its far.
     """
-    unit = np.cbrt(np.linalg.det(np.asarray(to_file)[:3, :3]))
+    unit = unit_of(to_file)
     frames = []
     for frame in capture.frames:
         bounds = near / unit or frame.bounds[0], far / unit or frame.bounds[1]

@@ -63,12 +63,12 @@ def free_cells(
     Args:
         views: of the split that is trained on.
         schedule: of the box.
-        min_views: number of views whose sparse points must tell that a cell is in front of a surface.
+        min_views: number of views that must tell that a cell is in front of what they show.
         pixel_offset: see `draw_batch`.
 
     Returns:
-        The cells in front of `Views.free_until` of a view; and those in front of the surfaces that min_views views
-        see, or where no view sees a surface, as far as `surface_range` tells.
+        The cells in front of `Views.free_until` of min_views views; and those in front of the surfaces that min_views
+        views see, or where no view sees a surface, as far as `surface_range` tells.
     """
     grid = _grid(schedule, schedule.shape)
 
@@ -79,10 +79,10 @@ def free_cells(
         samples = march_rays(None, grid, rays, step_size=min(schedule.cell), cell=schedule.cell)
         return cells_along(grid, rays, samples_from_edges(None, edges)), cells_along(grid, rays, samples)
 
-    free, surface = np.zeros((2, grid.valid.size + 1), bool)
-    num_views = np.zeros(grid.valid.size + 1, np.int32)
+    surface = np.zeros(grid.valid.size + 1, bool)
+    num_free, num_in_front = np.zeros((2, surface.size), np.int32)
     for view in range(len(views.offset)):
-        in_front = np.zeros_like(free)
+        free, in_front = np.zeros((2, surface.size), bool)
         for pixels, rays in _rays_of(views, view, max(schedule.shape) // 2, False, pixel_offset):
             near, far = surface_range(views, view, pixels)
             before, between = cells_between(rays, near, far)
@@ -90,9 +90,12 @@ def free_cells(
             if views.free_until is not None:
                 near = np.full_like(near, views.free_until[view])
                 free[np.asarray(cells_between(rays, near, near)[0])] = True
-        num_views += in_front
-    free, surface, num_views = (cells[:-1].reshape(schedule.shape) for cells in (free, surface, num_views))
-    return free, ~np.asarray(widen(surface)) | (num_views >= min_views)
+        num_free += free
+        num_in_front += in_front
+    surface, free, in_front = (
+        cells[:-1].reshape(schedule.shape) for cells in (surface, num_free >= min_views, num_in_front >= min_views)
+    )
+    return free, ~np.asarray(widen(surface)) | in_front
 
 
 def _grid(schedule: GridSchedule, shape: tuple[int, int, int]) -> OccupancyGrid:

@@ -9,6 +9,11 @@ from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.data.readers.base import Capture
 
 
+def unit_of(to_file: Float[np.ndarray, "4 4"]) -> float:
+    """Returns the length in the file's units of one unit of a normalised world, from the matrix in float32."""
+    return float(np.cbrt(np.linalg.det(np.float64(np.float32(to_file))[:3, :3])))
+
+
 def poses_of(capture: Capture) -> Float[np.ndarray, "V 3 4"]:
     """Returns the poses of a dataset's frames."""
     return np.stack([frame.camera.to_world for frame in capture.frames])
