@@ -245,7 +245,8 @@ class _Pace:
 
     The exponent of its decay is the fraction of the steps that are done, or the fourth power of the fraction of the
     time that has passed, whichever is larger: a run with time for few steps keeps a high learning rate for most of
-    them, which is better than a steady decay. Such a run depends on the clock. Several processes have several clocks, so their learning rate depends on the steps alone.
+    them, which is better than a steady decay. Such a run depends on the clock. Several processes have several clocks,
+    so their learning rate depends on the steps alone.
     """
 
     def __init__(self, experiment: build.Experiment, clock: _Clock, data: Any):
