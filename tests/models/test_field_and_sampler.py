@@ -20,7 +20,7 @@ STEPS = 40
     ("field", "sampler"),
     [
         ("mlp", "hierarchical"),
-        ("hash_grid", "occupancy"),
+        pytest.param("hash_grid", "occupancy", marks=pytest.mark.slow),
         pytest.param("mlp", "occupancy", marks=pytest.mark.slow),
         pytest.param("hash_grid", "hierarchical", marks=pytest.mark.slow),
     ],

@@ -127,6 +127,7 @@ def tiny():
     return Tiny()
 
 
+@pytest.mark.slow
 def test_it_learns(tiny):
     state, metrics = tiny.run(0, NEVER)
     mse = np.asarray(metrics["mse"])
@@ -294,6 +295,7 @@ def test_devices_give_the_same_update_grid_and_counts(toy_runs, toy, mode):
         assert_same(many_row, row, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_small_sample_buffer_drops_rays_and_trains_on_the_others(toy_runs):
     state, rows = toy_runs["jit"]
     assert all_finite((state.params, rows)) and int(state.counters["nonfinite"]) == 0
