@@ -1,7 +1,7 @@
 """Counts how often a training collapses to an image of one colour, with and without reinitialization.
 
     python experiments/stability/collapse.py [--seeds=20] [--steps=600] [--out=runs/collapse] [--readme=README.md]
-    python experiments/stability/collapse.py --painted [--seeds=10] [--steps=240] [--out=...] [--readme=README.md]
+    python experiments/stability/collapse.py --painted [--seeds=10] [--steps=480] [--out=...] [--readme=README.md]
 
 Trains the embedded scene with a network that tends to die (ReLU density, eight narrow layers without a skip, a high
 learning rate), each seed with train.max_reinits=0 and with the default. Prints one row per run, then the table;

@@ -30,7 +30,7 @@ def test_painted_backgrounds_count_runs_hardly_better_than_the_background():
 
 @pytest.mark.slow
 def test_captures_with_painted_backgrounds_train():
-    """With a plain sigmoid, seed 0 in front of black and most seeds in front of white collapse."""
+    """With a plain sigmoid, both seeds in front of black and one of two in front of white collapse."""
     collapse = study("stability/collapse")
     trained = collapse.PaintedStudy(480, "color_activation")
     for background in collapse.BACKGROUNDS:
