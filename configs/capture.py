@@ -10,11 +10,11 @@ def get_config():
     data.format, data.dir, data.factor, data.width = "auto", "", "auto", 200
     data.background, data.ndc = "auto", "auto"
     # Without alpha no cell is known to be empty at first. In real scenes thin density is mostly spurious fog.
-    config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 13.5
+    config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 9.0
     train = config.train
     # lego_fast.py has other values here, chosen on lego alone.
-    config.hash_grid.view_width, train.averaging_power = 128, 0.0
-    train.batch_size, train.max_steps, train.lr_steps, train.max_seconds = 384, 40_000, 40_000, 600.0
+    train.averaging_power = 0.0
+    train.batch_size, train.max_steps, train.lr_steps, train.max_seconds = 576, 40_000, 40_000, 600.0
     # Chosen on held-out views for fast frames; `jaxnerf-eval --error_budget` finds other settings.
-    config.eval.sample_multiplier, config.eval.early_stop_eps = 0.7, 0.02
+    config.eval.sample_multiplier, config.eval.early_stop_eps = 1.0, 0.02
     return config

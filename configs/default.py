@@ -93,11 +93,11 @@ def get_config():
                 "threshold": 0.01,  # opacity over one step below which a cell is empty
                 "update_every": 64,  # training steps between updates of the grid
                 "cells_per_update": 2**18,  # cells whose density an update evaluates
-                # Size of the sample buffer in training, divided by the number of rays. Rays that do not fit are
-                # dropped and counted.
+                # Size of the sample buffer in training, divided by the number of rays. If the samples of all rays do
+                # not fit, the rays with most samples get fewer: this fraction of them evenly, the others where the
+                # grid expects the rays to end.
                 "pool_samples_per_ray": 10.0,
-                # While not all samples fit, the rays with most samples take longer steps, but keep this many; 0: off.
-                "min_samples_per_ray": 8.0,
+                "uniform_fraction": 0.4,
                 "max_optical_depth": 6.0,  # training skips samples behind it, as estimated by the grid; 0: off
                 "occlusion_start_step": 400,  # training step from which max_optical_depth applies
                 # World units; the gradients of samples that are closer to the camera are reduced; 0: off. Otherwise

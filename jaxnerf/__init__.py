@@ -8,6 +8,7 @@ are first used.
 import importlib as _importlib
 import typing as _typing
 
+import jaxnerf.runtime.quiet_start as _quiet_start  # noqa: F401
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, rays_from_pixels, undistort
 from jaxnerf.core.encoding import positional_encoding
 from jaxnerf.core.losses import distortion_loss

@@ -14,7 +14,6 @@ import pathlib
 import statistics
 import sys
 
-import imageio.v3 as iio
 import jax
 import numpy as np
 from absl import flags
@@ -23,6 +22,7 @@ from PIL import Image, ImageDraw
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
+from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.runtime import cli
 
@@ -266,7 +266,7 @@ def draw_images(kept: dict, out: pathlib.Path, path: pathlib.Path) -> None:
 
 def _panel(path, name):
     image = Image.new("RGB", (_SIDE, _SIDE + _LABEL), "white")
-    image.paste(Image.fromarray(iio.imread(path)).resize((_SIDE, _SIDE)), (0, _LABEL))
+    image.paste(Image.fromarray(read_stored(path)).resize((_SIDE, _SIDE)), (0, _LABEL))
     ImageDraw.Draw(image).text((3, 2), name, "black", font_size=10)
     return np.asarray(image)
 

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from jaxnerf.data.images import downscaled_copies
+from jaxnerf.data.images.image_files import image_size, open_image
 
 _SWAP_YZ = np.diag([1.0, -1.0, -1.0])
 _LLFF = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # from LLFF's axes (down, right, backwards)
@@ -133,8 +134,8 @@ def cut(path: Path) -> None:
 
 def resize(path: Path, fraction: float) -> None:
     """Resizes an image to a fraction of its size."""
-    image = Image.open(path)
-    image.load()
+    with open_image(path) as image:
+        image.load()
     path.unlink()
     image.resize([round(side * fraction) for side in image.size]).save(path)
 
@@ -142,8 +143,8 @@ def resize(path: Path, fraction: float) -> None:
 def remove_alpha(folder: Path, index: int) -> None:
     """Adds alpha to all images without, and removes it from one."""
     for place, path in enumerate(images(folder)):
-        image = Image.open(path)
-        image.load()
+        with open_image(path) as image:
+            image.load()
         if place == index:
             path.unlink()
             image.convert("RGB").save(path, format="PNG")
@@ -163,7 +164,7 @@ def add_masks(folder: Path, *, without: Sequence[str] = (), unwritten: Sequence[
         if name not in without:
             frame["mask_path"] = f"masks/{name}.png"
         if path.is_file() and name not in (*without, *unwritten):
-            Image.new("L", Image.open(path).size, 255).save(Path(folder) / frame["mask_path"])
+            Image.new("L", image_size(path, follow_exif=False), 255).save(Path(folder) / frame["mask_path"])
     source.write_text(json.dumps(content))
 
 

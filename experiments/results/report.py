@@ -6,12 +6,10 @@ Writes DIR/report.md, DIR/pictures.png and, with the extra `experiments`, DIR/ps
 jaxnerf.eval wrote into the workdirs. A workdir that cannot be read is reported, also on the page.
 """
 
-import json
 import pathlib
 import sys
 from typing import Any, NamedTuple
 
-import imageio.v3 as iio
 import numpy as np
 from absl import flags
 from PIL import Image
@@ -20,9 +18,10 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 from results import table
 
+from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.runtime import cli
-from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.runtime.atomic_files import read_json, write_text
 from jaxnerf.training import metric_log
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the page.", required=True)
@@ -91,7 +90,7 @@ def read_run(folder: pathlib.Path) -> Run:
     paths = table.scored(folder)
     if not paths:
         raise ValueError("has no eval/*/results.json; run python -m jaxnerf.eval --workdir=... first")
-    results = [json.loads(path.read_text()) for path in paths]
+    results = [read_json(path, "score it again") for path in paths]
     return Run(
         name=folder.name,
         rows=[table.row(path) for path in paths],
@@ -108,7 +107,7 @@ def _strip(folder):
     if not names:
         raise ValueError(f"{folder / 'color'}: has no images; score again with --overwrite")
     chosen = [names[index] for index in np.linspace(0, len(names) - 1, _VIEWS).astype(int)]
-    panels = [iio.imread(folder / kind / name) for name in chosen for kind in ("gt-color", "color")]
+    panels = [read_stored(folder / kind / name) for name in chosen for kind in ("gt-color", "color")]
     sizes = [(round(panel.shape[1] * _HEIGHT / panel.shape[0]), _HEIGHT) for panel in panels]
     return np.concatenate(
         [np.asarray(Image.fromarray(p).resize(size)) for p, size in zip(panels, sizes, strict=True)], axis=1

@@ -6,7 +6,6 @@ Prints one row per scored checkpoint. With --readme the table in that file betwe
 <!-- end of results --> is replaced; --table is the word in these marks.
 """
 
-import json
 import pathlib
 import sys
 
@@ -16,6 +15,7 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf.runtime import cli
+from jaxnerf.runtime.atomic_files import read_json
 
 HEADS = ("run", "step", "training", "compiling", "PSNR", "SSIM", "views", "parameters")
 
@@ -36,7 +36,7 @@ def scored(folder: pathlib.Path) -> list[pathlib.Path]:
 
 def row(path: pathlib.Path) -> tuple[str, ...]:
     """Returns the cells of one results.json."""
-    results = json.loads(path.read_text())
+    results = read_json(path, "score it again")
     run = path.parts[-4] + ("" if path.parent.name.isdigit() else f" ({path.parent.name.split('-')[1]})")
     return (
         run,

@@ -6,7 +6,7 @@
 
 Writes DIR/<part>.json, DIR/published.json (what others report, with its source) and DIR/speed_vs_error.png, and
 prints the tables. What DIR holds already is kept: the same command resumes after an interruption. The parts
-rendering and limits take the run of --workdir, or the first of the curve "grid"; with "none" they do without.
+rendering and limits take the run of --workdir, or the longest of the curve "grid"; with "none" they do without.
 With --readme the tables replace what lies between <!-- speed --> and <!-- end of speed --> in that file.
 """
 
@@ -24,12 +24,15 @@ from speed import published, rendering, step, training
 
 from jaxnerf.runtime import cli
 
+_CURVE = "grid"  # whose run the other parts take
 PARTS = ("training", "rendering", "limits", "cost")
 BARS = (29.0, 30.0, 31.0, 32.0, 32.5, 33.5)
 _OUT = flags.DEFINE_string("out", None, "Folder of the measurements.", required=True)
 _PARTS = flags.DEFINE_list("parts", list(PARTS), f"Parts to measure, of {PARTS}; 'report' alone measures nothing.")
 _CURVES = flags.DEFINE_list("curves", None, "Names of training curves; all when not given.")
-_SEEDS = flags.DEFINE_list("seeds", ["0", "1", "2"], "Seeds of the curve 'grid'; the others take the first.")
+_SEEDS = flags.DEFINE_list(
+    "seeds", ["0", "1", "2"], f"Seeds of the curves {training.SEEDED}; the others take the first."
+)
 _SECONDS = flags.DEFINE_list("seconds", [], "Seconds of training, in place of the curves' own.")
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a trained run, or 'none'.")
 _VIEWS = flags.DEFINE_integer("views", 3, "Number of test views to render with each setting.", lower_bound=1)
@@ -56,13 +59,14 @@ def main(argv: list[str]) -> None:
 def _measure(part, out):
     """Measures a part; returns whether it was completed."""
     path = out / f"{part}.json"
-    kept, config = common.read_json(path), training.configuration(training.SEEDED)
+    kept, config = common.read_json(path), training.configuration(_CURVE)
 
     def save(kept):
         common.write_json(path, kept)
 
     seeds = common.seeds_of("--seeds", _SEEDS.value)
-    default = out / "runs" / training.workdir_name(training.SEEDED, seeds[0])
+    longest = training.workdir_name(_CURVE, seeds[0], max(training.CURVES[_CURVE]["seconds"]))
+    default = out / "runs" / longest
     folder = None if _WORKDIR.value == "none" else _WORKDIR.value or str(default)
     if part == "training":
         names = common.chosen("--curves", _CURVES.value or list(training.CURVES), list(training.CURVES))
@@ -280,7 +284,7 @@ def _plot_training(axis, kept):
         line = [(point["seconds"], point["psnr"]) for point in points]
         if not line:
             continue
-        other = name.split()[-1] if name.split()[-1].isdigit() else ""
+        other = name.split()[-1].isdigit() or curve["config"] == "capture"  # of another size or scene
         axis.plot(*zip(*line, strict=True), ":" if other else "-", marker="o", markersize=4, label=name)
         small += [] if other else line
     if small:

@@ -28,7 +28,6 @@ _FOX = {"data.format": "transforms", "data.dir": "fox"}
 _NO_UPDATES = {
     "occupancy.update_every": 10**8,
     "occupancy.max_optical_depth": 0.0,
-    "occupancy.min_samples_per_ray": 0.0,
     "occupancy.pool_samples_per_ray": 243.0,
     "train.batch_size": 43,
 }
@@ -36,10 +35,13 @@ _NO_UPDATES = {
 _ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4}
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
 CURVES = {
-    "grid": _curve("lego_fast", (15, 30, 45, 60, 90, 120, 180, 300)),
-    "grid without alpha": _curve("lego_fast", (30, 60, 90, 180, 300), **{"occupancy.use_alpha": False}),
-    "grid 200": _curve("lego_fast", (30, 60, 100, 180, 360), **{"data.factor": 4}),
-    "grid 400": _curve("lego_fast", (60, 150, 300, 600), **{"data.factor": 2}),
+    "grid": _curve("lego_fast", (10, 15, 30, 60, 120, 300)),
+    "grid without alpha": _curve("lego_fast", (15, 30, 60, 120), **{"occupancy.use_alpha": False}),
+    "grid 200": _curve("lego_fast", (60, 300), **{"data.factor": 4}),
+    "grid 400": _curve("lego_fast", (180, 600), **{"data.factor": 2}),
+    "capture can": _curve("capture", (120, 300, 600), **{"data.dir": "can"}),
+    "capture fern": _curve("capture", (120, 300, 600), **{"data.dir": "fern"}),
+    "capture fox": _curve("capture", (120, 300, 600), **{"data.dir": "fox"}),
     "small network": _curve("lego_mlp_fast", (30, 60, 120, 240, 480)),
     "small network by Adam": _curve("lego_mlp_fast", (30, 60, 120, 240, 480), **_ADAM),
     "small network everywhere": _curve("lego_mlp_fast", (120, 480), **_DENSE),
@@ -53,7 +55,7 @@ CURVES = {
     "paper": _curve("default", (600, 1800), **_PAPER),
     "paper skipping": _curve("default", (600, 1800), **_PAPER, **{"sampler": "occupancy"}),
 }
-SEEDED = "grid"  # the curve that is measured with several seeds
+SEEDED = ("grid", "grid without alpha")  # the curves that are measured with several seeds
 
 
 def measure(
@@ -64,14 +66,16 @@ def measure(
     seeds: Sequence[int],
     seconds: Sequence[float] = (),
 ) -> bool:
-    """Trains curves to each of their times and scores the test views there; kept points are not repeated.
+    """Trains a run for each time of each curve and scores the test views; kept points are not repeated.
+
+    The learning rate reaches its end when the time does, so a point of a curve is no part of a longer run.
 
     Args:
         kept: what an earlier call saved, {} at first; it is extended.
         save: called with kept after each score.
         folder: of the workdirs.
         names: of CURVES.
-        seeds: of the curve SEEDED; the others take the first.
+        seeds: of the curves SEEDED; the others take the first.
         seconds: in place of the curves' own.
 
     Returns:
@@ -84,13 +88,12 @@ def measure(
         curve = kept.setdefault("curves", {}).setdefault(name, {**described, "runs": {}})
         if {key: curve[key] for key in described} != described:
             raise ValueError(f"{name}: was measured with {curve['overrides']}; give another --out")
-        for seed in seeds if name == SEEDED else seeds[:1]:
+        for seed in seeds if name in SEEDED else seeds[:1]:
             points = curve["runs"].setdefault(str(seed), [])
-            where = folder / workdir_name(name, seed)
             for time_limit in sorted(seconds or plan["seconds"]):
                 if points and (time_limit <= points[-1]["time_limit"] or points[-1]["ended"]):
                     continue
-                point = run_to(time_limit, configuration(name, seed), where, points[-1] if points else None)
+                point = run_to(time_limit, configuration(name, seed), folder / workdir_name(name, seed, time_limit))
                 if point is None:
                     return False
                 points.append(point)
@@ -104,20 +107,18 @@ def configuration(name: str, seed: int = 0):
     return common.configuration(CURVES[name]["config"], CURVES[name]["overrides"], seed=seed)
 
 
-def workdir_name(name: str, seed: int) -> str:
-    """Returns the name of a curve's workdir."""
-    return f"{name.replace(' ', '_')}-{seed}"
+def workdir_name(name: str, seed: int, time_limit: float) -> str:
+    """Returns the name of the workdir of a curve's point."""
+    return f"{name.replace(' ', '_')}-{seed}-{time_limit:g}"
 
 
-def run_to(time_limit: float, config, where: pathlib.Path, before: dict[str, Any] | None) -> dict[str, Any] | None:
+def run_to(time_limit: float, config, where: pathlib.Path) -> dict[str, Any] | None:
     """Returns the scores of a run after so many seconds of training, or None if it was interrupted.
 
     Args:
-        time_limit: seconds of training in all.
+        time_limit: seconds of training.
         config: of the run.
-        where: its workdir.
-        before: the point from which the run resumes, or None. Comparable seconds add up over the pieces, each
-            scaled by the machine's speed just before and after it.
+        where: its workdir. Comparable seconds are scaled by the machine's speed just before and after the run.
     """
     config.train.max_seconds = float(time_limit)
     fresh = not metric_log.read_rows(where)
@@ -128,16 +129,14 @@ def run_to(time_limit: float, config, where: pathlib.Path, before: dict[str, Any
     speed.append(common.matrix_gflops())
     result = evaluate(where, overwrite=True)
     trained, compiling = result["training_seconds"], result["compile_seconds"]
-    last = before or {"seconds": 0.0, "comparable": 0.0, "compile_seconds": compiling, "setup_seconds": None}
-    piece = trained - last["seconds"]
     return {
         "time_limit": time_limit,
         "ended": result["step"] >= workdir.read_config(where).train.max_steps,
         "seconds": trained,
-        "comparable": last["comparable"] + common.comparable(piece, sum(speed) / 2),
+        "comparable": common.comparable(trained, sum(speed) / 2),
         "gflops": speed,
-        "compile_seconds": last["compile_seconds"],  # of the first start
-        "setup_seconds": wall - trained - compiling if fresh else last["setup_seconds"],
+        "compile_seconds": compiling,
+        "setup_seconds": wall - trained - compiling if fresh else None,  # not known of a run that was interrupted
         "rays": result["rays_seen"],
         **{key: result[key] for key in ("step", "psnr", "ssim", "seconds_per_frame", "views", "parameters")},
     }

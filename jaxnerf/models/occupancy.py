@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxnerf.core.occupancy.from_scene import crop_grid, num_visibility_rays, visible_grid
-from jaxnerf.core.occupancy.grid import OccupancyGrid, mask_samples, mask_scene
-from jaxnerf.core.occupancy.packed import render_packed
+from jaxnerf.core.occupancy.grid import OccupancyGrid, mask_scene
+from jaxnerf.core.occupancy.importance import importance_samples
+from jaxnerf.core.occupancy.packed import render_packed, render_placed
 from jaxnerf.core.occupancy.ray_culling import rays_may_hit, render_background
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import Background, Rays, Rendering, SceneFn
@@ -20,9 +20,6 @@ from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 
-_COUNTING_STEP = 8  # times the step size: in training, steps that only count a ray's samples
-_MAX_STRETCH = 8.0  # times the step size, the longest step of training
-_FILLED = 0.95  # of the sample buffer: the counts are estimates
 _SMALLEST_EPS = 1e-30  # replaces an early_stop_eps of 0: below this transmittance no light is left
 
 
@@ -44,7 +41,7 @@ def from_context(context: SamplerContext) -> Model:
         field,
         schedule_from_section(section, field),
         pool_samples_per_ray=section["pool_samples_per_ray"],
-        min_samples_per_ray=section.get("min_samples_per_ray", 0.0),
+        uniform_fraction=section.get("uniform_fraction", 1.0),
         max_optical_depth=section["max_optical_depth"],
         occlusion_start_step=section["occlusion_start_step"],
         near_gradient_distance=section.get("near_gradient_distance", 0.0),
@@ -72,7 +69,7 @@ def occupancy_model(
     schedule: GridSchedule,
     *,
     pool_samples_per_ray: float,
-    min_samples_per_ray: float,
+    uniform_fraction: float,
     max_optical_depth: float,
     occlusion_start_step: int,
     near_gradient_distance: float,
@@ -86,11 +83,9 @@ def occupancy_model(
     Args:
         field: any Field.
         schedule: of the occupancy grid.
-        pool_samples_per_ray: size of training's sample buffer over the number of rays. Rays whose samples do
-            not fit are dropped and counted.
-        min_samples_per_ray: of training. While not all samples fit into the buffer, the rays with most samples take
-            longer steps, but keep at least this many samples; 0: all steps have the same length. Early in training
-            the field is fog, which looks the same with long steps.
+        pool_samples_per_ray: size of training's sample buffer over the number of rays. If the samples of all rays do
+            not fit, the rays with most samples get fewer, see `importance_samples`.
+        uniform_fraction: of training, see `importance_samples`.
         max_optical_depth: training skips samples behind this optical depth, as estimated by the grid;
             0: no limit.
         occlusion_start_step: the training step from which max_optical_depth applies.
@@ -110,17 +105,11 @@ def occupancy_model(
         limit = jnp.inf
         if max_optical_depth:
             limit = jnp.where(step < occlusion_start_step, jnp.inf, max_optical_depth)
-        stretch = 1.0
-        if min_samples_per_ray:
-            step_size = _COUNTING_STEP * schedule.step_size
-            samples = march_rays(None, grid, fixed, step_size=step_size, cell=schedule.cell)
-            counted = mask_samples(grid, fixed, samples, max_optical_depth=limit)[0].delta > 0
-            count = _COUNTING_STEP * counted.sum(axis=-1)
-            stretch = fit_steps(count, _FILLED * buffer, min_samples_per_ray)
-        samples = march_rays(keys, grid, fixed, step_size=schedule.step_size, cell=schedule.cell, stretch=stretch)
-        samples, occluded = mask_samples(grid, fixed, samples, max_optical_depth=limit)
-        options = {"max_samples": buffer, "near_gradient_distance": near_gradient_distance}
-        rendering = render_packed(scene(params), None, rays, samples, **options)
+        candidates = march_rays(None, grid, fixed, step_size=schedule.step_size, cell=schedule.cell)
+        options = {"max_samples": buffer, "uniform_fraction": uniform_fraction, "max_optical_depth": limit}
+        samples, occluded = importance_samples(keys, grid, fixed, candidates, **options)
+        options = {"longest": candidates.t.shape[-1], "near_gradient_distance": near_gradient_distance}
+        rendering = render_placed(scene(params), rays, samples, **options)
         return (_over_background(rendering, occluded, background),)
 
     return Model(
@@ -201,24 +190,6 @@ def render_with_grid(
         early_stop_eps=early_stop_eps or _SMALLEST_EPS,
         background=background,
     )
-
-
-def fit_steps(count: Int[ArrayLike, " B"], max_samples: float, min_samples_per_ray: float) -> Float[Array, " B"]:
-    """Returns the factors [B] >= 1 by which the steps of rays become longer, so that all samples fit into a buffer.
-
-    The rays with most samples get longer steps until all have at most a common number m of samples, the solution of
-    sum_i min(count_i, m) = max_samples, but not fewer than min_samples_per_ray.
-
-    Args:
-        count: [B] samples of each ray with steps of the usual length.
-        max_samples: number of samples that fit.
-        min_samples_per_ray: see `occupancy_model`.
-    """
-    ascending = jnp.sort(count)
-    below, above = jnp.cumsum(ascending) - ascending, jnp.arange(count.size, 0, -1)
-    # The sum is the least of the lines below_k + above_k m, so m is the largest of their solutions.
-    most = jnp.maximum(((max_samples - below) / above).max(), min_samples_per_ray)
-    return jnp.where(count.sum() > max_samples, jnp.clip(count / most, 1, _MAX_STRETCH), 1.0)
 
 
 def _cull(schedule, background):

@@ -20,7 +20,8 @@ from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.build import build_model
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
-_FINEST = (32, 256)  # vertices along the longest side, minimum and maximum
+_FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, where space is not contracted
+_LEVELS = 4  # of the hash grid; the box of contracted space is twice as large and has one level more
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 _MAX_STATED_BOX = 3.0  # times the box of contraction; a stated box that is larger is no better than contraction
@@ -160,7 +161,9 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
         raise ValueError(
             f"occupancy.lower is {section.lower} and occupancy.upper {section.upper}, expected lower < upper"
         )
-    finest = int(np.clip(round(longest / (_CELL_PER_PIXEL * footprint)), *_FINEST))
+    wide = bool(section.contracted)  # half of the box holds the surroundings
+    vertices = int(np.clip(round(longest / (_CELL_PER_PIXEL * footprint)), _FINEST[0], _FINEST[1] << wide))
+    finest = min(vertices, _FINEST[1])
     step_size = longest / min(finest, _MAX_STEPS_PER_SIDE)
     line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
     infer(section, "step_size", step_size, line, **use_box)
@@ -170,7 +173,7 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     for name, used in (("coarse", config.sampler == "hierarchical"), ("fine", config.field == "mlp")):
         line = f"octaves       {octaves} in {name}; the shortest wave is four pixels long"
         infer(config[name], "num_freqs", octaves, line, used=used)
-    levels = tuple(max(finest // 2**level, 2) for level in (3, 2, 1, 0))
+    levels = tuple(max(vertices // 2**level, 2) for level in reversed(range(_LEVELS + wide)))
     line = f"hash grid     {levels} vertices along the longest side"
     infer(config.hash_grid, "resolutions", levels, line, used=config.field == "hash_grid")
     side = float(np.sqrt(np.prod(views.size, axis=1)).mean())

@@ -20,7 +20,7 @@ _RANGES = (
         (
             "data.near data.far data.hold_out data.num_views sampling.num_fine sampling.importance_padding "
             "sampling.density_noise hash_grid.geometry_features hash_grid.view_depth occupancy.threshold "
-            "occupancy.min_samples_per_ray occupancy.near_gradient_distance occupancy.min_views "
+            "occupancy.near_gradient_distance occupancy.min_views "
             "occupancy.max_optical_depth occupancy.occlusion_start_step train.max_seconds train.warmup_steps "
             "train.muon train.averaging_power train.max_reinits train.preview_every "
             "cameras.refine_start_step eval.summary_seconds"
@@ -34,6 +34,7 @@ _RANGES = (
             "train.epsilon cameras.exposure_lr cameras.refine_lr eval.sample_multiplier"
         ),
     ),
+    ("more than 0 and at most 1", lambda value: 0 < value <= 1, "occupancy.uniform_fraction"),
     ("at least 0 and below 1", lambda value: 0 <= value < 1, "train.beta1 train.beta2 eval.early_stop_eps"),
 )
 

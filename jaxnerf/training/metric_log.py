@@ -2,13 +2,10 @@
 
 import json
 import logging
-import math
 import os
 import pathlib
-import shutil
 import sys
 import time
-from collections.abc import Sequence
 from typing import Any, TextIO
 
 import jax
@@ -16,13 +13,12 @@ import numpy as np
 
 from jaxnerf.core.metrics import decibels
 from jaxnerf.core.types import Views
-from jaxnerf.runtime.atomic_files import naming, write_text
+from jaxnerf.runtime.atomic_files import naming, open_regular, parse_json, partial_file, read_bytes, write_text
 from jaxnerf.runtime.devices import devices_of
 from jaxnerf.training.dead_networks import dead_networks
 from jaxnerf.training.state import TrainState
 
-_MAX_DROPPED = 0.1  # fraction of the rays
-_DROPPED_ROWS = 3  # in a row; at first most cells are occupied and many samples do not fit
+_READ_AGAIN = ("step", "seconds", "rays", "compile_seconds")  # by a run that resumes, its evaluation or its summary
 
 
 class MetricLog:
@@ -46,7 +42,8 @@ class MetricLog:
             return
         if damaged:
             kept = self._path.with_name("metrics.jsonl.damaged")
-            shutil.copyfile(self._path, kept)
+            with partial_file(kept) as partial:
+                partial.write_bytes(read_bytes(self._path))
             lines = f"{len(damaged)} lines from line {damaged[0]} on that are not rows"
             print(f"{self._path}: dropped {lines}; the file is kept as {kept.name}", file=sys.stderr)
         if cut:
@@ -59,7 +56,7 @@ class MetricLog:
         self.rows.append(row)
         if not self._write:
             return
-        with naming(self._path), self._path.open("a") as file:
+        with naming(self._path), open_regular(self._path, "a") as file:
             file.write(json.dumps(row) + "\n")
         self._events.append(row)
 
@@ -79,7 +76,7 @@ def read_rows(workdir: str | os.PathLike) -> list[dict[str, Any]]:
 
 def _parse(path):
     """Returns rows, the numbers of lines that are not rows, and whether the last line is incomplete."""
-    *lines, last = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    *lines, last = read_bytes(path).split(b"\n") if path.exists() else [b""]
     found = [_parse_row(line) for line in lines]
     damaged = [number for number, row in enumerate(found, 1) if row is None]
     if _parse_row(last):
@@ -88,12 +85,16 @@ def _parse(path):
 
 
 def _parse_row(line):
-    """Returns the row that a line in bytes holds, or None."""
+    """Returns the row that a line in bytes holds: numbers, those that a run reads again finite; or None."""
     try:
-        row = json.loads(line)
+        row = parse_json(line)
     except ValueError:
         return None
-    return row if isinstance(row, dict) and type(row.get("step")) is int and "seconds" in row else None
+    if not isinstance(row, dict) or type(row.get("step")) is not int:
+        return None
+    numbers = all(type(value) is float or (type(value) is int and abs(value) < 2**63) for value in row.values())
+    finite = numbers and all(0 <= row.get(name, 0) < 2**63 for name in _READ_AGAIN)
+    return row if finite and "seconds" in row else None
 
 
 class _Events:
@@ -266,27 +267,6 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
         f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{_minutes(row['seconds'])} elapsed, {_minutes(0.0 if out_of_time else left)} left{notes}"
     )
-
-
-def warnings(rows: Sequence[dict[str, Any]], experiment: Any) -> list[str]:
-    """Returns a line, once in a run, if the sample buffer has been too small for many rays over the last rows.
-
-    Args:
-        rows: all rows of the run, the new one last.
-        experiment: of the run.
-    """
-    dropped = np.diff([row.get("rays_dropped", 0) for row in rows], prepend=0)
-    drawn = np.diff([row["step"] for row in rows], prepend=0) * experiment.train.batch_size
-    many = dropped > _MAX_DROPPED * drawn
-    runs = np.convolve(many, np.ones(_DROPPED_ROWS, int))[: len(many)] == _DROPPED_ROWS
-    if not runs.any() or runs[:-1].any():
-        return []
-    found = dropped[-_DROPPED_ROWS:].sum() / drawn[-_DROPPED_ROWS:].sum()
-    size = experiment.model.samples_per_ray
-    return [
-        f"warning       {found:.0%} of rays are dropped, as their samples do not fit into the sample buffer: set "
-        f"--config.occupancy.pool_samples_per_ray to {math.ceil(1.5 * size)} or more (now {size:g}) in a new --workdir"
-    ]
 
 
 def _minutes(seconds):

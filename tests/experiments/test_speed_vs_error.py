@@ -64,5 +64,5 @@ def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, t
     monkeypatch.setattr(training, "train_and_evaluate", train)
     monkeypatch.setattr(training, "evaluate", lambda where, overwrite: scores)
     monkeypatch.setattr(common, "matrix_gflops", lambda: 2 * common.REFERENCE_GFLOPS)
-    point = training.run_to(3, config, tmp_path, None)
+    point = training.run_to(3, config, tmp_path)
     assert (point["ended"], point["seconds"], point["comparable"]) == (ended, 2.0, 4.0)

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import itertools
 import json
 import sys
 
@@ -313,6 +314,26 @@ def test_larger_images_are_trained_on_longer(views):
     got, _, lines = resolve(config, views)
     assert (got.train.max_steps, got.train.lr_steps) == (7, 7)
     assert not any(line.startswith("training") and "steps, for images" in line for line in lines)
+
+
+def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
+    def sizes(contracted, factor):
+        larger = dataclasses.replace(
+            views,
+            size=factor * views.size,
+            cameras=dataclasses.replace(views.cameras, focal=factor * np.asarray(views.cameras.focal)),
+        )
+        config = auto_config(use_alpha=False, contracted=contracted)
+        got = resolve(config, larger).config
+        longest = max(np.subtract(got.occupancy.upper, got.occupancy.lower))
+        return got.hash_grid.resolutions, got.occupancy.resolution, round(longest / got.occupancy.step_size)
+
+    for contracted, finest, levels in ((False, (34, 69, 256), 4), (True, (69, 137, 512), 5)):
+        for factor, vertices in zip((1, 2, 16), finest, strict=True):
+            resolutions, cells, steps = sizes(contracted, factor)
+            assert len(resolutions) == levels and resolutions[-1] == pytest.approx(vertices, abs=1)
+            assert all(2 * a in (b, b - 1) for a, b in itertools.pairwise(resolutions))
+            assert cells == min(resolutions[-1], 128) and steps == min(resolutions[-1], 144)
 
 
 def test_box_holds_all_matter_of_the_embedded_scene(resolved):

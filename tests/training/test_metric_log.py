@@ -50,21 +50,6 @@ def test_line_reports_what_went_wrong():
     )
 
 
-def dropped(*counts):
-    """Returns rows of 10 steps of 64 rays each, with so many dropped in total."""
-    return [{"step": 10 * index, "rays_dropped": count} for index, count in enumerate(counts, 1)]
-
-
-def test_a_full_sample_buffer_is_reported_once_and_names_the_setting():
-    experiment = types.SimpleNamespace(train=TRAIN, model=types.SimpleNamespace(samples_per_ray=10.0))
-    rows = dropped(320, 640, 700, 828, 956, 1084, 1212)  # 50, 50, 9, 20, 20, 20, 20 %
-    said = [metric_log.warnings(rows[:count], experiment) for count in range(1, len(rows) + 1)]
-    assert [len(lines) for lines in said] == [0, 0, 0, 0, 0, 1, 0]
-    assert said[5][0].startswith("warning       20% of rays are dropped, as their samples do not fit")
-    assert "--config.occupancy.pool_samples_per_ray to 15 or more (now 10)" in said[5][0]
-    assert metric_log.warnings([{"step": 10}, {"step": 20}, {"step": 30}], experiment) == []
-
-
 def test_a_note_is_a_line_above_the_bar():
     class Terminal(io.StringIO):
         def isatty(self):

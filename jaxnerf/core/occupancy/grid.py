@@ -247,16 +247,33 @@ def mask_samples(
         Samples [..., S] with delta 0 where they are masked; and occluded [...], whether samples of a ray in
         occupied cells are masked.
     """
+    occupied, optical_depth = estimate_optical_depth(grid, rays, samples)
+    occluded = volume_rendering.exclusive_sum(optical_depth) > max_optical_depth
+    kept = occupied & ~occluded
+    masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
+    return masked, (occupied & occluded).any(axis=-1)
+
+
+def estimate_optical_depth(
+    grid: OccupancyGrid, rays: Rays, samples: Samples
+) -> tuple[Bool[Array, "*batch samples"], Float[Array, "*batch samples"]]:
+    """Estimates the optical depth of samples from the grid's density_mean; no scene is evaluated.
+
+    Args:
+        grid: OccupancyGrid.
+        rays: Rays [...].
+        samples: Samples [..., S].
+
+    Returns:
+        [..., S] bool, whether a sample has a length and is in an occupied cell, or is NaN, so that it is visible; and
+        [..., S], its optical depth, 0 where it is not.
+    """
     index, inside = _cells_of(grid, _along_rays(grid, rays, samples.t))
     mean = jnp.where(inside & ~(samples.delta <= 0), grid.density_mean.reshape(-1)[index], -1)
     # A plain norm, as it is computed again for every sample; an estimate need not be accurate at lengths of 1e-20.
     x, y, z = (rays.directions[..., axis] for axis in range(3))
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
-    occluded = volume_rendering.exclusive_sum(jnp.maximum(mean, 0) * samples.delta * size) > max_optical_depth
-    occupied = ~(mean < 0) | jnp.isnan(samples.t)  # NaN is kept, so that it is visible
-    kept = occupied & ~occluded
-    masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
-    return masked, (occupied & occluded).any(axis=-1)
+    return ~(mean < 0) | jnp.isnan(samples.t), jnp.maximum(mean, 0) * samples.delta * size
 
 
 def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:

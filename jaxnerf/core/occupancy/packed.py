@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
@@ -18,6 +18,24 @@ from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Sampl
 
 _OPAQUE = 1e-3  # transmittance below which a ray counts as opaque
 _HIGH_EPS = 0.01  # an early_stop_eps above which rays end so soon that long runs waste samples
+
+
+class PlacedSamples(NamedTuple):
+    """Samples of many rays in one buffer of fixed size, ray after ray, near to far, before the scene is evaluated.
+
+    Attributes:
+        t: [K] in t of the sample's ray.
+        delta: [K] length in t.
+        ray_index: [K] int32, index of the sample's ray, ascending.
+        used: [K] bool, False for unused slots, which come last.
+        num_dropped: [B] int32, the number of a ray's samples that did not fit.
+    """
+
+    t: Float[Array, " K"]
+    delta: Float[Array, " K"]
+    ray_index: Int[Array, " K"]
+    used: Bool[Array, " K"]
+    num_dropped: Int[Array, " B"]
 
 
 def render_packed(
@@ -71,9 +89,42 @@ def render_packed(
     else:
         occupied, slot = _count_occupied(words), jnp.arange(max_samples)
         buffer = _fill(occupied, slot, slot < occupied.ends[-1])
-        sums, packed = _composite(scene, rays, samples, buffer, near_gradient_distance)
+        t, delta = (jnp.where(buffer.used, leaf[buffer.ray, buffer.source], 0) for leaf in (samples.t, samples.delta))
         num_dropped = occupied.count - jnp.clip(max_samples - _first(occupied), 0, occupied.count)
+        placed = PlacedSamples(t, delta, buffer.ray, buffer.used, num_dropped)
+        options = {"rule": samples.rule, "longest": samples.t.shape[-1]}
+        sums, packed = _composite("render_packed", scene, rays, placed, near_gradient_distance, **options)
     flat = _rendering(sums, num_dropped, rays.far, shape, background)
+    return dataclasses.replace(flat, samples=packed)
+
+
+def render_placed(
+    scene: SceneFn,
+    rays: Rays,
+    placed: PlacedSamples,
+    *,
+    longest: int,
+    near_gradient_distance: float = 0.0,
+    background: Background | None = None,
+) -> Rendering:
+    """Renders samples that are in a buffer already, such as those of `importance_samples`.
+
+    Args:
+        scene: see render_samples. It is evaluated at [1, K, 3] positions with as many directions.
+        rays: Rays [B].
+        placed: PlacedSamples [K] of these rays, of the rule "segments".
+        longest: upper bound of the number of samples of a ray.
+        near_gradient_distance: see render_packed.
+        background: see render_samples.
+
+    Returns:
+        Rendering [B] without weights; `samples` is PackedSamples [K].
+    """
+    check_shapes("render_placed", near=(rays.near, "B"), t=(placed.t, "K"), delta=(placed.delta, "K"))
+    rays = jax.tree.map(jnp.asarray, rays)
+    options = {"rule": "segments", "longest": longest}
+    sums, packed = _composite("render_placed", scene, rays, placed, near_gradient_distance, **options)
+    flat = _rendering(sums, placed.num_dropped, rays.far, rays.near.shape, background)
     return dataclasses.replace(flat, samples=packed)
 
 
@@ -114,7 +165,8 @@ def visible_samples(
     def evaluate_round(index, outputs):
         slot = index * max_samples + jnp.arange(max_samples)
         buffer = _fill(occupied, slot, slot < occupied.ends[-1])
-        _, density, rgb = _evaluate(name, scene, rays, samples, buffer)
+        t = samples.t[buffer.ray, buffer.source]
+        density, rgb = _evaluate(name, scene, rays, t, buffer.ray, buffer.used)
         place = jnp.where(buffer.used, buffer.ray * shape[-1] + buffer.source, outputs.shape[0])
         return outputs.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
 
@@ -277,31 +329,31 @@ def _fill(occupied, place, used):
     return _Buffer(word % width * 32 + _nth_bit(flags, place - before), word // width, used)
 
 
-def _evaluate(function, scene, rays, samples, buffer):
-    """Evaluates the scene at a buffer's samples: t [K], density [K], rgb [K, 3], all 0 in unused slots."""
-    t = jnp.where(buffer.used, samples.t[buffer.ray, buffer.source], 0)
-    one = jax.tree.map(lambda leaf: leaf[buffer.ray][None], rays)  # Rays [1, K], one for each sample
+def _evaluate(function, scene, rays, t, ray_index, used):
+    """Evaluates the scene at samples t [K] of rays: density [K], rgb [K, 3], both 0 in unused slots."""
+    t = jnp.where(used, t, 0)
+    one = jax.tree.map(lambda leaf: leaf[ray_index][None], rays)  # Rays [1, K], one for each sample
     x = one.origins + t[None, :, None] * one.directions
     density, rgb = scene(x, one.viewdirs)
     rendering.check_scene_output(function, density, rgb, x)
-    return t, jnp.where(buffer.used, density[0], 0), jnp.where(buffer.used[:, None], rgb[0], 0)
+    return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
 
 
-def _composite(scene, rays, samples, buffer, near_gradient_distance):
-    """Evaluates the scene at a buffer's samples and composites them: _Sums [B], PackedSamples [K]."""
-    t, density, rgb = _evaluate("render_packed", scene, rays, samples, buffer)
-    delta = jnp.where(buffer.used, samples.delta[buffer.ray, buffer.source], 0)
-    directions = rays.directions[buffer.ray]
-    length = rendering.segment_lengths(delta[:, None], directions)[:, 0]
+def _composite(function, scene, rays, placed, near_gradient_distance, *, rule, longest):
+    """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
+    t, ray = placed.t, placed.ray_index
+    density, rgb = _evaluate(function, scene, rays, t, ray, placed.used)
+    directions = rays.directions[ray]
+    length = rendering.segment_lengths(placed.delta[:, None], directions)[:, 0]
     if near_gradient_distance:
         scale = jnp.minimum(norm(directions) * t / near_gradient_distance, 1) ** 2
         density, rgb = scale_gradient(density, scale), scale_gradient(rgb, scale[:, None])
-    starts = buffer.ray != jnp.roll(buffer.ray, 1).at[0].set(-1)
-    weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=samples.t.shape[-1])
+    starts = ray != jnp.roll(ray, 1).at[0].set(-1)
+    weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=longest)
     colours = [rgb[:, axis] * weights for axis in range(3)]
     parts = [optical_depth, *colours, weights * t, volume_rendering.divide_or_zero(weights, t)]
-    sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), buffer.ray, rays.near.size, indices_are_sorted=True)
-    packed = PackedSamples(weights=weights, t=t, delta=delta, ray_index=buffer.ray, used=buffer.used, rule=samples.rule)
+    sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
+    packed = PackedSamples(weights=weights, t=t, delta=placed.delta, ray_index=ray, used=placed.used, rule=rule)
     return _Sums(
         transmittance=jnp.exp(-sums[:, 0]),
         opacity=-jnp.expm1(-sums[:, 0]),

@@ -1,0 +1,134 @@
+"""Samples of training: as many as a buffer holds, most of them where the occupancy grid expects the rays to end.
+
+This is the importance sampling of arXiv:2003.08934 (Section 5.2) with the grid in place of the coarse network.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from jaxnerf.core.occupancy.grid import OccupancyGrid, estimate_optical_depth
+from jaxnerf.core.occupancy.packed import PlacedSamples
+from jaxnerf.core.sampling import uniform
+from jaxnerf.core.types import Keys, Rays, Samples, check_shapes
+from jaxnerf.core.volume_rendering import exclusive_sum, running_sum
+
+_PARTS = 2.0**16  # probabilities are multiples of its inverse: float32 then sums them exactly, in any order
+
+
+def importance_samples(
+    key: Keys,
+    grid: OccupancyGrid,
+    rays: Rays,
+    candidates: Samples,
+    *,
+    max_samples: int,
+    uniform_fraction: float,
+    max_optical_depth: Float[ArrayLike, ""] = jnp.inf,
+) -> tuple[PlacedSamples, Bool[Array, " B"]]:
+    """Places at most max_samples samples in the occupied cells along rays.
+
+    The candidates in occupied cells are the segments of a ray in which samples may be. If all of them fit into the
+    buffer, a ray has as many samples as candidates, at equal distances. Otherwise the rays with most candidates get
+    fewer samples, all the same number. A fraction of these, on average, is placed evenly over the candidates; the
+    others in proportion to the weights that the grid's density_mean gives to the candidates. Each sample stands for
+    the occupied length halfway to its neighbours, so that the length of all samples of a ray is that of its
+    candidates.
+
+    Args:
+        key: one key, or one per ray [B]; it moves all samples of a ray together.
+        grid: OccupancyGrid. Its cells are the resolution of the weights.
+        rays: Rays [B].
+        candidates: Samples [B, S] of rule "segments", S <= 2^16; usually of `march_rays`.
+        max_samples: K >= 1, the size of the buffer.
+        uniform_fraction: in (0, 1]. The weights are estimates: without evenly placed samples, matter would not be
+            found where the grid has none yet. At 1 the weights do not matter.
+        max_optical_depth: candidates behind this optical depth, as estimated by the grid, are skipped.
+
+    Returns:
+        PlacedSamples, all in occupied cells; and occluded [B], whether candidates of a ray in occupied cells were
+        skipped. No ray with candidates is dropped unless there are more such rays than slots. A ray that is NaN
+        has samples, so that it is visible.
+
+    Raises:
+        ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
+    """
+    shapes = {"near": (rays.near, "B"), "t": (candidates.t, "B S"), "delta": (candidates.delta, "B S")}
+    check_shapes("importance_samples", **shapes)
+    if candidates.rule != "segments" or max_samples < 1 or not 0 < uniform_fraction <= 1:
+        raise ValueError(
+            f"importance_samples: rule is {candidates.rule!r}, max_samples {max_samples} and uniform_fraction "
+            f"{uniform_fraction}, expected 'segments', at least 1, and above 0 up to 1"
+        )
+    occupied, optical_depth = estimate_optical_depth(grid, rays, candidates)
+    in_front = exclusive_sum(optical_depth)
+    kept = occupied & ~(in_front > max_optical_depth)
+    count = kept.sum(axis=-1)
+    number = divide_slots(count, max_samples)
+    weights = jnp.where(kept, jnp.exp(-in_front) * -jnp.expm1(-optical_depth), 0)
+    weights = jnp.where((number < count)[:, None], (1 - uniform_fraction) * weights, 0)
+    even = (1 - weights.sum(axis=-1)) / jnp.maximum(count, 1)
+    probability = weights + even[:, None]
+    parts = jnp.where(kept, 1 + jnp.where(probability > 0, jnp.floor(_PARTS * probability), 0), 0)
+    cumulative = running_sum(parts)
+    delta = jnp.where(kept, candidates.delta, 0)
+    length = running_sum(delta)
+
+    first = jnp.cumsum(number) - number
+    slot = jnp.arange(max_samples)
+    ended = jnp.zeros(max_samples, jnp.int32).at[first + number].add(1, mode="drop")
+    ray = jnp.minimum(jnp.cumsum(ended), count.size - 1)
+    used = slot < number.sum()
+    row, total = slot - first[ray], cumulative[ray, -1]
+    spacing = total / jnp.maximum(number[ray], 1)
+    shift = uniform(key, (*count.shape, 1))[ray, 0] - 0.5
+    lower = jnp.where(row == 0, 0, (row + shift) * spacing)
+    last = row == number[ray] - 1
+    upper = jnp.where(last, total, (row + 1 + shift) * spacing)
+
+    def locate(at):
+        """Returns the candidate that contains a place [K] on the scale of `cumulative`, and the fraction before it."""
+        index = _count_up_to(cumulative, ray, jnp.minimum(jnp.floor(at), total - 1))
+        size = parts[ray, index]
+        return index, jnp.clip((at - (cumulative[ray, index] - size)) / jnp.maximum(size, 1), 0, 1)
+
+    index, fraction = locate(lower)
+    before = length[ray, index] - (1 - fraction) * delta[ray, index]
+    after = jnp.where(last, length[ray, -1], jnp.roll(before, -1))
+    index, fraction = locate((lower + upper) / 2)
+    placed = PlacedSamples(
+        t=jnp.where(used, candidates.t[ray, index] + (fraction - 0.5) * candidates.delta[ray, index], 0),
+        delta=jnp.where(used, jnp.maximum(after - before, 0), 0),
+        ray_index=ray,
+        used=used,
+        num_dropped=jnp.where(number == 0, count, 0),
+    )
+    return placed, (occupied & (in_front > max_optical_depth)).any(axis=-1)
+
+
+def divide_slots(count: Int[ArrayLike, " B"], num_slots: int) -> Int[Array, " B"]:
+    """Returns the numbers [B] of slots of rays that want count [B] slots: all that they want, or at most m each.
+
+    Here m is the largest number with sum_i min(count_i, m) <= num_slots. The slots that are then left go to the first
+    rays that want more than m, one each.
+    """
+    count = jnp.asarray(count)
+    ascending = jnp.sort(count)
+    # The sum is the least of the lines below_k + above_k m, so m is the largest of their solutions.
+    below, above = jnp.cumsum(ascending) - ascending, jnp.arange(count.size, 0, -1)
+    most = jnp.maximum((num_slots - below) // above, 0).max()
+    number = jnp.minimum(count, most)
+    more = count > most
+    return number + (more & (jnp.cumsum(more) <= num_slots - number.sum()))
+
+
+def _count_up_to(ascending, row, value):
+    """Returns [K], how many of ascending[row] [K, S] are at most value [K]; at most S - 1."""
+    size = ascending.shape[-1]
+    found = jnp.zeros(row.shape, jnp.int32)
+    step = 1 << (size.bit_length() - 1)
+    while step:
+        place = found + step
+        inside = place < size
+        found = jnp.where(inside & (ascending[row, jnp.minimum(place, size) - 1] <= value), place, found)
+        step //= 2
+    return found
