@@ -138,8 +138,7 @@ def full(*args, **options):
 
 def test_a_full_disk_keeps_the_old_text_file(tmp_path, monkeypatch):
     (tmp_path / "config.json").write_text("old")
-    monkeypatch.setattr(atomic_files.secrets, "token_hex", lambda size: "partial")
-    os.symlink("/dev/full", tmp_path / "config.json.partial.tmp")  # every write to it fails with ENOSPC
+    monkeypatch.setattr(atomic_files.os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
         atomic_files.write_text(tmp_path / "config.json", "new")
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]

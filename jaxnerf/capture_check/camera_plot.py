@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from PIL import Image
 
 from jaxnerf.capture_check.report import Report
 from jaxnerf.core.types import Camera
+from jaxnerf.data.images.image_files import open_image
 from jaxnerf.runtime.atomic_files import partial_file
 
 CAMERA, FLAGGED, POINT, PATH = "#2060c0", "#e02020", "#9a9a9a", "#20a040"
@@ -63,7 +63,7 @@ def save(figure: Figure, path: str | os.PathLike, folder: str | os.PathLike) -> 
 def is_plot_of(path: str | os.PathLike, folder: str | os.PathLike) -> bool:
     """Returns whether a file was written by `save` for the dataset in a folder."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             found = image.info.get("Software"), image.info.get("Source")
     except (OSError, ValueError, SyntaxError):
         return False

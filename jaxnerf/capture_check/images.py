@@ -10,11 +10,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt
-from PIL import Image
 
 from jaxnerf.capture_check.findings import Finding, named
 from jaxnerf.data.geometry.world import poses_of
-from jaxnerf.data.images.image_files import read_image, read_mask
+from jaxnerf.data.images.image_files import open_image, read_image, read_mask
 from jaxnerf.data.images.load_images import check_size
 from jaxnerf.data.readers.base import Capture, Frame
 
@@ -108,7 +107,7 @@ def _reduced_side(frames: Sequence[Frame]) -> int:
     """
     sides = []
     for frame in frames:
-        with contextlib.suppress(Exception), Image.open(frame.image) as image:  # reported when the image is read
+        with contextlib.suppress(Exception), open_image(frame.image) as image:  # reported when the image is read
             sides.append(max(image.size))
     median = int(np.median(sides or [_LONGEST]))
     return median // -(-median // _LONGEST)

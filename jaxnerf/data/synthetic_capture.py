@@ -19,7 +19,7 @@ from PIL import Image
 from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.types import Camera
 from jaxnerf.fields import room
-from jaxnerf.runtime.atomic_files import partial_file, write_text
+from jaxnerf.runtime.atomic_files import open_regular, partial_file, write_text
 
 PHONE_LENS = (-0.08, 0.03, 0.001, -0.0008)  # k1, k2, p1, p2
 GROUND_TRUTH = "ground_truth.npz"
@@ -78,7 +78,7 @@ def read_ground_truth(folder: str | os.PathLike) -> GroundTruth:
     path = pathlib.Path(folder) / GROUND_TRUTH
     if not path.is_file():
         raise ValueError(f"{path}: no such file, expected the ground truth of an embedded capture; write one first")
-    with np.load(path) as arrays:
+    with open_regular(path, "rb") as file, np.load(file) as arrays:
         return GroundTruth(**{name: arrays[name] for name in GroundTruth._fields})
 
 

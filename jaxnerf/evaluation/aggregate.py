@@ -7,18 +7,19 @@ import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import imageio.v3 as iio
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 
 from jaxnerf.core.types import Rendering, Views
+from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images, protocol
 from jaxnerf.evaluation.restore import TrainedRun, render_settings
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.training import metric_log
 
 ORIGIN = "origin.json"
+_AGAIN = "remove it, and the same command scores that view again"
 _KEPT, _WORKING = ("color", "gt-color", "depth"), ("rows", "contact_sheet")
 FOLDERS = _KEPT + _WORKING
 
@@ -52,16 +53,16 @@ def finish(
         partial.write_text(json.dumps(content))
 
 
-def is_finished(folder: pathlib.Path, index: int) -> bool:
-    """Returns whether a view's images and its row exist."""
-    files = [*output_images.view_files(folder, f"{index:03d}"), _row_file(folder, index)]
-    return all(file.is_file() for file in files)
+def view_files(folder: pathlib.Path, index: int, *, count: int) -> list[pathlib.Path]:
+    """Returns the files of a finished view, one of `count`: its images, and its row."""
+    sheet = [_contact_sheet_file(folder, index)] if index in _on_contact_sheet(count) else []
+    return [*output_images.view_files(folder, f"{index:03d}"), *sheet, _row_file(folder, index)]
 
 
 def read(target: pathlib.Path, origin: Mapping[str, Any], remedy: str) -> dict[str, Any]:
     """Reads the results.json of a finished evaluation; raises ValueError if it has another origin."""
     shards.check_origin(target, origin, file=ORIGIN, remedy=remedy)
-    return json.loads((target / "results.json").read_text())
+    return atomic_files.read_json(target / "results.json", remedy)
 
 
 def merge(
@@ -83,11 +84,11 @@ def merge(
         FileNotFoundError: if another process does the same and was faster.
     """
     count = len(views.names)
-    if not all(is_finished(partial, index) for index in range(count)):
+    if not all(file.is_file() for index in range(count) for file in view_files(partial, index, count=count)):
         return None
-    finished = [json.loads(_row_file(partial, index).read_text()) for index in range(count)]
+    finished = [atomic_files.read_json(_row_file(partial, index), _AGAIN) for index in range(count)]
     results = _results(run, workdir, views, variables, finished, origin)
-    rows = [iio.imread(_contact_sheet_file(partial, index)) for index in _on_contact_sheet(count)]
+    rows = [read_stored(_contact_sheet_file(partial, index)) for index in _on_contact_sheet(count)]
     output_images.write_contact_sheet(partial / "contact_sheet.png", rows)
     with atomic_files.partial_file(partial / "results.json") as file:
         file.write_text(json.dumps(results, indent=2) + "\n")
@@ -116,9 +117,9 @@ def _results(run, workdir, views, variables, finished, origin):
         "rays_per_second": sum(view["rays"] for view in finished) / len(rows) / seconds,
         "seconds_per_frame": seconds,
         "step": origin["step"],
-        "rays_seen": trained[-1]["rays"] if trained else None,
+        "rays_seen": trained[-1].get("rays") if trained else None,
         "training_seconds": trained[-1]["seconds"] if trained else None,
-        "compile_seconds": trained[-1]["compile_seconds"] if trained else None,
+        "compile_seconds": trained[-1].get("compile_seconds") if trained else None,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(variables[0])),
         "settings": render_settings(run),
         "exposure": run.experiment.cameras is not None and run.experiment.cameras.exposure,

@@ -152,6 +152,7 @@ def claim_target(
     step, own = newest_step(run, workdir, step), run.experiment.eval.split
     name = str(step) if split in (None, own) else f"{step}-{split}"
     target = pathlib.Path(workdir) / "eval" / name
+    atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(overwrite, shard, target)
     if target.exists() and not overwrite and shard == shards.WHOLE:
         raise ValueError(f"{target}: exists already; give --overwrite to score again, or another --step")
@@ -183,8 +184,10 @@ def summary(results: dict[str, Any]) -> str:
 
 def _score_views(run, render, views, folder, shard):
     """Renders and scores those views of a shard that are not finished."""
-    frames = shards.own(range(len(views.names)), shard)
-    todo = [index for index in frames if not aggregate.is_finished(folder, index)]
+    count = len(views.names)
+    frames = shards.own(range(count), shard)
+    readable = output_images.readable([aggregate.view_files(folder, index, count=count) for index in frames])
+    todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     progress, first = metric_log.Progress(len(frames), show=processes.is_first()), True
     for done, index in enumerate(todo, len(frames) - len(todo) + 1):
         name, (height, width) = views.names[index], (int(value) for value in views.size[index])
@@ -197,7 +200,7 @@ def _score_views(run, render, views, folder, shard):
         row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
         output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
-        aggregate.finish(folder, index, row, truth, image, count=len(views.names), first=first)
+        aggregate.finish(folder, index, row, truth, image, count=count, first=first)
         progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
         first = False
     progress.close()

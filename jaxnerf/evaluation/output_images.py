@@ -1,13 +1,17 @@
 """Image files that evaluation writes: colours, depths, a contact sheet."""
 
 import pathlib
+import sys
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import imageio.v3 as iio
 import numpy as np
 from jax.typing import ArrayLike
 
 from jaxnerf.core.types import Rendering
+from jaxnerf.data.images.image_files import read_stored
+from jaxnerf.data.images.pixel_cache import num_workers
 from jaxnerf.runtime import atomic_files
 
 CONTACT_SHEET_ROWS = 4
@@ -29,6 +33,23 @@ def write_view(folder: pathlib.Path, name: str, rgb: ArrayLike, truth: ArrayLike
 def view_files(folder: pathlib.Path, name: str) -> list[pathlib.Path]:
     """Returns the paths that `write_view` writes; their folders must exist."""
     return [pathlib.Path(folder) / kind / f"{name}.{suffix}" for kind, suffix in _VIEW_FILES.items()]
+
+
+def readable(groups: Sequence[Sequence[pathlib.Path]]) -> list[bool]:
+    """Returns for each group of image and JSON files whether all exist and are whole; prints those that are not."""
+
+    def check(files):
+        for file in files if all(file.is_file() for file in files) else ():
+            try:
+                atomic_files.read_json(file, "") if file.suffix == ".json" else read_stored(file)
+            except (ValueError, OSError):
+                if file.is_file():  # otherwise another process has finished and moved the folder
+                    print(f"{file}: is damaged; its view is rendered again", file=sys.stderr)
+                return False
+        return all(file.is_file() for file in files)
+
+    with ThreadPoolExecutor(num_workers()) as pool:
+        return list(pool.map(check, groups))
 
 
 def write_image(path: pathlib.Path, pixels: ArrayLike) -> None:

@@ -1,7 +1,6 @@
 """What a training run shows of its images: a preview every so often, and a summary when it ends."""
 
 import functools
-import json
 import math
 import os
 import pathlib
@@ -18,7 +17,7 @@ from jaxnerf.core.types import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask, reference
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
-from jaxnerf.runtime import memory, processes
+from jaxnerf.runtime import atomic_files, memory, processes
 from jaxnerf.training import metric_log
 from jaxnerf.training.optimizer import averaged_params
 from jaxnerf.training.state import TrainState
@@ -60,7 +59,7 @@ class Previews:
         """
         run, rows = self._run, metric_log.read_rows(self._workdir)
         options, step = run.experiment.train, newest_step(run, self._workdir)
-        row = next((row for row in rows if row["step"] == step), {"rays": 0, "seconds": 0.0})
+        row = next((row for row in rows if row["step"] == step), {"seconds": 0.0})
         if step >= options.max_steps:
             limit, more = "train.max_steps", 2 * step
             why = f"it reached train.max_steps = {options.max_steps:,}"
@@ -68,7 +67,7 @@ class Previews:
             limit, more = "train.max_seconds", 2 * options.max_seconds
             why = f"train.max_seconds = {options.max_seconds:g} have passed at step {step:,} of {options.max_steps:,}"
         return [
-            f"done          {why}: {row['rays']:,} rays in {row['seconds']:.1f} s of training",
+            f"done          {why}: {row.get('rays', 0):,} rays in {row['seconds']:.1f} s of training",
             *self._cameras(step, views),
             *self._scores(step, views),
             f"workdir       {self._workdir.absolute()}: {', '.join(self._contents())}",
@@ -111,8 +110,12 @@ class Previews:
             except _FAILURES as error:
                 lines.append(f"scores        none: {error}")
         if results.exists():
-            found = json.loads(results.read_text())
-            lines.append(f"evaluation    PSNR {found['psnr']:.2f} dB over {found['views']} views, in {results.parent}")
+            try:
+                found = atomic_files.read_json(results, "score it again with --overwrite")
+                scored = f"PSNR {found['psnr']:.2f} dB over {found['views']} views, in {results.parent}"
+            except (*_FAILURES, KeyError, TypeError) as error:
+                scored = f"none: {error}"
+            lines.append(f"evaluation    {scored}")
         elif held_out is None:
             lines.append(f"held-out      no images ({why}); --config.data.hold_out=8 with a new --workdir keeps some")
         return lines

@@ -140,12 +140,18 @@ def load_scene(workdir: str | os.PathLike) -> tuple[SceneFn, Callable[[Rays], Re
         workdir: the folder that training wrote.
 
     Returns:
-        scene, the trained field as a function (x, viewdirs) -> (density, rgb); and render, a jitted function
-        Rays [...] -> Rendering [...] with the samples and background that the run was trained for.
+        scene, the trained field as a function (x, viewdirs) -> (density, rgb); and render, a function
+        Rays [...] -> Rendering [...] with the samples and background of the run's evaluation. It renders in chunks
+        that fit into memory, and skips rays that hit nothing; inside a jitted function it renders all rays at once.
 
     Raises:
         ValueError: if the folder holds no finished checkpoint; names it.
     """
     run = restore_run(workdir)
     variables = run.variables(newest_step(run, workdir))
-    return run.experiment.model.scene(*variables), functools.partial(run.render, variables)
+
+    def render(rays: Rays) -> Rendering:
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(rays))
+        return (run.render if traced else run.render_image)(variables, rays)
+
+    return run.experiment.model.scene(*variables), render

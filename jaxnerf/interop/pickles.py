@@ -12,6 +12,7 @@ import pickletools
 import numpy as np
 
 from jaxnerf.data.readers.validation import read_npy_header
+from jaxnerf.runtime.atomic_files import open_regular
 
 # The names in a pickled list of arrays: of numpy 1 and 2, and of protocol 2, which encodes bytes as text.
 _NAMES = {
@@ -46,13 +47,13 @@ def read_array_list(path: pathlib.Path, expected: str) -> list[np.ndarray]:
         ValueError: if the file is missing, damaged or holds anything else; names the file.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path, "rb") as file:
             shape, _, dtype = read_npy_header(file)
             if not dtype.hasobject:
                 raise ValueError(f"one array of {dtype}{list(shape)}, not a list")
             content = file.read()
-        arrays = [_array(record) for record in _items(_follow(content))]
-        if shape != (len(arrays),) or sum(array.nbytes for array in arrays) > len(content):
+        arrays = _arrays(_items(_follow(content)), len(content))
+        if shape != (len(arrays),):
             raise ValueError(f"{len(arrays)} arrays, but its header states {list(shape)}")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file, expected {expected}; correct the name") from None
@@ -130,24 +131,34 @@ def _items(record):
     return content
 
 
-def _array(record):
-    _, shape, dtype, fortran, content = _state(record)
-    content, dtype = _bytes(content), _dtype(dtype)
-    if len(shape) > 2 or min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(content):
-        raise ValueError(f"{len(content)} bytes for {dtype}{list(shape)[:3]}")
-    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
+def _arrays(records, size):
+    """Returns the arrays of records; ValueError, before it makes more, if they hold more bytes than the file."""
+    arrays = []
+    for record in records:
+        _, shape, dtype, fortran, content = _state(record)
+        content, dtype = _text_or_bytes(content), _dtype(dtype)
+        size -= len(content)
+        if size < 0:
+            raise ValueError("an array more than once")
+        if len(shape) > 2 or min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(content):
+            raise ValueError(f"{len(content)} bytes for {dtype} of another shape")
+        content = content.encode("latin1") if isinstance(content, str) else content
+        arrays.append(np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C"))
+    return arrays
 
 
-def _bytes(content):
-    """Returns bytes, which protocol 2 writes as an encoding of text, and Python 2 as text."""
+def _text_or_bytes(content):
+    """Returns the content of an array: protocol 2 writes an encoding of text, and Python 2 text of as many letters."""
     if isinstance(content, Record) and content.name == "bytes":
         content = content.arguments[0]
-    return content.encode("latin1") if isinstance(content, str) else content
+    if not isinstance(content, str | bytes):
+        raise ValueError(f"{type(content).__name__} in place of an array's bytes")
+    return content
 
 
 def _dtype(record):
     if not isinstance(record, Record) or record.name != "dtype" or record.arguments[0] not in _FLOATS:
         raise ValueError(f"numbers of another kind than {', '.join(_FLOATS)}")
     if record.state[1] not in ("<", ">"):
-        raise ValueError(f"the byte order {record.state[1]!r}")
+        raise ValueError("another byte order than < or >")  # a repr of nested tuples may be of any length
     return np.dtype(record.state[1] + record.arguments[0])

@@ -6,6 +6,7 @@ except in JaxNeRF, where it comes after them. No code in a file is ever run.
 """
 
 import re
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 from flax.serialization import msgpack_restore
 
 from jaxnerf.interop.pickles import read_array_list
+from jaxnerf.runtime.atomic_files import open_regular, read_bytes
 
 _HEADS = ("bottleneck", "view", "rgb", "density")
 _TORCH = {"feature_linear": "bottleneck", "views_linears.0": "view", "rgb_linear": "rgb"}
@@ -80,18 +82,24 @@ def load_torch(path: Path, expected: str) -> dict:
         raise ValueError(f"{path}: needs torch, which is not installed; install it with `pip install torch`") from None
     if torch.__version__ < (2, 6):  # before, weights_only let some files run code (CVE-2025-32434)
         raise ValueError(f"{path}: torch is {torch.__version__}, expected at least 2.6; update torch")
-    size = path.stat().st_size
+    size = left = path.stat().st_size
 
     def arrays(value):
+        nonlocal left
         if isinstance(value, dict):
             return {key: arrays(part) for key, part in value.items()}
         if not isinstance(value, torch.Tensor):
             return value
-        if value.numel() * value.element_size() > size:  # a stride of 0 repeats without end
-            raise ValueError(f"a tensor of {list(value.shape)} in {size} bytes")
+        left -= value.numel() * value.element_size()
+        if left < 0:  # a stride of 0 repeats without end, and tensors may share their numbers
+            raise ValueError(f"a tensor of {list(value.shape)} is more than the rest of {size} bytes")
         return value.detach().numpy()
 
     try:
+        if zipfile.is_zipfile(path):  # torch stores without compression
+            with zipfile.ZipFile(path) as archive:
+                if sum(info.file_size for info in archive.infolist()) > size:
+                    raise ValueError(f"an archive of more than its {size} bytes")
         return arrays(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:  # torch raises almost any exception on a damaged file
         raise _unreadable(path, error, expected) from None
@@ -100,14 +108,14 @@ def load_torch(path: Path, expected: str) -> dict:
 def load_flax(path: Path, expected: str) -> dict:
     """Returns the dictionary in a file of flax.serialization.msgpack_serialize. See `load_torch`."""
     try:
-        return msgpack_restore(path.read_bytes())
+        return msgpack_restore(read_bytes(path))
     except Exception as error:  # msgpack and numpy raise almost any exception on a damaged file
         raise _unreadable(path, error, expected) from None
 
 
 def _reader(path: Path) -> Callable[..., PublishedWeights]:
     try:
-        with path.open("rb") as file:
+        with open_regular(path, "rb") as file:
             head = file.read(6)
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}, expected a checkpoint; correct --weights") from None

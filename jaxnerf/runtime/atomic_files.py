@@ -1,30 +1,118 @@
-"""Files that appear completely or not at all, even if the writer is interrupted."""
+"""Files that appear completely or not at all, even if the writer is interrupted, in folders that may be a stranger's.
+
+Nothing is written through a symbolic link, and only regular files are read: a pipe would be waited for without end,
+and a device such as /dev/zero has no end.
+"""
 
 import contextlib
+import errno
+import json
 import os
 import pathlib
 import secrets
+import stat
 from collections.abc import Iterator
+from typing import IO, Any
+
+_MAX_DEPTH = 100  # of JSON; functions that call themselves for each level must not fail on a stranger's file
+_NO_LINK, _NO_WAIT = getattr(os, "O_NOFOLLOW", 0), getattr(os, "O_NONBLOCK", 0)
+
+
+def open_regular(path: str | os.PathLike, mode: str = "r") -> IO[Any]:
+    """Opens a regular file as `open` does. Links are followed to read, and refused to write.
+
+    Raises:
+        OSError: with the path, also if it is a pipe, a device or a folder, or to be written and has a second name.
+    """
+
+    def opener(path, flags):
+        writes = bool(flags & (os.O_WRONLY | os.O_RDWR))
+        descriptor = os.open(path, flags | _NO_WAIT | writes * _NO_LINK, 0o666)
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or (writes and found.st_nlink > 1):
+            os.close(descriptor)
+            raise OSError(errno.EINVAL, "Not a regular file", str(path))
+        return descriptor
+
+    return open(path, mode, opener=opener)
+
+
+def read_bytes(path: str | os.PathLike) -> bytes:
+    """Returns the content of a regular file; see `open_regular`."""
+    with open_regular(path, "rb") as file:
+        return file.read()
+
+
+def parse_json(content: str | bytes) -> Any:
+    """Returns what JSON of unknown origin holds; raises ValueError if it is malformed or nested too deeply."""
+    try:
+        found = json.loads(content)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    level = [found]
+    for _ in range(_MAX_DEPTH):
+        containers = [value for value in level if isinstance(value, dict | list)]
+        level = [each for value in containers for each in (value.values() if isinstance(value, dict) else value)]
+        if not level:
+            return found
+    raise ValueError(f"nested more than {_MAX_DEPTH} levels deep")
+
+
+def read_json(path: str | os.PathLike, remedy: str) -> Any:
+    """Returns what a JSON file of unknown origin holds.
+
+    Raises:
+        OSError: with the path, see `open_regular`.
+        ValueError: if it is malformed; names the file and ends with the remedy.
+    """
+    try:
+        return parse_json(read_bytes(path))
+    except ValueError as error:
+        raise ValueError(f"{path}: malformed JSON ({error}); {remedy}") from None
+
+
+def check_tree(folder: str | os.PathLike, *, links: bool = False) -> None:
+    """Checks that a folder, if it exists, is no symbolic link, and holds only folders and regular files.
+
+    Args:
+        folder: in which something is to be written, or read by a library that opens whatever it finds.
+        links: whether the folder and the files in it may be links, which is safe where they are only read.
+
+    Raises:
+        ValueError: names the first link, pipe or device.
+    """
+    below = (os.path.join(place, name) for place, *names in os.walk(folder) for name in sum(names, []))
+    for path in below if links else (folder, *below):
+        try:
+            mode = os.lstat(path).st_mode
+            accepted = stat.S_ISREG(os.stat(path).st_mode) if links and stat.S_ISLNK(mode) else stat.S_ISDIR(mode)
+        except FileNotFoundError:  # another process has just removed it
+            continue
+        if not (accepted or stat.S_ISREG(mode)):
+            kind = "a symbolic link" if stat.S_ISLNK(mode) else "a pipe or a device"
+            raise ValueError(f"{path}: is {kind}, expected a folder or a regular file; remove it")
 
 
 @contextlib.contextmanager
-def partial_file(path: str | os.PathLike, suffix: str = ".tmp") -> Iterator[pathlib.Path]:
-    """Yields a path to write to, and then moves the written file to `path`.
+def partial_file(path: str | os.PathLike, suffix: str = ".tmp", *, mode: int = 0o666) -> Iterator[pathlib.Path]:
+    """Yields the path of a new, empty file to write to, and then moves that file to `path`.
 
     The partial file lies beside `path` and has a random name, so that any number of processes may write the
     same file: the last one wins. A process that is killed leaves its partial file behind; see `sweep`.
 
     Args:
-        path: of the finished file; its folder exists.
+        path: of the finished file; its folder exists. A link of that name is replaced, not followed.
         suffix: of the partial file, for writers that infer a format from it; `sweep` expects ".tmp" in it.
+        mode: of the file, of which the umask is subtracted.
 
     Raises:
         OSError: with the path, even if the system names none, as on a full disk.
     """
     path = pathlib.Path(path)
-    partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}{suffix}")
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}{suffix}")
     try:
         with naming(path):
+            os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK, mode))
             yield partial
         try:
             os.replace(partial, path)
@@ -46,9 +134,10 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 def write_text_once(path: str | os.PathLike, text: str) -> None:
     """Writes a text file unless it exists; of several processes that try, the first one wins."""
     path = pathlib.Path(path)
-    partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.tmp")
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.tmp")
     try:
-        partial.write_text(text)
+        with partial.open("x") as file:
+            file.write(text)
         try:
             os.link(partial, path)  # unlike a rename it replaces nothing
         except FileExistsError:

@@ -16,6 +16,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from jaxnerf.registry import READERS
+from jaxnerf.runtime import signals
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 
@@ -31,18 +32,19 @@ def run(
     """Parses the flags, imports the plugins and calls main(argv).
 
     The process exits with 2 on a wrong flag and with 1 on a ValueError or OSError, each reported in one line,
-    and with 128 plus the signal's number on SIGINT or SIGTERM.
+    and with 128 plus the signal's number on SIGINT, SIGTERM or SIGHUP, see `signals`.
 
     Args:
         main: the program. Its module's docstring opens the help.
         positional: whether arguments that are not flags are accepted, as argv[1:].
         stopped: completes the message "stopped ..." after a signal: what was saved, and how to continue.
     """
+    signals.keep_streams()
     _keep_memory()
     # Tracing a step creates hundreds of thousands of objects, few of them in cycles. Python's default of one
     # collection per 700 objects takes a good part of the tracing time.
     gc.set_threshold(50_000)
-    signal.signal(signal.SIGTERM, _interrupt)
+    signals.handle(signals.interrupt)
     plugins = flags.DEFINE_list(
         "plugins", [], "Modules to import first: they register fields, samplers, losses or dataset readers."
     )
@@ -56,11 +58,18 @@ def run(
             from jaxnerf.runtime.compilation_cache import use_compilation_cache
 
             use_compilation_cache()
-            return main(argv)
+            result = main(argv)
+            sys.stdout.flush()
+            return result
         except (ValueError, OSError) as error:
             _leave(1, error)
         except KeyboardInterrupt as interrupt:
-            _leave(128 + (interrupt.args or (signal.SIGINT,))[0], f"stopped {stopped}")
+            code = 128 + (interrupt.args or (signal.SIGINT,))[0]
+            print(f"error: stopped {stopped}", file=sys.stderr)
+            sys.stdout.flush()
+            sys.stderr.flush()
+            # A regular exit would destroy what threads of XLA still use, which can end in a segmentation fault.
+            os._exit(code)
 
     app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
 
@@ -227,11 +236,6 @@ def _import_plugins(names: Sequence[str]) -> None:
                 f"--plugins: cannot import {name!r} ({type(error).__name__}: {error}); "
                 "correct the module, or set PYTHONPATH to its folder"
             ) from error
-
-
-def _interrupt(number, _):
-    """Makes SIGTERM clean up as SIGINT does."""
-    raise KeyboardInterrupt(number)
 
 
 def _leave(code, error):

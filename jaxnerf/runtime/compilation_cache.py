@@ -1,33 +1,32 @@
 """A cache of compiled programs in the user's cache folder. Failing to write it is never an error."""
 
 import contextlib
+import hashlib
 import os
 import platform
 import sys
-import zlib
 from pathlib import Path
 
 import jax
 
+from jaxnerf.runtime.atomic_files import partial_file, read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.runtime.user_cache import default_folder
+from jaxnerf.runtime.user_cache import private_folder
 
 MAX_BYTES = 2**30  # a training step takes half a megabyte, so this holds over a thousand programs
-_ZSTD = b"\x28\xb5\x2f\xfd"
+_HASH_BYTES = 32
 
 
 def use_compilation_cache() -> None:
     """Sets JAX's compilation cache, unless JAX_COMPILATION_CACHE_DIR is set: to a folder, or empty for no cache."""
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir:
         return
-    folder = None
     try:
-        folder = default_folder() / "compiled" / _machine()
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = private_folder("compiled", _machine())
         prune(folder)
-    except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
-        place = f"{folder}: " if folder else ""
-        print(f"{place}compiled programs cannot be cached ({error}); continuing without", file=sys.stderr)
+        _use_programs()
+    except (OSError, RuntimeError, ImportError) as error:  # RuntimeError: no home folder
+        print(f"compiled programs cannot be cached ({error}); continuing without", file=sys.stderr)
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
@@ -35,52 +34,63 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def prune(folder: Path, max_bytes: float = MAX_BYTES) -> None:
-    """Removes truncated programs, and the least recently used ones until the rest fits into max_bytes.
+def _use_programs():
+    """Replaces JAX's class that reads and writes files, for which there is no public way; it runs what a file holds."""
+    from jax._src import compilation_cache
 
-    JAX would report a program that a killed process left truncated at every start, and never replace it. JAX
-    has a size limit of its own, but a kill at the wrong moment makes that fail forever after.
+    if not hasattr(compilation_cache, "get_file_cache"):
+        raise ImportError(f"JAX {jax.__version__} has no get_file_cache")
+    compilation_cache.get_file_cache = lambda path: (Programs(path), path)
+
+
+class Programs:
+    """The compiled programs in a folder, with the interface that JAX expects of a cache.
+
+    A file begins with a hash of its key and its program. A file that a killed process left truncated, that has a
+    flipped bit or that is another program's is as good as absent, and replaced.
     """
-    stamp = folder / "checked"
-    since = stamp.stat().st_mtime if stamp.exists() else 0.0
-    stamp.touch()  # first: files that are written meanwhile are checked at the next start
+
+    def __init__(self, folder: str | os.PathLike):
+        self._path = Path(folder)
+
+    def get(self, key: str) -> bytes | None:
+        """Returns the program of a key, or None."""
+        try:
+            content = read_bytes(self._file(key))
+        except FileNotFoundError:
+            return None
+        found, program = content[:_HASH_BYTES], content[_HASH_BYTES:]
+        return program if found == _hash(key, program) else None
+
+    def put(self, key: str, value: bytes) -> None:
+        """Writes the program of a key."""
+        with partial_file(self._file(key), mode=0o600) as partial:
+            partial.write_bytes(_hash(key, value) + value)
+
+    def _file(self, key):
+        return self._path / f"{key}-cache"
+
+
+def _hash(key, program):
+    return hashlib.sha256(b"%d:%s%s" % (len(key), key.encode(), program)).digest()
+
+
+def prune(folder: Path, max_bytes: float = MAX_BYTES) -> None:
+    """Removes the least recently used programs until the rest fits into max_bytes.
+
+    JAX has a size limit of its own, but a kill at the wrong moment makes that fail forever after.
+    """
     kept = []
-    for path in folder.glob("*-cache"):
+    for path in folder.glob("*-cache*"):  # with the partial files of killed processes
         with contextlib.suppress(FileNotFoundError):  # another process may prune, too
             status = path.stat()
-            if status.st_mtime >= since - 2 and not _is_complete(path.read_bytes()):  # 2 s: file times are coarse
-                path.unlink()
-            else:
-                kept.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+            kept.append((max(status.st_atime, status.st_mtime), status.st_size, path))
     size = sum(entry[1] for entry in kept)
     for _, bytes_, path in sorted(kept):
         if size <= max_bytes:
             break
         path.unlink(missing_ok=True)
         size -= bytes_
-
-
-def _is_complete(content):
-    """Returns whether a file decompresses."""
-    if content.startswith(_ZSTD):
-        return _is_complete_zstd(content)
-    try:
-        zlib.decompress(content)
-    except zlib.error:
-        return False
-    return True
-
-
-def _is_complete_zstd(content):
-    try:
-        import zstandard
-    except ImportError:  # then JAX wrote it with another library, or for another Python
-        return True
-    try:
-        zstandard.ZstdDecompressor().decompress(content)
-    except zstandard.ZstdError:
-        return False
-    return True
 
 
 def _machine():

@@ -7,6 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxnerf.runtime.atomic_files import open_regular
+
 
 def fingerprint(*values: Any, sample: int | None = None) -> str:
     """Returns 16 hexadecimal digits of SHA-256 over text, bytes and trees of arrays.
@@ -35,5 +37,5 @@ def fingerprint(*values: Any, sample: int | None = None) -> str:
 
 def file_sha256(path: str | os.PathLike) -> str:
     """Returns the SHA-256 of a file's content, as sha256sum prints it."""
-    with open(path, "rb") as file:
+    with open_regular(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

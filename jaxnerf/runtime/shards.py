@@ -89,7 +89,7 @@ def check_origin(folder: pathlib.Path, origin: Mapping[str, Any], *, file: str, 
         ValueError: if they have another, or the file cannot be read; names what differs.
     """
     try:
-        found = json.loads((folder / file).read_text())
+        found = atomic_files.read_json(folder / file, remedy)
         differ = [key for key in origin | found if found.get(key) != origin.get(key)]
     except (OSError, ValueError, TypeError, AttributeError):
         raise ValueError(f"{folder / file}: cannot be read; {remedy}") from None

@@ -1,14 +1,20 @@
-"""A cache on disk for arrays that take long to compute. A cache that cannot be used is never an error."""
+"""A cache on disk for arrays that take long to compute. A cache that cannot be used is never an error.
+
+What it holds is believed, and compiled programs are run, so its folders belong to the user alone.
+"""
 
 import logging
 import os
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from jaxnerf.runtime.atomic_files import partial_file
+from jaxnerf.runtime.atomic_files import open_regular, partial_file
+
+_CHECKSUM = "checksum"  # the name of an array in each file
 
 
 def load_or_make(
@@ -24,7 +30,7 @@ def load_or_make(
     Problems with the cache are logged as warnings.
 
     Args:
-        folder: the cache's folder; None: `default_folder()`.
+        folder: the cache's folder; None: `private_folder()`.
         name: of the file, without extension. It must contain a hash of everything that the arrays depend on.
         make: computes the arrays by name.
         is_valid: returns whether arrays from a file have the expected names, shapes and types. A file with
@@ -36,20 +42,21 @@ def load_or_make(
     """
     path = None
     try:
-        path = (default_folder() if folder is None else Path(folder)) / f"{name}.npz"
-        with np.load(path) as content:
+        path = (private_folder() if folder is None else Path(folder)) / f"{name}.npz"
+        with open_regular(path, "rb") as file, np.load(file) as content:
             arrays = dict(content)
-        if is_valid(arrays):
+        checksum = arrays.pop(_CHECKSUM, None)
+        if checksum == _checksum(name, arrays) and is_valid(arrays):
             return arrays
         logging.warning("%s holds unexpected arrays; they are computed again", path)
     except FileNotFoundError:
         logging.info("%s does not exist yet; its arrays are computed", path)
     except Exception as error:  # a damaged zip file raises almost any exception
-        logging.warning("%s cannot be read (%s); its arrays are computed again", path or folder, error)
+        logging.warning("%s cannot be read (%s); its arrays are computed again", path or folder or "the cache", error)
     start = time.perf_counter()
     arrays = make()
     if path is not None and time.perf_counter() - start >= min_seconds:
-        _store(path, arrays)
+        _store(path, arrays, _checksum(name, arrays))
     return arrays
 
 
@@ -58,10 +65,42 @@ def default_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxnerf"
 
 
-def _store(path, arrays):
+def private_folder(*names: str) -> Path:
+    """Returns `default_folder()` or a folder below it, made if missing; only the user can read and write it.
+
+    Raises:
+        OSError: if it cannot be made, belongs to another user, or can be written by others, who may have put
+            something there; names the folder.
+        RuntimeError: if there is no home.
+    """
+    folder = default_folder()
+    for name in ("", *names):
+        folder = folder / name
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not hasattr(os, "geteuid"):  # Windows, where a user's folder is private
+            continue
+        mode, owners = folder.stat().st_mode, {folder.lstat().st_uid, folder.stat().st_uid}
+        if owners != {os.geteuid()}:
+            raise PermissionError(f"{folder} belongs to another user; set XDG_CACHE_HOME to a folder of your own")
+        if mode & 0o022:
+            raise PermissionError(f"{folder} can be written by other users (mode {mode & 0o777:o}); remove it")
+        if mode & 0o077:
+            folder.chmod(0o700)
+    return folder
+
+
+def _checksum(name, arrays):
+    """Returns the CRC-32 of a file's name and arrays, so that neither a flipped bit nor another file is believed."""
+    total = zlib.crc32(name.encode())
+    for key, array in sorted(arrays.items()):
+        total = zlib.crc32(np.ascontiguousarray(array), zlib.crc32(key.encode(), total))
+    return total
+
+
+def _store(path, arrays, checksum):
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with partial_file(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        with partial_file(path, mode=0o600) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays, **{_CHECKSUM: np.uint32(checksum)})
     except OSError as error:
         logging.warning("%s cannot be written (%s); its arrays will be computed again", path, error)

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 from jaxnerf.data.readers import colmap
 from jaxnerf.registry import READERS
-from jaxnerf.runtime.atomic_files import partial_file, sweep, write_text
+from jaxnerf.runtime.atomic_files import check_tree, partial_file, sweep, write_text
+from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.structure_from_motion import colmap_process
 from jaxnerf.structure_from_motion import images as images_module
 from jaxnerf.structure_from_motion.colmap_process import Model
@@ -121,6 +122,8 @@ def estimate_cameras(
     paths, others = images_module.find_images(images)
     _check_out(out, overwrite)
     in_place = images.resolve() == (out / "images").resolve()
+    for name in ("cameras", "sparse") if in_place else ("cameras", "sparse", "images"):
+        check_tree(out / name)
     if in_place:
         _check_names(paths)
     if importlib.util.find_spec("pycolmap") is None:
@@ -133,7 +136,7 @@ def estimate_cameras(
         "single_camera": single_camera,
         "matching": matching,
         "max_size": max_size,
-        "images": {path.name: path.stat().st_size for path in paths},
+        "images": {path.name: file_sha256(path) for path in paths},
     }
     say(f"images: {len(paths)} in {images}" + (f"; its other files are skipped: {others}" if others else ""))
     stages = _Stages(out, settings, num_threads or -1, overwrite, say)

@@ -1,16 +1,16 @@
 """The images of a capture whose cameras are to be estimated: finding, copying and pairing them."""
 
+import filecmp
 import os
 import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from PIL import Image, ImageOps
+from PIL import ImageOps
 
-from jaxnerf.data.images.image_files import image_size, read_image
-from jaxnerf.runtime.atomic_files import partial_file
+from jaxnerf.data.images.image_files import image_size, open_image, read_image
+from jaxnerf.runtime.atomic_files import partial_file, read_bytes
 
 MIN_IMAGES = 3
 MAX_EXHAUSTIVE = 200  # images; exhaustive matching takes time with the square of their number
@@ -65,7 +65,7 @@ def copy_images(paths: Sequence[Path], folder: Path, *, overwrite: bool, progres
 
     COLMAP and the reader of its models ignore the EXIF orientation, so that rotated images would put the world
     on its side. A rotated JPEG is encoded again with quality 95; every other image is copied byte by byte.
-    A copy has its image's time, by which an earlier call's copy is recognised and not repeated.
+    An equal file is not copied again. A turned copy has its image's time, by which it is recognised.
 
     Args:
         paths: images with different names.
@@ -86,7 +86,7 @@ def copy_images(paths: Sequence[Path], folder: Path, *, overwrite: bool, progres
     turned = 0
     for index, path in enumerate(paths, 1):
         target = folder / copy_name(path)
-        if not _is_copy(target, path):
+        if not _is_copy(target, path, overwrite):
             if target.exists() and not overwrite:
                 raise ValueError(f"{target}: exists and is no copy of {path}; add --overwrite or choose another --out")
             read_image(path)  # reports a damaged file
@@ -96,26 +96,31 @@ def copy_images(paths: Sequence[Path], folder: Path, *, overwrite: bool, progres
     return turned
 
 
-def _is_copy(target, path):
-    """Returns whether two files have the same time; some file systems round it to 2 s."""
-    return target.is_file() and abs(target.stat().st_mtime - path.stat().st_mtime) <= 2
+def _is_copy(target, path, overwrite):
+    """Returns whether a file is a copy: equal; or, of a JPEG that was turned, of the same time unless overwrite."""
+    if not target.is_file():
+        return False
+    if filecmp.cmp(target, path, shallow=False):
+        return not is_rotated_jpeg(path)
+    same_time = abs(target.stat().st_mtime - path.stat().st_mtime) <= 2  # some file systems round it to 2 s
+    return same_time and not overwrite and is_rotated_jpeg(path)
 
 
 def is_rotated_jpeg(path: Path) -> bool:
     """Returns whether a file is a JPEG that its EXIF orientation says is not upright."""
-    with Image.open(path) as image:  # an MPO is a JPEG with further images behind it, as phones write them
+    with open_image(path) as image:  # an MPO is a JPEG with further images behind it, as phones write them
         return image.format in ("JPEG", "MPO") and image.getexif().get(0x0112, 1) in range(2, 9)
 
 
 def _copy(path, target):
     with partial_file(target) as partial:
         if is_rotated_jpeg(path):
-            with Image.open(path) as image:
+            with open_image(path) as image:
                 upright = ImageOps.exif_transpose(image)
             kept = {name: upright.info[name] for name in ("exif", "icc_profile") if name in upright.info}
             upright.save(partial, format="JPEG", quality=95, **kept)
         else:
-            shutil.copyfile(path, partial)
+            partial.write_bytes(read_bytes(path))
         times = path.stat()
         os.utime(partial, ns=(times.st_atime_ns, times.st_mtime_ns))
 

@@ -1,7 +1,6 @@
 """Checkpoints: complete or absent, verified by a fingerprint, the last few kept (orbax v1)."""
 
 import functools
-import json
 import os
 import pathlib
 import sys
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from jaxnerf.runtime import processes
+from jaxnerf.runtime import atomic_files, processes
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.state import TrainState
 
@@ -106,6 +105,7 @@ class Checkpoints:
 
     def _open(self):
         if self._writer is None:
+            atomic_files.check_tree(self._folder, links=True)  # tensorstore would wait for a pipe without end
             # Opened late, because this creates the folder, which a reader must not do. Only the process that
             # writes may remove an unfinished checkpoint: it knows that a killed process left it.
             self._writer = ocp.training.Checkpointer(
@@ -118,9 +118,11 @@ class Checkpoints:
 
     def _verify(self, step, state):
         """Raises a ValueError if a state is not the one that was saved; orbax does not detect changed numbers."""
-        metadata = json.loads((self._folder / str(step) / "_CHECKPOINT_METADATA").read_text())
+        metadata = atomic_files.read_json(self._folder / str(step) / "_CHECKPOINT_METADATA", "it was changed")
         if metadata["custom_metadata"][_FINGERPRINT] != _fingerprint(state):
             raise ValueError("its numbers are not those that were saved")
+        if int(state.step) != step:
+            raise ValueError(f"it holds step {int(state.step)}")
 
     def _set_aside(self, step, error):
         path, number = self._folder / f"{step}.unreadable", 1

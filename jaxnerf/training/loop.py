@@ -6,8 +6,6 @@ import dataclasses
 import functools
 import os
 import pathlib
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -18,7 +16,7 @@ from ml_collections import ConfigDict
 
 from jaxnerf.core.types import Views
 from jaxnerf.data.ray_batches import Gathered
-from jaxnerf.runtime import devices, memory, processes
+from jaxnerf.runtime import devices, memory, processes, signals
 from jaxnerf.training import build, metric_log, workdir
 from jaxnerf.training.auto_config import resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
@@ -47,7 +45,7 @@ def train(
         at_end: called with these Views when training is complete; returns whether it has completed.
 
     Returns:
-        Whether training, and at_end, have completed. False: stopped by Ctrl-C or SIGTERM and saved.
+        Whether training, and at_end, have completed. False: stopped by a signal and saved.
 
     Raises:
         ValueError: on bad input, when another process trains in the workdir, or when too many steps in a row
@@ -100,7 +98,7 @@ def run_training(
     pace = _Pace(experiment, clock, data)
     recent = []
     done = processes.any_of(first >= options.max_steps or 0 < options.max_seconds <= before)
-    with _Interrupt() as interrupt:
+    with signals.Interrupt() as interrupt:
         for step in range(first + 1, first + 1 if done else options.max_steps + 1):
             state, metrics = reinitialize_dead(step, *run(state, pace.data_of(step)))
             recent.append(metrics)
@@ -120,7 +118,6 @@ def run_training(
                 )
                 row["lr"] *= pace.scale
                 log.append(row)
-                progress.note(*metric_log.warnings(log.rows, experiment))
                 progress.show(step, metric_log.line(row, options, out_of_time=out_of_time))
                 recent = []
                 _check_finite(row, options, folder)
@@ -281,22 +278,3 @@ class _PreviewTimes:
 
     def _plan(self, seconds, spent):
         self._next = seconds + max(self._every, 0.1 * seconds, 10 * spent)
-
-
-class _Interrupt:
-    """Turns the first Ctrl-C or SIGTERM into the flag `caught`; a second one ends the program as usual."""
-
-    def __enter__(self) -> Any:
-        self.caught = False
-        self._old = {}
-        if threading.current_thread() is threading.main_thread():  # only there Python allows signal handlers
-            self._old = {number: signal.signal(number, self._catch) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def _catch(self, *_):
-        self.caught = True
-        self.__exit__()

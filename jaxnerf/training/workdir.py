@@ -34,6 +34,7 @@ CHANGEABLE = (
     "train.preview_every",
     "eval.",
 )
+_FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training writes to
 SECTIONS = ("data", "coarse", "fine", "sampling", "hash_grid", "occupancy", "losses", "train", "eval")
 
 
@@ -70,11 +71,9 @@ def read_config(workdir: str | os.PathLike) -> ConfigDict:
     """Reads the config of the run in a workdir; raises ValueError if there is none."""
     path = pathlib.Path(workdir) / "config.json"
     try:
-        content = json.loads(path.read_text())
+        content = atomic_files.read_json(path, "restore it or train again")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file, expected the workdir of a training run; correct --workdir") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: malformed JSON ({error}); restore it or train again") from None
     if not isinstance(content, dict) or not all(isinstance(content.get(name), dict) for name in SECTIONS):
         raise ValueError(f"{path}: is not a config, expected an object with {SECTIONS}; restore it or train again")
     return ConfigDict(content, type_safe=False)  # JSON does not hold the types of "auto" fields
@@ -108,9 +107,12 @@ def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
     process ends. Packages such as `filelock` do not name the holder.
 
     Raises:
-        ValueError: if another process holds it, or nothing can be written there; names the folder.
+        ValueError: if another process holds it, or nothing can be written there, or a symbolic link would lead
+            what training writes to another place; names the folder or the link.
     """
     path = pathlib.Path(workdir) / "running"
+    for name in _FOLDERS:
+        atomic_files.check_tree(path.with_name(name))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = _locked(path)
@@ -134,9 +136,7 @@ def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
 def _locked(path):
     """Returns the file, opened and locked; raises ValueError if another process holds it."""
     while True:
-        # Links are not followed, as truncate would empty the file that a link points at.
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
-        file = os.fdopen(os.open(path, flags, 0o666), "a+")
+        file = atomic_files.open_regular(path, "a+")
         try:
             if fcntl is None:
                 raise OSError(None, "this system has no flock")

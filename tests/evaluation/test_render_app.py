@@ -81,7 +81,7 @@ def test_rgba_over_the_background_is_the_colour(rendered):
     np.testing.assert_allclose(rgba[..., :3] * alpha + (1 - alpha), color, atol=1.01 / 255)
 
 
-def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch):
+def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch, capsys):
     folder = rendered[0]
     before = {file: file.stat().st_mtime_ns for file in folder.rglob("*") if "depth" not in str(file)}
     pixels = (folder / "color" / "0001.png").read_bytes()
@@ -98,6 +98,9 @@ def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch)
         assert (folder / name).stat().st_mtime_ns == before[folder / name]
     render_path(run, **options)
     assert len(calls) == 1, "all frames exist"
+    os.truncate(folder / "depth" / "0001.tiff", 40)
+    render_path(run, **options)
+    assert len(calls) == 2 and f"{folder / 'depth' / '0001.tiff'}: is damaged" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import os
 import pathlib
 import pickle
 import sys
+import tracemalloc
 
 import jax.numpy as jnp
 import numpy as np
@@ -268,6 +269,20 @@ def test_sizes_are_checked_before_allocation(tmp_path):
     read_weights([published.write_pickle(tmp_path / "far.npy", far, 2)])
     with pytest.raises(ValueError, match="its header states"):
         read_weights([published.write_pickle(tmp_path / "bad.npy", good, 3)])
+
+
+@pytest.mark.parametrize("protocol", [2, 4])
+def test_an_array_that_a_list_holds_often_is_made_once(tmp_path, protocol):
+    """The list of a small file holds one array 500 times."""
+    array, size = np.empty(500, object), 40_000
+    array.fill(np.ones((size // 4,), np.float32))
+    path = published.write_pickle(tmp_path / "many.npy", pickle.dumps(array, protocol=protocol), 500)
+    assert path.stat().st_size < 3 * size
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="unreadable .an array more than once"):
+        read_weights([path])
+    assert tracemalloc.get_traced_memory()[1] < 30 * size
+    tracemalloc.stop()
 
 
 def test_without_torch_the_message_names_the_package(tmp_path, monkeypatch):

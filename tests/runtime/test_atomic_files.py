@@ -30,6 +30,7 @@ def test_full_disk_is_an_error_that_names_the_file(tmp_path):
     path = tmp_path / "file.txt"
     path.write_text("old")
     with pytest.raises(OSError, match="No space left.*file.txt"), atomic_files.partial_file(path) as partial:
+        partial.unlink()
         os.symlink("/dev/full", partial)
         with partial.open("w") as file:
             file.write("new")
@@ -43,8 +44,64 @@ def test_swept_partial_file_is_an_error_only_if_the_file_is_missing(tmp_path):
         partial.write_text("same")
         atomic_files.sweep(tmp_path)
     assert path.read_text() == "finished by another process"
-    with pytest.raises(FileNotFoundError), atomic_files.partial_file(tmp_path / "missing.txt"):
-        pass
+    with pytest.raises(FileNotFoundError), atomic_files.partial_file(tmp_path / "missing.txt") as partial:
+        partial.unlink()
+
+
+@pytest.mark.parametrize("write", [atomic_files.write_text, atomic_files.write_text_once])
+def test_nothing_is_written_through_a_link(tmp_path, monkeypatch, write):
+    """Names of partial files cannot be guessed; here they can."""
+    (tmp_path / "precious").write_text("content")
+    (tmp_path / "run").mkdir()
+    monkeypatch.setattr(atomic_files.secrets, "token_hex", lambda size: "0")
+    os.symlink(tmp_path / "precious", tmp_path / "run" / "file.txt.0.tmp")
+    with pytest.raises(FileExistsError, match="file.txt.0.tmp"):
+        write(tmp_path / "run" / "file.txt", "new")
+    os.symlink(tmp_path / "precious", tmp_path / "run" / "file.txt")
+    with pytest.raises(OSError, match="symbolic links.*file.txt"):
+        atomic_files.open_regular(tmp_path / "run" / "file.txt", "a")
+    write(tmp_path / "run" / "file.txt", "new")
+    os.link(tmp_path / "precious", tmp_path / "run" / "other name")
+    with pytest.raises(OSError, match="Not a regular file.*other name"):
+        atomic_files.open_regular(tmp_path / "run" / "other name", "a")
+    assert (tmp_path / "precious").read_text() == "content"
+
+
+def test_only_regular_files_are_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    os.symlink("pipe", tmp_path / "link")
+    for path in (tmp_path / "pipe", tmp_path / "link", tmp_path, "/dev/zero"):
+        with pytest.raises(OSError, match="Not a regular file"):
+            atomic_files.read_bytes(path)
+    (tmp_path / "file").write_text("content")
+    os.symlink("file", tmp_path / "link to a file")
+    assert atomic_files.read_bytes(tmp_path / "link to a file") == b"content"
+
+
+def test_a_tree_has_no_links_pipes_or_devices(tmp_path):
+    folder = tmp_path / "folder"
+    atomic_files.check_tree(folder)  # there is none
+    (folder / "below").mkdir(parents=True)
+    (folder / "below" / "file").write_text("content")
+    atomic_files.check_tree(folder)
+    os.symlink("file", folder / "below" / "link")
+    with pytest.raises(ValueError, match="below/link: is a symbolic link, expected"):
+        atomic_files.check_tree(folder)
+    atomic_files.check_tree(folder, links=True)
+    os.symlink(folder, tmp_path / "other")
+    with pytest.raises(ValueError, match="other: is a symbolic link"):
+        atomic_files.check_tree(tmp_path / "other")
+    atomic_files.check_tree(tmp_path / "other", links=True)
+    os.mkfifo(folder / "pipe")
+    with pytest.raises(ValueError, match="folder/pipe: is a pipe or a device"):
+        atomic_files.check_tree(folder, links=True)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"a":' * 100_000, '{"a": 1', "\xff"])
+def test_malformed_json_is_an_error_that_names_the_file(tmp_path, content):
+    (tmp_path / "file.json").write_text(content, encoding="latin-1")
+    with pytest.raises(ValueError, match=r"file.json: malformed JSON \(.*\); restore it"):
+        atomic_files.read_json(tmp_path / "file.json", "restore it")
 
 
 def test_first_writer_wins(tmp_path):

@@ -23,6 +23,8 @@ import jax, jax.numpy as jnp
 from jaxnerf.runtime import cli
 
 def main(argv):
+    for factor in (2, 3):
+        print(jax.jit(lambda x: factor * x)(jnp.ones(1)))
     jax.jit(lambda x: jnp.linalg.svd(x @ x.T))(jnp.ones((9, 9)))
 
 cli.run(main)
@@ -30,12 +32,12 @@ cli.run(main)
 
 
 def start(**variables):
-    """Runs a program that compiles something; returns its stderr."""
+    """Runs a program that compiles something; returns what it prints and its stderr."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     environment |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", **variables}
     done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return done.stderr
+    return done.stdout, done.stderr
 
 
 def entries(folder):
@@ -55,22 +57,42 @@ def test_cached_program_computes_the_same(trained, unoptimized, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again, first)
 
 
-def test_programs_are_cached_by_default_and_truncated_files_replaced(tmp_path):
-    assert start(XDG_CACHE_HOME=str(tmp_path)) == ""
+def test_programs_are_cached_by_default_and_damaged_files_replaced(tmp_path):
+    out, err = start(XDG_CACHE_HOME=str(tmp_path))
+    assert out.split() == ["[2.]", "[3.]"] and err == ""
     kept = entries(tmp_path / "jaxnerf" / "compiled")
     assert any("lambda" in path.name for path in kept)
-    before = {path: path.read_bytes() for path in kept}
+    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "jaxnerf").rglob("*")} == {0o700, 0o600}
     largest = max(kept, key=lambda path: path.stat().st_size)
     os.truncate(largest, 100)  # as a process killed while writing leaves it
-    assert start(XDG_CACHE_HOME=str(tmp_path)) == "", "JAX alone would warn at every start, and never replace the file"
+    one, other = [path for path in kept if "lambda" in path.name and path != largest][:2]
+    contents = one.read_bytes(), other.read_bytes()
+    other.write_bytes(contents[0])
+    one.write_bytes(contents[1])
+    assert start(XDG_CACHE_HOME=str(tmp_path)) == (out, ""), "JAX alone would print wrong numbers, and a warning"
     assert set(entries(tmp_path)) == set(kept)
-    zlib.decompress(largest.read_bytes())
-    assert all(path.read_bytes() == before[path] for path in kept if path != largest)
+    programs = compilation_cache.Programs(one.parent)
+    assert all(programs.get(path.name.removesuffix("-cache")) for path in kept), "the damaged files are replaced"
+
+
+def test_only_the_program_of_a_key_is_returned(tmp_path):
+    programs = compilation_cache.Programs(tmp_path)
+    programs.put("a", b"program")
+    content = (tmp_path / "a-cache").read_bytes()
+    assert programs.get("a") == b"program" and programs.get("b") is None
+    for key, wrong in [("b", content), ("a", content[:-1]), ("a", content[:-1] + b"n"), ("a", b"")]:
+        (tmp_path / f"{key}-cache").write_bytes(wrong)
+        assert programs.get(key) is None
+    programs.put("a", b"program")
+    assert programs.get("a") == b"program"
 
 
 @pytest.fixture
 def chosen(monkeypatch, tmp_path):
     """Returns a function: environment variables -> the folder that JAX was given, or None."""
+    from jax._src import compilation_cache as jax_cache
+
+    monkeypatch.setattr(jax_cache, "get_file_cache", jax_cache.get_file_cache)  # restores it
     given = {}
     config = types.SimpleNamespace(jax_compilation_cache_dir=None)
     config.update = lambda name, value: given.update({name: value})
@@ -95,9 +117,13 @@ def test_own_cache_folder_is_used(chosen, tmp_path):
 
 def test_unusable_cache_folder_prints_one_line(chosen, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert chosen(XDG_CACHE_HOME=tmp_path / "file") is None
-    said = capsys.readouterr().err
-    assert "compiled programs cannot be cached" in said and len(said.splitlines()) == 1
+    (tmp_path / "shared" / "jaxnerf").mkdir(parents=True)
+    (tmp_path / "shared" / "jaxnerf").chmod(0o777)
+    for folder in ("file", "shared"):
+        assert chosen(XDG_CACHE_HOME=tmp_path / folder) is None
+        said = capsys.readouterr().err
+        assert "compiled programs cannot be cached" in said and len(said.splitlines()) == 1
+    assert "shared/jaxnerf can be written by other users (mode 777); remove it" in said
 
 
 def test_least_recently_used_are_removed_first(tmp_path):

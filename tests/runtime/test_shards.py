@@ -96,6 +96,19 @@ def test_an_interrupted_call_loses_only_the_view_that_it_rendered(fresh, whole, 
     assert len(rendered) == 3 + 6 and contents(folder / "20") == contents(whole[1])
 
 
+def test_damaged_files_are_named_and_their_views_rendered_again(fresh, whole, rendered, capsys):
+    score, folder = fresh
+    score("0/2")
+    damaged = [folder / "20.tmp" / name for name in ("color/000.png", "depth/002.tiff", "contact_sheet/004.png")]
+    for path in (*damaged, folder / "20.tmp" / "rows" / "006.json"):
+        os.truncate(path, path.stat().st_size // 2)
+    assert without_times(score()) == without_times(whole[0])
+    assert len(rendered) == 4 + 8 and contents(folder / "20") == contents(whole[1])
+    said = capsys.readouterr().err
+    assert all(f"{path}: is damaged; its view is rendered again" in said for path in damaged)
+    assert "rows/006.json: is damaged" in said
+
+
 def test_two_shards_that_finish_together_both_return_the_result(fresh, monkeypatch):
     """The second one finishes between the first one's check and its move; a third one follows."""
     score, folder = fresh

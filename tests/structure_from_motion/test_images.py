@@ -85,7 +85,8 @@ def test_rotated_jpegs_are_copied_upright(tmp_path):
 def test_other_files_are_replaced_only_on_request(tmp_path):
     paths, out = write_images(tmp_path / "in", "a.png"), tmp_path / "out"
     write_images(out, "a.png", size=(4, 4))
-    os.utime(out / "a.png", (0, 0))
+    time = paths[0].stat().st_mtime_ns
+    os.utime(out / "a.png", ns=(time, time))
     with pytest.raises(ValueError, match="a.png: exists and is no copy of .*; add --overwrite"):
         copy_images(paths, out, overwrite=False, progress=lambda count: None)
     copy_images(paths, out, overwrite=True, progress=lambda count: None)

@@ -20,7 +20,7 @@ from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
 from jaxnerf.training.workdir import claim, workdir_lock
-from runs import ROOT, smoke_config
+from runs import ROOT, SMOKE_FLAGS, smoke_config
 from slow.faults import kill_many
 
 pytest_plugins = ["run_fixtures"]
@@ -98,6 +98,14 @@ def test_changed_checkpoint_is_an_error(folder):
     shutil.copytree(folder / "checkpoints" / "15" / "state", folder / "checkpoints" / "20" / "state")
     with pytest.raises(ValueError, match="checkpoints/20: .*its numbers are not those that were saved"):
         variables(folder, 20)
+
+
+def test_checkpoint_of_another_step_is_an_error(folder):
+    shutil.copytree(folder / "checkpoints" / "15", folder / "checkpoints" / "25")
+    with pytest.raises(ValueError, match="checkpoints/25: .*it holds step 15"):
+        variables(folder, 25)
+    state, said = load_newest(folder, keep=3)
+    assert int(state.step) == 20 and "kept as 25.unreadable" in said[0]
 
 
 def test_if_no_checkpoint_can_be_read_none_is_renamed(folder):
@@ -188,10 +196,9 @@ def test_read_only_disk_is_an_error(trained, tmp_path):
         variables(disk / "run", 20)  # reading works
 
 
-def test_full_disk_while_writing_metrics_is_an_error(tmp_path):
+def test_full_disk_while_writing_metrics_is_an_error(tmp_path, monkeypatch):
     log = metric_log.MetricLog(tmp_path, first_step=0)
-    os.remove(tmp_path / "metrics.jsonl")
-    os.symlink("/dev/full", tmp_path / "metrics.jsonl")
+    monkeypatch.setattr(metric_log, "open_regular", lambda path, mode: open("/dev/full", mode))
     with pytest.raises(OSError, match="No space left.*metrics.jsonl"):
         log.append({"step": 1, "seconds": 1.0})
     log.close()
@@ -215,6 +222,9 @@ def test_full_disk_while_writing_events_does_not_stop_training(tmp_path, monkeyp
 def test_damaged_rows_are_dropped_and_reported(tmp_path, capsys):
     good = [json.dumps({"step": step, "seconds": 1.0 * step}).encode() for step in (1, 2, 3, 4)]
     bad = [b'{"step": 2, "sec', b"\xff\xfe\x00", b"5", b'{"seconds": 1}', b'{"step": "3", "seconds": 1}', b""]
+    bad += [b'{"step": 3, "seconds": %s}' % value for value in (b"NaN", b"null", b'"1"', b"-1", b"true", b"1e999")]
+    bad += [b'{"step": 3, "seconds": 1, "rays": %s}' % value for value in (b"[]", b"NaN", b"null", b"9" * 99)]
+    bad += [b'{"step": -3, "seconds": 1}', b'{"step": 3, "seconds": 1, "lr": "x"}', b"[" * 100_000]
     content = b"\n".join([good[0], *bad, *good[1:], b'{"step": 5'])
     (tmp_path / "metrics.jsonl").write_bytes(content)
     assert [row["step"] for row in metric_log.read_rows(tmp_path)] == [1, 2, 3, 4]
@@ -223,7 +233,7 @@ def test_damaged_rows_are_dropped_and_reported(tmp_path, capsys):
     log.close()
     said = capsys.readouterr().err.splitlines()
     assert said[0].endswith(
-        "dropped 6 lines from line 2 on that are not rows; the file is kept as metrics.jsonl.damaged"
+        "dropped 19 lines from line 2 on that are not rows; the file is kept as metrics.jsonl.damaged"
     )
     assert said[1].endswith("metrics.jsonl: dropped an incomplete last line") and len(said) == 2
     assert (tmp_path / "metrics.jsonl.damaged").read_bytes() == content
@@ -250,7 +260,26 @@ def test_signal_during_evaluation_keeps_the_checkpoints(folder, monkeypatch, cap
     assert train_and_evaluate(config, folder), "an evaluated checkpoint is not evaluated again"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["SIGHUP", "reader", "closed"])
+def test_run_whose_terminal_or_reader_goes_away_is_saved(compiled_once, tmp_path, how):
+    steps = 40 if how == "closed" else 1_000_000
+    command = [sys.executable, "-m", "jaxnerf.train", f"--workdir={tmp_path}/run", *SMOKE_FLAGS]
+    command += [f"--config.train.max_steps={steps}", "--config.train.log_every=1", "--config.train.save_every=1000000"]
+    close = {"preexec_fn": lambda: os.close(2)} if how == "closed" else {}
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, **close)
+    if how != "closed":
+        assert any(line.startswith("3/") for line in process.stderr)
+    if how == "SIGHUP":
+        process.send_signal(signal.SIGHUP)
+    process.stderr.close()
+    assert process.wait(timeout=100) == 0
+    rows = [row["step"] for row in metric_log.read_rows(tmp_path / "run")]
+    assert Checkpoints(tmp_path / "run").steps() == [rows[-1]] and rows[-1] <= steps
+    assert rows == list(range(1, rows[-1] + 1)) and (how != "closed" or rows[-1] == 40)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_before_training_prints_one_line(number):
     main = f"lambda argv: os.kill(os.getpid(), {int(number)}) or input()"
     program = f"import os\nfrom jaxnerf.runtime import cli\ncli.run({main})"

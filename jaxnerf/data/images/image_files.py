@@ -5,12 +5,18 @@ multiplied by alpha, which is what averages and composites correctly. Files and 
 are taken of premultiplied colour.
 """
 
+import contextlib
 import os
+from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt, UInt16
-from PIL import Image
+from jaxtyping import Bool, Float, Shaped, UInt, UInt16
+from PIL import Image, UnidentifiedImageError
 
+from jaxnerf.runtime.atomic_files import open_regular
+
+# What Pillow decodes by itself. Left to choose by a file's content, it would start Ghostscript for an EPS.
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _ORIENTATION = 0x0112  # the EXIF tag
 _UPRIGHT = {  # value of the tag -> function that makes the image upright
@@ -30,7 +36,7 @@ def read_image(
     """Reads the pixels of an image file, upright, with the file's precision.
 
     Args:
-        path: an 8 or 16 bit PNG, or an 8 bit file of another format that Pillow reads.
+        path: an 8 or 16 bit PNG, or an 8 bit file of another of the FORMATS.
         camera_size: (height, width) that the camera's intrinsics refer to, or a multiple of the image's size.
             If only the stored, unrotated pixels fit it, the EXIF orientation is ignored.
         follow_exif: whether EXIF orientation is followed at all.
@@ -46,6 +52,23 @@ def read_image(
     if not (follow_exif and _is_rotated(pixels.shape[:2], value, camera_size)):
         return pixels
     return np.ascontiguousarray(_UPRIGHT[value](pixels))
+
+
+def read_stored(path: str | os.PathLike) -> Shaped[np.ndarray, "H W *C"]:
+    """Reads an image file's numbers as they are stored, also those of a float32 TIFF.
+
+    Raises:
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is truncated or not an image.
+    """
+    return _use(path, np.asarray)
+
+
+@contextlib.contextmanager
+def open_image(path: str | os.PathLike) -> Iterator[Image.Image]:
+    """Opens an image file of one of the FORMATS with Pillow; raises what Pillow and `open_regular` raise."""
+    with open_regular(path, "rb") as file, Image.open(file, formats=FORMATS) as image:
+        yield image
 
 
 def image_form(
@@ -91,12 +114,20 @@ def has_alpha(path: str | os.PathLike) -> bool:
 
 def _open(path, use):
     try:
-        with Image.open(path) as image:
-            return use(image)
+        return _use(path, use)
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file, expected an image; copy it or correct the name") from None
+
+
+def _use(path, use):
+    try:
+        with open_image(path) as image:
+            return use(image)
+    except FileNotFoundError:
+        raise
     except Exception as error:  # Pillow's decoders raise almost any exception on a damaged file
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        unknown = isinstance(error, UnidentifiedImageError)
+        reason = f"it is no {'/'.join(FORMATS)}" if unknown else " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(
             f"{path}: unreadable ({reason}), expected a complete image file; copy or render it again"
         ) from error
@@ -135,7 +166,7 @@ def _decode(path, image):
 
 
 def _second_bytes(path, raw):
-    with Image.open(path) as image:
+    with open_image(path) as image:
         image.tile = [(*image.tile[0][:3], raw.replace("16B", "16L"))]
         return np.asarray(image)
 

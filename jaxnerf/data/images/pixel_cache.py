@@ -11,9 +11,9 @@ import os
 import shutil
 import threading
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,12 +21,13 @@ from jaxtyping import UInt
 
 from jaxnerf.data.images import image_files
 from jaxnerf.runtime.atomic_files import partial_file
-from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.runtime.user_cache import default_folder
+from jaxnerf.runtime.fingerprint import file_sha256, fingerprint
+from jaxnerf.runtime.user_cache import private_folder
 
 _LARGE = 2**28  # bytes from which pixels are mapped
 _SLOW = 0.5  # seconds of decoding from which smaller arrays are cached, too
 _MAX_SIZE = 2**35  # bytes of all cached files; the least recently used are deleted first
+_PART = 2**24  # bytes that have a checksum of their own, so that several are computed at a time
 _ABANDONED = 3600  # seconds after which a temporary file has no writer any more
 _SPARE = 2**28  # bytes of the disk that stay free
 
@@ -43,7 +44,7 @@ def fill_pixels(
     """Reads the pixels of many images, several images at a time.
 
     Args:
-        paths: all files that the pixels depend on. The cache notices a changed size or modification time.
+        paths: all files that the pixels depend on. The cache notices any change of their content.
         read: N functions without arguments; each returns one image [..., C].
         shape: (P, C) of the result.
         dtype: of the result.
@@ -69,18 +70,17 @@ def fill_pixels(
     mapped = np.dtype(dtype).itemsize * shape[0] * shape[1] >= _LARGE
     path = pixels = None
     try:
-        folder = default_folder()
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"pixels_{_fingerprint(paths, shape, dtype, depends)}.npy"
+        path = private_folder() / f"pixels_{_fingerprint(paths, shape, dtype, depends)}.npy"
         found = _open(path, shape, dtype, mapped)
         if found is not None:
             return found
         if mapped:
             _write(path, fill, shape, dtype)
-            return _open(path, shape, dtype, mapped)
-        start, pixels = time.perf_counter(), _in_memory(fill, shape, dtype)
-        if time.perf_counter() - start > _SLOW:
-            _write(path, lambda put: put(0, pixels), shape, dtype)
+            pixels = _open(path, shape, dtype, mapped)
+        else:
+            start, pixels = time.perf_counter(), _in_memory(fill, shape, dtype)
+            if time.perf_counter() - start > _SLOW:
+                _write(path, lambda put: put(0, pixels), shape, dtype)
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
         logging.warning("pixels cannot be cached in %s (%s); they are held in memory", path, error)
     return _in_memory(fill, shape, dtype) if pixels is None else pixels
@@ -113,15 +113,32 @@ def _open(path, shape, dtype, mapped):
     if pixels.shape != tuple(shape) or pixels.dtype != dtype:
         logging.warning("%s holds an unexpected array; it is written again", path)
         return None
+    checksums = _checksums(path.name, pixels)
+    with path.open("rb") as file:
+        file.seek(-len(checksums), os.SEEK_END)
+        if file.read() != checksums:
+            logging.warning("%s is damaged; it is written again", path)
+            return None
     os.utime(path)  # marks it as used, for _free_space
     return pixels
+
+
+def _checksums(name, pixels):
+    """Returns the CRC-32 of a file's name and of each part of its pixels, as the last bytes of the file.
+
+    CRC-32 is the fastest hash of the standard library, and no flipped bit escapes it.
+    """
+    content = pixels.reshape(-1).view(np.uint8)
+    parts = [content[start : start + _PART] for start in range(0, content.size, _PART)]
+    with ThreadPoolExecutor(num_workers()) as pool:
+        return np.array([zlib.crc32(name.encode()), *pool.map(zlib.crc32, parts)], "<u4").tobytes()
 
 
 def _write(path, fill, shape, dtype):
     row = shape[1] * np.dtype(dtype).itemsize
     _free_space(path.parent, shape[0] * row)
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
-    with partial_file(path) as partial, partial.open("wb") as file:
+    with partial_file(path, mode=0o600) as partial, partial.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
         start, lock = file.tell(), threading.Lock()
 
@@ -131,6 +148,10 @@ def _write(path, fill, shape, dtype):
                 file.write(np.ascontiguousarray(part))
 
         fill(put)
+        file.flush()
+        checksums = _checksums(path.name, np.load(partial, mmap_mode="r"))
+        file.seek(0, os.SEEK_END)
+        file.write(checksums)
 
 
 def _free_space(folder, size):
@@ -150,7 +171,7 @@ def _free_space(folder, size):
 
 def _fingerprint(paths, shape, dtype, depends):
     """Returns a hash of everything that the pixels depend on, the decoding code included."""
-    stats = [(Path(path).absolute(), Path(path).stat()) for path in paths]
-    files = [f"{path}\0{stat.st_size}\0{stat.st_mtime_ns}" for path, stat in stats]
+    with ThreadPoolExecutor(num_workers()) as pool:
+        files = list(pool.map(file_sha256, paths))
     form = repr((tuple(shape), np.dtype(dtype).str, depends))
     return fingerprint(inspect.getsource(image_files), form, *files)

@@ -62,13 +62,15 @@ class Capture(NamedTuple):
 
 
 def fingerprint(capture: Capture) -> str:
-    """Returns a line that changes whenever the names, cameras or splits of a Capture's images change."""
+    """Returns a line that changes whenever the names, cameras, masks' names or splits of a Capture's images change."""
     parts = [repr(capture.splits)]
     for frame in capture.frames:
         camera = frame.camera
         parts.append(repr((frame.name, camera.lens, camera.height, camera.width)))
         arrays = (camera.to_world, camera.focal, camera.center, camera.distortion)
         parts += [np.float32(array) for array in arrays if array is not None]
+        if frame.mask is not None:
+            parts.append(f"mask {frame.mask.name}")
     return f"{len(capture.frames)} images, {content_fingerprint(*parts)[:8]}"
 
 

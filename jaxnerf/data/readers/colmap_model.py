@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.data.readers.validation import MAX_FLOAT32
+from jaxnerf.runtime.atomic_files import read_bytes
 
 MODELS = {  # COLMAP's number of a camera model: its name and number of parameters
     0: ("SIMPLE_PINHOLE", 3),
@@ -165,7 +166,7 @@ def _check_points(ids, points, path):
 
 def _bytes(path):
     try:
-        return path.read_bytes()
+        return read_bytes(path)
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}, expected a model of three files; {AGAIN}") from None
 

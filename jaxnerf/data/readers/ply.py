@@ -8,6 +8,8 @@ import os
 import numpy as np
 from jaxtyping import Float
 
+from jaxnerf.runtime.atomic_files import open_regular
+
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
     **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
@@ -27,7 +29,7 @@ def read_points(path: str | os.PathLike) -> Float[np.ndarray, "N 3"]:
             coordinate that is not finite.
     """
     try:
-        with open(path, "rb") as file:
+        with open_regular(path, "rb") as file:
             order, count, columns = _header(file, path)
             if order is None:
                 points = _ascii(file, count, columns, path)

@@ -1,6 +1,5 @@
 """Checks of arguments, and readers of JSON and .npy files of unknown origin."""
 
-import json
 import math
 import operator
 import os
@@ -11,6 +10,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Shaped
+
+from jaxnerf.runtime import atomic_files
 
 MAX_FLOAT32 = 3.4e38
 
@@ -55,11 +56,9 @@ def is_number(value: Any) -> bool:
 def read_json(path: Path) -> dict[str, Any]:
     """Returns the object in a JSON file; ValueError if the file is unreadable or holds no object."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = atomic_files.read_json(path, "expected a complete file; export it again")
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}, expected a readable JSON file; correct the path") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: malformed JSON ({error}), expected a complete file; export it again") from None
     if not isinstance(content, dict):
         raise ValueError(f"{path}: holds a {type(content).__name__}, expected an object {{...}}; export it again")
     return content
@@ -76,7 +75,7 @@ def read_npy(path: Path, expected: str) -> Shaped[np.ndarray, "..."]:
         ValueError: if the file is missing, truncated or holds no plain array; names the file.
     """
     try:
-        with path.open("rb") as file:
+        with atomic_files.open_regular(path, "rb") as file:
             shape, fortran, dtype = read_npy_header(file)
             if dtype.hasobject:
                 raise ValueError("Python objects, which are never unpickled")

@@ -11,6 +11,7 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Camera, Views
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.evaluation.paths.path_files import read_path_file
+from jaxnerf.runtime.atomic_files import read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
 
 _SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
@@ -150,7 +151,7 @@ def _from_file(file, views):
     height, width = (int(side) for side in views.size[0])
     same = CameraPath(
         name=file.stem,
-        source=fingerprint(file.read_bytes()),
+        source=fingerprint(read_bytes(file)),
         poses=_in_run(found.poses, views.to_file),
         focal=np.tile(np.float64(views.cameras.focal)[:1], (len(found.poses), 1)),
         center=np.tile(np.float64(views.cameras.center)[:1], (len(found.poses), 1)),

@@ -6,12 +6,12 @@ import pathlib
 import sys
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 
 from jaxnerf.core.types import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
+from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path, video
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
@@ -78,6 +78,7 @@ def render_path(
     path = camera_path.make_path(_select_kind(path, views), views, num_frames=num_frames, closed=closed)
     path = camera_path.resize(path, *size)
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
+    atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(overwrite, shard, target)
     shards.claim_folder(target, _origin(run, step, views, path, closed), overwrite=overwrite)
     missing = write_frames(target, run, step, views, path, rgba=rgba, shard=shard)
@@ -117,7 +118,8 @@ def write_frames(
         return [index for index, group in enumerate(files) if not all(file.is_file() for file in group)]
 
     frames = shards.own(range(len(files)), shard)
-    todo = shards.own(missing(), shard)
+    readable = output_images.readable([files[index] for index in frames])
+    todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     if todo:
         render = functools.partial(run.render_image, run.variables(step))
         posed, progress = camera_path.posed_views(views, path), Progress(len(frames))
@@ -163,6 +165,6 @@ def _origin(run, step, views, path, closed):
 
 
 def _write_depth_images(files):
-    near, far = output_images.depth_range(iio.imread(file) for file in files)
+    near, far = output_images.depth_range(map(read_stored, files))
     for file in files:
-        output_images.write_image(file.with_suffix(".png"), output_images.depth_image(iio.imread(file), near, far))
+        output_images.write_image(file.with_suffix(".png"), output_images.depth_image(read_stored(file), near, far))

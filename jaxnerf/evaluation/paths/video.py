@@ -7,9 +7,9 @@ import warnings
 from collections.abc import Iterable
 
 import imageio.v2
-import imageio.v3 as iio
 import numpy as np
 
+from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.runtime import atomic_files
 
 KINDS = ("auto", "mp4", "gif", "none")
@@ -45,7 +45,7 @@ def write_video(path: pathlib.Path, frames: Iterable[pathlib.Path], fps: float) 
         warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
         with imageio.v2.get_writer(partial, **_options(path.suffix, fps)) as writer:
             for frame in frames:
-                pixels = iio.imread(frame)
+                pixels = read_stored(frame)
                 pixels = np.repeat(pixels[..., None], 3, axis=-1) if pixels.ndim == 2 else pixels
                 writer.append_data(_even(pixels) if path.suffix == ".mp4" else pixels)
     atomic_files.sweep(path.parent, f"{glob.escape(path.name)}.*{unfinished}")

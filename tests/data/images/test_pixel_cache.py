@@ -50,19 +50,33 @@ def test_pixels_are_decoded_again_only_if_a_file_changes(image_file, cache, monk
     assert isinstance(first, np.memmap) == isinstance(second, np.memmap) == many
     assert sorted(decoded) == [0, 1] and first[:, 0].tolist() == second[:, 0].tolist() == [7] * 6 + [8] * 6
     assert [file.suffix for file in cache.iterdir()] == [".npy"]
-    os.utime(image_file, ns=(1, 1))
+    assert [path.stat().st_mode & 0o777 for path in (cache, *cache.iterdir())] == [0o700, 0o600]
+    times = image_file.stat()
+    image_file.write_bytes(b"124")  # of the same size
+    os.utime(image_file, ns=(times.st_atime_ns, times.st_mtime_ns))
     assert fill(image_file, decoded, value=9)[0, 0] == 9
     assert fill(image_file, decoded, value=5, depends=("factor", 2))[0, 0] == 5
 
 
-@pytest.mark.parametrize("content", [b"", b"nothing", "cut", "other"])
-def test_a_damaged_cache_file_is_replaced(image_file, cache, content):
+@pytest.mark.parametrize("many", [True, False])
+@pytest.mark.parametrize("content", [b"", b"nothing", "cut", "other", "a flipped bit", "of other pixels"])
+def test_a_damaged_cache_file_is_replaced(image_file, cache, monkeypatch, content, many):
+    monkeypatch.setattr(pixel_cache, "_LARGE", 1 if many else 2**28)
+    monkeypatch.setattr(pixel_cache, "_SLOW", 0.0)
     fill(image_file, [])
     (file,) = cache.iterdir()
+    kept = bytearray(file.read_bytes())
     if content == "other":
         np.save(file, np.zeros((3, 4), np.uint8))
+    elif content == "a flipped bit":
+        kept[140] ^= 1
+        file.write_bytes(kept)
+    elif content == "of other pixels":
+        fill(image_file, [], value=5, depends=("factor", 2))
+        (other,) = set(cache.iterdir()) - {file}
+        os.replace(other, file)
     else:
-        file.write_bytes(file.read_bytes()[:-5] if content == "cut" else content)
+        file.write_bytes(kept[:-5] if content == "cut" else content)
     decoded = []
     assert fill(image_file, decoded)[:, 0].tolist() == [7] * 6 + [8] * 6 and len(decoded) == 2
 
@@ -98,7 +112,7 @@ def test_the_least_recently_used_files_are_deleted_first(image_file, cache, monk
         os.utime(newest, (10**9 - age,) * 2)
     (cache / "pixels_x.1.tmp").write_bytes(b"of a killed process")
     os.utime(cache / "pixels_x.1.tmp", (1, 1))
-    monkeypatch.setattr(pixel_cache, "_MAX_SIZE", 48 + 2 * (128 + 48))
+    monkeypatch.setattr(pixel_cache, "_MAX_SIZE", 48 + 2 * (128 + 48 + 8))
     decoded = []
     fill(image_file, decoded, depends=(4,))
     assert len(list(cache.iterdir())) == 3

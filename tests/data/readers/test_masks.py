@@ -83,3 +83,10 @@ def test_masks_that_the_format_states_are_kept(tmp_path, shots):
     (tmp_path / "images_mask").mkdir()
     found = base.read_capture(tmp_path)
     assert found.frames[0].mask == tmp_path / "masks" / "000.png" and not found.notes
+
+
+def test_masks_are_part_of_the_fingerprint(tmp_path, shots):
+    folder = write(tmp_path, shots, "colmap")
+    with_masks = base.fingerprint(base.read_capture(folder))
+    (folder / "masks").rename(folder / "no_masks")
+    assert base.fingerprint(base.read_capture(folder)) != with_masks

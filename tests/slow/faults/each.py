@@ -76,7 +76,7 @@ def second(out):
 
 
 def signals(out):
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         with training(out / f"signal{int(number)}") as (process, folder):
             process.send_signal(number)
             err = process.communicate(timeout=300)[1].splitlines()
