@@ -4,7 +4,7 @@ BIN := .venv/bin
 DEMO := runs/demo
 PYTEST := $(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile
 
-.PHONY: demo test test-slow test-extra lint clean
+.PHONY: demo test test-slow test-extra docs lint clean
 
 $(BIN)/.installed: setup.cfg pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -12,7 +12,7 @@ $(BIN)/.installed: setup.cfg pyproject.toml
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
-	$(BIN)/pip install --quiet --editable '.[dev,check,tensorboard]'
+	$(BIN)/pip install --quiet --editable '.[dev,check,docs,tensorboard]'
 	touch $@
 
 demo: $(BIN)/.installed
@@ -34,9 +34,15 @@ test-extra: $(BIN)/.dev
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/cameras_from_images.py runs/extra/cameras
 
+# zensical prints what griffe finds in docstrings, but does not fail.
+docs: $(BIN)/.dev
+	@mkdir -p build
+	@$(BIN)/zensical build --clean --strict >build/site.log 2>&1 && ! grep -q griffe: build/site.log || (cat build/site.log; exit 1)
+	@tail -1 build/site.log
+
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
 clean:
-	rm -rf .venv runs build *.egg-info
+	rm -rf .venv runs build site *.egg-info

@@ -2,12 +2,12 @@
 
     JAXNERF_SCENES=... python experiments/speed/speed_vs_error.py --out=DIR \
         [--parts=training,rendering,limits,cost] [--curves=grid,dense] \
-        [--workdir=DIR of a trained run, or none] [--readme=README.md]
+        [--workdir=DIR of a trained run, or none] [--page=FILE.md]
 
 Writes DIR/<part>.json, DIR/published.json (what others report, with its source) and DIR/speed_vs_error.png, and
 prints the tables. What DIR holds already is kept: the same command resumes after an interruption. The parts
 rendering and limits take the run of --workdir, or the longest of the curve "grid"; with "none" they do without.
-With --readme the tables replace what lies between <!-- speed --> and <!-- end of speed --> in that file.
+With --page the tables replace what lies between <!-- speed --> and <!-- end of speed --> in that file.
 """
 
 import math

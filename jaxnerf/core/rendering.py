@@ -126,7 +126,8 @@ def render_hierarchical(
 
     Args:
         key: None for fixed samples, one key, or one key per ray [...].
-        coarse, fine: scenes, see render_samples. They may be the same.
+        coarse: scene, see render_samples.
+        fine: scene; it may be the same.
         rays: Rays [...].
         num_coarse: samples of the coarse scene.
         num_fine: importance points. The fine scene is evaluated at num_coarse + num_fine samples.
