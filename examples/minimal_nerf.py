@@ -1,4 +1,4 @@
-"""NeRF (arXiv:2003.08934) in one file, on public names of jaxnerf only: reads a dataset, trains, scores, saves an image.
+"""NeRF (arXiv:2003.08934) in one file, on public names of jaxnerf only: reads a dataset, trains, scores, saves images.
 
     python examples/minimal_nerf.py [--data_dir=FOLDER] [--steps=2000] [--out=minimal_nerf.png]
 

@@ -45,7 +45,7 @@ def render_samples(scene: SceneFn, rays: Rays, samples: Samples, *, background: 
         delta=(samples.delta, "... S"),
     )
     kept = ~(samples.delta <= 0)  # NaN is kept, so that it is visible
-    t = jnp.where(kept, samples.t, jnp.broadcast_to(rays.near[..., None], samples.t.shape))
+    t = jnp.where(kept, samples.t, jnp.broadcast_to(jnp.asarray(rays.near)[..., None], samples.t.shape))
     x = points_on_rays(rays, t)
     x = jnp.where(kept[..., None], x, jax.lax.stop_gradient(x))  # a NaN gradient must not reach the rays
     density, rgb = scene(x, rays.viewdirs[..., None, :])
