@@ -29,6 +29,9 @@ test-slow: $(BIN)/.dev
 
 # These take longer, or need root to mount small disks; .ci/run does not call them.
 test-extra: $(BIN)/.dev
+	$(BIN)/pip install --quiet --editable '.[notebooks]'
+	$(BIN)/python tests/slow/notebooks.py
+	$(BIN)/python tests/slow/minimal_nerf.py
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/device_matrix.py runs/extra/device_matrix
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/kill_many.py --kills=20 --seed=1 --out=runs/extra/kill_many
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults
