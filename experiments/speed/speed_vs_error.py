@@ -101,7 +101,7 @@ def _training(kept):
     for name, curve in kept["curves"].items():
         if not any(curve["runs"].values()):
             continue
-        for point in medians(curve["runs"]):
+        for point in training.medians(curve["runs"]):
             spread = f" ({min(point['seeds']):.2f} to {max(point['seeds']):.2f})" if len(point["seeds"]) > 1 else ""
             rows.append(
                 (
@@ -252,18 +252,6 @@ def slope(values: list[float], costs: list[float]) -> float:
     return float(np.polyfit(np.log(values), np.log(costs), 1)[0])
 
 
-def medians(runs: dict[str, list[dict]]) -> list[dict]:
-    """Returns the points of a curve: the medians over its runs, at each time at which all were scored."""
-    time_limits = sorted(set.intersection(*({point["time_limit"] for point in points} for points in runs.values())))
-    found = []
-    for time_limit in time_limits:
-        same = [point for points in runs.values() for point in points if point["time_limit"] == time_limit]
-        numbers = [key for key, value in same[0].items() if isinstance(value, (int, float))]
-        found.append({key: statistics.median(point[key] for point in same) for key in numbers})
-        found[-1]["seeds"] = [point["psnr"] for point in same]
-    return found
-
-
 def plot(measured: dict[str, dict], path: pathlib.Path) -> None:
     """Plots PSNR against seconds of training, and of rendering, for the parts that were measured."""
     pyplot = common.pyplot()
@@ -280,7 +268,7 @@ def plot(measured: dict[str, dict], path: pathlib.Path) -> None:
 def _plot_training(axis, kept):
     small = []
     for name, curve in kept["curves"].items():
-        points = medians(curve["runs"]) if all(curve["runs"].values()) and curve["runs"] else []
+        points = training.medians(curve["runs"]) if all(curve["runs"].values()) and curve["runs"] else []
         line = [(point["seconds"], point["psnr"]) for point in points]
         if not line:
             continue
