@@ -41,6 +41,9 @@ _PROCESS_ID = flags.DEFINE_integer(
     "process_id", None, "The index of this process, from 0; required by --coordinator.", lower_bound=0
 )
 _JOIN_SECONDS = flags.DEFINE_float("join_seconds", 300.0, "The time to wait for other processes.", lower_bound=1.0)
+_HEARTBEAT_SECONDS = flags.DEFINE_float(
+    "heartbeat_seconds", 100.0, "The time without a sign of life after which a process counts as lost.", lower_bound=5.0
+)
 _STOPPED_CODE = flags.DEFINE_integer(
     "stopped_code", 0, "The exit code after SIGTERM or Ctrl-C. Kubernetes restarts a program that does not exit with 0."
 )
@@ -70,6 +73,7 @@ def main(argv):
         num_processes=_NUM_PROCESSES.value,
         process_id=_PROCESS_ID.value,
         seconds=_JOIN_SECONDS.value,
+        heartbeat_seconds=_HEARTBEAT_SECONDS.value,
     ):
         finished = train_and_evaluate(config, _WORKDIR.value)
     if not finished:

@@ -1,6 +1,7 @@
 """The processes of one training run: how they connect, agree, and let the first one write files."""
 
 import contextlib
+import math
 import os
 import socket
 import sys
@@ -15,6 +16,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.runtime.lost_processes import LostProcesses
 
 AGREE_EVERY = 10  # steps; agreeing takes some ms, as it waits for the step before it
 _SAMPLE = 2**16  # rows
@@ -41,6 +43,7 @@ def cluster(
     num_processes: int | None = None,
     process_id: int | None = None,
     seconds: float = 300.0,
+    heartbeat_seconds: float = 100.0,
 ) -> Iterator[None]:
     """Joins the processes of one training run, if there are several; call it before any other use of JAX.
 
@@ -53,6 +56,7 @@ def cluster(
         coordinator: HOST:PORT of process 0, to which all connect; None: JAX finds it.
         num_processes, process_id: None: those of srun or mpirun.
         seconds: how long to wait for the other processes.
+        heartbeat_seconds: how long a process may give no sign of life before the others end.
 
     Raises:
         ValueError: if the arguments do not describe a process of a cluster. Inside a cluster no error is
@@ -71,10 +75,13 @@ def cluster(
         num_processes = num_processes if num_processes is not None or not place else place[1]
         process_id = process_id if process_id is not None or not place else place[0]
         _check(coordinator, num_processes, process_id)
+    watch = LostProcesses()
     try:
-        _join(coordinator, num_processes, process_id, seconds)
+        _join(coordinator, num_processes, process_id, seconds, heartbeat_seconds)
         yield
+        watch.flush()
     except BaseException as error:
+        watch.flush()
         _leave(error)
 
 
@@ -89,7 +96,7 @@ def _check(coordinator, num_processes, process_id):
         )
 
 
-def _join(coordinator, num_processes, process_id, seconds):
+def _join(coordinator, num_processes, process_id, seconds, heartbeat_seconds):
     # The preemption service would catch SIGTERM.
     jax.config.update("jax_enable_preemption_service", False)
     failed = []
@@ -98,6 +105,7 @@ def _join(coordinator, num_processes, process_id, seconds):
         try:
             # JAX would end a process that times out with a stack trace, so the time is limited below.
             options = {"initialization_timeout": int(seconds) + 3600}
+            options["heartbeat_timeout_seconds"] = math.ceil(heartbeat_seconds)
             if coordinator is not None and launched() is None:  # otherwise JAX assigns one GPU to each process
                 options["cluster_detection_method"] = "deactivate"
             jax.distributed.initialize(coordinator, num_processes, process_id, **options)
@@ -106,7 +114,13 @@ def _join(coordinator, num_processes, process_id, seconds):
 
     thread = threading.Thread(target=connect, daemon=True)
     thread.start()
-    thread.join(seconds)
+    deadline, answered = time.monotonic() + seconds, False
+    while thread.is_alive() and time.monotonic() < deadline:
+        thread.join(1.0)
+        answers = coordinator is not None and _listens(coordinator)
+        if thread.is_alive() and answered and not answers:  # JAX would go on trying
+            raise ValueError(f"--coordinator={coordinator}: process 0 ended while it waited for others; see its output")
+        answered = answers
     if failed and coordinator is None:
         raise ValueError(f"no cluster to join ({_line(failed[0])}); start with srun, or give {_BY_HAND}")
     if failed:

@@ -103,6 +103,11 @@ def keep_streams() -> None:
     sys.stdout, sys.stderr = _Output(sys.stdout), _Output(sys.stderr)
 
 
+def output(number: int) -> TextIO:
+    """Returns a stream that writes to a file descriptor; a reader that goes away stops the program once."""
+    return _Output(open(number, "w", buffering=1, errors="backslashreplace", closefd=False))
+
+
 def _discard(number):
     """Makes a file descriptor lead nowhere."""
     nowhere = os.open(os.devnull, os.O_RDWR)

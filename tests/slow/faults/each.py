@@ -26,6 +26,7 @@ from jaxnerf.training import auto_config, build, workdir  # noqa: E402
 from jaxnerf.training.checkpoint import Checkpoints  # noqa: E402
 from jaxnerf.training.metric_log import read_rows  # noqa: E402
 from jaxnerf.training.state import create_state  # noqa: E402
+from runs import free_port  # noqa: E402
 
 OPTIONS = {"save_every": 10, "log_every": 1, "max_to_keep": 1000}
 TRAIN = ("--config=configs/smoke.py", *(f"--config.train.{name}={value}" for name, value in OPTIONS.items()))
@@ -36,7 +37,7 @@ def main(out):
     out = pathlib.Path(out)
     out.mkdir(parents=True)
     logging.disable()  # orbax logs each file that it cannot read
-    for fault in (damage, second, signals, full_disk, read_only, devices):
+    for fault in (damage, second, signals, full_disk, read_only, devices, hangs):
         for line in fault(out):
             print(f"{fault.__name__:9}  {line}", flush=True)
 
@@ -144,6 +145,25 @@ def devices(out):
         largest = max(float(np.abs(a - b).max()) for a, b in pairs)
         assert largest < 1e-5
         yield f"4, then 2, then 1, against {name} throughout, 60 steps: parameters within {largest:.1e}"
+
+
+def hangs(out):
+    """Stops one process of two: the other one names it."""
+    for index in (0, 1):
+        folder = out / f"hangs{index}"
+        flags = (*FOREVER, "--heartbeat_seconds=10", f"--coordinator=127.0.0.1:{free_port()}", "--num_processes=2")
+        started = [start("train", folder, *flags, f"--process_id={each}") for each in (0, 1)]
+        try:
+            wait_for(folder, started[0], 12)
+            started[index].send_signal(signal.SIGSTOP)
+            err = started[1 - index].communicate(timeout=100)[1].splitlines()
+            code = started[1 - index].returncode
+            assert code == 1 and err[-1].startswith(f"error: process {index} does not answer any more"), err
+            yield f"process {index} of 2: the other one ends with exit 1, {err[-1]}"
+        finally:
+            for process in started:
+                process.kill()
+                process.communicate()
 
 
 def start(program, folder, *flags):
