@@ -9,10 +9,13 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.safe_math import at_least_float32
 
-# 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half the digits of a float32
-# is exact. Six pieces resolve |x| 2^k, up to 1e6 * 2^15, to 2^-27 of a turn.
-_TURNS = 0x28BE60DB9391054A7F
-_PIECES = [((_TURNS >> (60 - 12 * j)) & 0xFFF) * 2.0 ** (-12 * (j + 1)) for j in range(6)]
+# A fraction of a turn in two floats has digits for this many octaves. The next group begins with a reduction of its own.
+_GROUP = 16
+_MAX_FREQS = 64
+# 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half the digits of a float32 is exact.
+# Six pieces resolve |x| 2^k, up to 1e6 * 2^15, to 2^-27 of a turn; each further group of octaves needs 16 bits more.
+_TURNS = 0x28BE60DB9391054A7F09D5F47D4D37
+_PIECES = [((_TURNS >> (108 - 12 * j)) & 0xFFF) * 2.0 ** (-12 * (j + 1)) for j in range(10)]
 _SIN = [(-1) ** n / math.factorial(2 * n + 1) for n in range(5)]
 _COS = [(-1) ** n / math.factorial(2 * n) for n in range(6)]
 
@@ -25,12 +28,12 @@ def positional_encoding(
         gamma(x) = (x, sin x, cos x, ..., sin 2^(F-1) x, cos 2^(F-1) x)      (Eq. 4)
 
     As in the released code there is no factor pi and x itself comes first. In float32 every
-    entry is within 3e-7 of the exact sine for |x| <= 1e6 and F <= 16: x is reduced once to a
+    entry is within 3e-7 of the exact sine for |x| <= 1e6: x is reduced, once for every 16 octaves, to a
     fraction of a turn in two floats, whose octaves are exact products with powers of two.
 
     Args:
         x: [..., D] positions or directions, any unit.
-        num_freqs: F >= 0 octaves.
+        num_freqs: F octaves, 0 to 64.
         include_input: whether x itself comes first.
 
     Returns:
@@ -39,7 +42,7 @@ def positional_encoding(
         2^k cos 2^k x, to the same accuracy.
 
     Raises:
-        ValueError: on a scalar or integer x, if F is negative, or if there are no features.
+        ValueError: on a scalar or integer x, if F is outside [0, 64], or if there are no features.
     """
     x = jnp.asarray(x)
     if num_freqs < 0 or (num_freqs == 0 and not include_input):
@@ -62,6 +65,11 @@ def encode_planes(x: Float[Array, "D N"], *, num_freqs: int, include_input: bool
     The computation uses this layout because its inner loops are long and a matrix product reads it without a
     transposition.
     """
+    if num_freqs > _MAX_FREQS:
+        raise ValueError(
+            f"positional_encoding: num_freqs is {num_freqs}, expected at most {_MAX_FREQS}, up to which sines have "
+            "correct digits; use fewer octaves (the paper uses 10 and 4)"
+        )
     parts = [x] if include_input else []
     if num_freqs:
         parts.append(_octaves(x.reshape(-1), num_freqs).reshape(2 * num_freqs * x.shape[0], -1))
@@ -74,7 +82,11 @@ def _octaves(x, num_freqs):
     if x.dtype != jnp.float32:
         angles = _scales(num_freqs, x.dtype) * x[None]
         return jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1)
-    return jax.lax.scan(_next_octave, _fraction_of_turn(x), length=num_freqs)[1]
+    groups = [
+        jax.lax.scan(_next_octave, _fraction_of_turn(x, first), length=min(_GROUP, num_freqs - first))[1]
+        for first in range(0, num_freqs, _GROUP)
+    ]
+    return groups[0] if len(groups) == 1 else jnp.concatenate(groups)
 
 
 @_octaves.defjvp
@@ -109,12 +121,13 @@ def _next_octave(turns, _):
     return (doubled - jnp.round(doubled), 2 * low), jnp.stack([sine, cosine])  # both exact
 
 
-def _fraction_of_turn(x):
-    """Returns x / (2 pi) minus an integer, as two floats (Payne and Hanek 1983, shortened)."""
+def _fraction_of_turn(x, octave):
+    """Returns 2^octave x / (2 pi) minus an integer, as two floats (Payne and Hanek 1983, shortened)."""
+    x, count = x * 2.0**octave, 6 + math.ceil(octave / 12)
     bits = jax.lax.bitcast_convert_type(x, jnp.uint32) & jnp.uint32(0xFFFFF000)
     leading = jax.lax.bitcast_convert_type(bits, jnp.float32)
     high, low = jnp.zeros_like(x), jnp.zeros_like(x)
-    for part, pieces in ((leading, _PIECES), (x - leading, _PIECES[:-1])):
+    for part, pieces in ((leading, _PIECES[:count]), (x - leading, _PIECES[: count - 1])):
         for piece in pieces:
             product = part * piece  # exact: 12 by 12 bits
             term = product - jnp.round(product)

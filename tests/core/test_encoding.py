@@ -33,8 +33,9 @@ def test_no_octaves_leave_x():
 def test_every_octave_keeps_its_digits(scale):
     """The shortcuts, sin(x + pi/2) and double angles, lose all digits at the upper end of this range."""
     x = np.random.default_rng(0).uniform(-scale, scale, 1000).astype(np.float32)
-    got = encode(x[:, None], num_freqs=16, include_input=False).reshape(-1, 16, 2)
-    angles = 2.0 ** np.arange(16) * x[:, None].astype(np.float64)
+    x[:2] = np.pi, -scale
+    got = encode(x[:, None], num_freqs=40, include_input=False).reshape(-1, 40, 2)
+    angles = 2.0 ** np.arange(40) * x[:, None].astype(np.float64)
     expected = np.stack([np.sin(angles), np.cos(angles)], axis=-1)
     np.testing.assert_allclose(got, expected, atol=3e-7)
 
@@ -88,6 +89,8 @@ def test_wrong_arguments():
         positional_encoding(jnp.float32(1.0), num_freqs=2)
     with pytest.raises(ValueError, match="num_freqs"):
         positional_encoding(jnp.ones(3), num_freqs=-1)
+    with pytest.raises(ValueError, match="num_freqs is 65, expected at most 64"):
+        positional_encoding(jnp.ones(3), num_freqs=65)
     with pytest.raises(ValueError, match="num_freqs"):
         positional_encoding(jnp.ones(3), num_freqs=0, include_input=False)
 
