@@ -1,7 +1,8 @@
 """Every field of a run's config, with its unit and meaning. The other files here change fields of this one.
 
 A field that is "auto" is inferred when a run starts and logged with its reason. What depends on the dataset is saved to
-the workdir; what depends on the device (microbatch_size, chunk, max_samples) is inferred again at every start.
+the workdir; what depends on the device (microbatch_size, steps_per_dispatch, update_chunk, compute_dtype, chunk,
+max_samples) is inferred again at every start.
 """
 
 from ml_collections import ConfigDict
@@ -82,6 +83,7 @@ def get_config():
                 "view_width": 128,  # outputs of such a layer
                 "use_viewdirs": True,  # False: colour does not depend on the direction
                 "feature_scale": 4.0,  # features are table entries times this; it scales the table's learning rate
+                "compute_dtype": "auto",  # of the networks' layers: "float32" or "bfloat16"; all else is float32
             },
             "occupancy": {  # of the sampler "occupancy"; the box also bounds the hash grid
                 "use_alpha": True,  # cells outside the visual hull of the alpha channels are empty from the start
@@ -93,6 +95,7 @@ def get_config():
                 "threshold": 0.01,  # opacity over one step below which a cell is empty
                 "update_every": 64,  # training steps between updates of the grid
                 "cells_per_update": 2**18,  # cells whose density an update evaluates
+                "update_chunk": auto(int),  # cells of these evaluated at once
                 # Size of the sample buffer in training, divided by the number of rays. If the samples of all rays do
                 # not fit, the rays with most samples get fewer: this fraction of them evenly, the others where the
                 # grid expects the rays to end.
@@ -127,8 +130,12 @@ def get_config():
                 "num_images": auto(int),  # of the split "train"
             },
             "train": {
-                "batch_size": 1024,  # rays per step, over all devices
+                # Rays per step, over all devices. auto: cpu_batch_size on a CPU, and with the sampler "hierarchical";
+                # on an accelerator as many as keep it busy, in the same number of steps.
+                "batch_size": auto(int, 1024),
+                "cpu_batch_size": 1024,
                 "microbatch_size": auto(int),  # rays per gradient accumulation
+                "steps_per_dispatch": auto(int),  # training steps between which the host does nothing
                 "batching": "all_images",  # "all_images", or "single_image": each step draws its rays from one view
                 "parallel": "auto",  # "jit", "sharded", "pmap"; "auto": jit on one device, otherwise sharded
                 "max_steps": auto(int, 200_000),
@@ -159,7 +166,7 @@ def get_config():
             },
             "eval": {
                 "split": "test",
-                "chunk": auto(int, 4096),  # rays per rendered chunk
+                "chunk": auto(int),  # rays per rendered chunk
                 "sample_multiplier": 1.0,  # samples per ray, divided by those of training
                 "bake_occupancy": False,  # render a hierarchical model with an occupancy grid of its visible density
                 "early_stop_eps": 1e-3,  # with a grid: transmittance below which a ray is terminated

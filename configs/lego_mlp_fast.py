@@ -13,6 +13,6 @@ def get_config():
     network.density_activation, network.density_bias = "softplus", -1.0
     config.occupancy.pool_samples_per_ray = 10.0
     train = config.train
-    train.batch_size, train.max_steps, train.lr_steps = 320, 30_000, 30_000
+    train.cpu_batch_size, train.max_steps, train.lr_steps = 320, 30_000, 30_000
     train.lr_init, train.lr_final, train.muon, train.epsilon = 16e-3, 6e-4, 0.2, 1e-8
     return config

@@ -9,6 +9,7 @@ import os
 import pathlib
 import re
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -172,6 +173,16 @@ def describe_machine() -> str:
     """Returns what timings depend on."""
     cores = len(os.sched_getaffinity(0))
     return f"{jax.devices()[0].device_kind}, {cores} core(s), XLA_FLAGS={os.environ.get('XLA_FLAGS', '')!r}"
+
+
+def commit() -> str:
+    """Returns the commit of the working tree, with "-dirty" after it where files differ.
+
+    Outside git it is that of the environment variable JAXNERF_COMMIT, or "unknown".
+    """
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or os.environ.get("JAXNERF_COMMIT", "unknown")
 
 
 def matrix_gflops(repeats: int = 12) -> float:

@@ -75,14 +75,14 @@ def settings(config, run) -> tuple[list[dict[str, Any]], list[str]]:
         "sample_multiplier": options.sample_multiplier,
         "early_stop_eps": options.early_stop_eps,
         "chunk": options.chunk,
-        "compute_dtype": section.get("compute_dtype", "float32"),
+        "compute_dtype": "float32" if config.field == "hash_grid" else section.get("compute_dtype", "float32"),
         "bake_occupancy": not has_grid,
     }
     tried, notes = [own], []
     if not has_grid:
         tried.insert(0, own | {"bake_occupancy": False})
     tried += [own | {"chunk": chunk} for chunk in CHUNKS]
-    if "compute_dtype" in section:
+    if "compute_dtype" in section and config.field != "hash_grid":
         tried += [own | {"compute_dtype": dtype} for dtype in DTYPES]
     else:
         notes.append(f"precision: excluded, as the {config.field} field has one only")

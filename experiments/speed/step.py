@@ -107,7 +107,7 @@ def measure_limits(config, folder: str | None) -> dict[str, Any]:
 
 def _step_row(config):
     step = common.compile_step(config)
-    rays, params = config.train.batch_size, step.state.params
+    rays, params = step.config.train.batch_size, step.state.params
     counts = {name: rays * count for name, count in _samples_per_ray(step.config).items()}
     return {
         "what": f"training step of {rays} rays",

@@ -16,6 +16,7 @@ from jaxnerf.fields.mlp import Dense
 
 _glorot = linen.initializers.glorot_uniform()
 
+_COMPUTE_DTYPES = {"float32": None, "bfloat16": jnp.bfloat16}
 _PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, Eq. 4
 _LARGEST_EXPONENT = 15.0  # a density that is opaque within 1e-5 world units
 _MIN_SLOPE = 1e-3  # the sigmoid has it where its value is 0.001 from 0 or 1: a quarter of an 8-bit level
@@ -63,6 +64,10 @@ def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
             "hash_grid.resolutions or the box of occupancy.lower and occupancy.upper is 'auto'; resolve the "
             "config against a dataset, or set them"
         )
+    name = options.get("compute_dtype", "float32")  # configs of older versions lack it
+    if name not in _COMPUTE_DTYPES:
+        raise ValueError(f"hash_grid.compute_dtype is {name!r}, expected one of {sorted(_COMPUTE_DTYPES)}; correct it")
+    options = {**options, "compute_dtype": _COMPUTE_DTYPES[name]}
     return hash_grid_field(lower=box[0], upper=box[1], **options)
 
 
@@ -106,6 +111,8 @@ class HashGrid(linen.Module):
         view_width: features of such a layer.
         use_viewdirs: False: colour does not depend on the direction.
         feature_scale: features over table entries. A step reaches few entries, so each should change more.
+        compute_dtype: of the inputs of both networks' layers; parameters, interpolation and outputs keep the
+            precision of the table. None: that of the table for all.
     """
 
     lower: Sequence[float]
@@ -119,6 +126,7 @@ class HashGrid(linen.Module):
     view_width: int = 128
     use_viewdirs: bool = True
     feature_scale: float = 4.0
+    compute_dtype: Any = None
 
     @linen.nowrap
     def levels(self) -> tuple[TableLevel, ...]:
@@ -127,6 +135,10 @@ class HashGrid(linen.Module):
         sizes = [vertices(side, resolution) for resolution in self.resolutions]
         ends = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes]).tolist()
         return tuple(TableLevel(size, range(*rows)) for size, rows in zip(sizes, itertools.pairwise(ends), strict=True))
+
+    @linen.nowrap
+    def _rounded(self, value):
+        return value if self.compute_dtype is None else value.astype(self.compute_dtype)
 
     @linen.compact
     def __call__(
@@ -140,19 +152,22 @@ class HashGrid(linen.Module):
         # All levels share a table, so there is only one gradient to clear and one array to update.
         table = self.param("table", _near_zero, (levels[-1].rows.stop, self.features_per_level))
         features = [interpolate(table, place, level.size, rows=level.rows) for level in levels]
-        features = self.feature_scale * jnp.concatenate(features, axis=-1)
+        features = self._rounded(self.feature_scale * jnp.concatenate(features, axis=-1))
         # The table yields one row per sample, but small layers are faster with features first.
         kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
         bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
+        kernel, bias = self._rounded(kernel), self._rounded(bias)
         hidden = jax.nn.relu(jnp.einsum("df,nd->fn", kernel, features) + bias[:, None])
-        geometry = Dense(1 + self.geometry_features, name="density")(hidden)
-        density, inputs = geometry[0], [geometry[1:]]
+        # The logarithm of a density is up to 15, where bfloat16 has steps of 1/16.
+        outputs = {"dtype": None if self.compute_dtype is None else table.dtype}
+        geometry = Dense(1 + self.geometry_features, name="density", **outputs)(hidden)
+        density, inputs = geometry[0], [self._rounded(geometry[1:])]
         if self.use_viewdirs:
             directions = jnp.broadcast_to(harmonics(viewdirs), (*shape, 9))
-            inputs.append(directions.reshape(-1, 9).T)
+            inputs.append(self._rounded(directions.reshape(-1, 9).T))
         for layer in range(self.view_depth):
             inputs = [jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(*inputs))]
-        rgb = Dense(3, name="rgb")(*inputs)
+        rgb = Dense(3, name="rgb", **outputs)(*inputs)
         return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 

@@ -135,7 +135,12 @@ class Dense(Affine):
 
     The kernel has one row for each feature of the concatenation, so parameters and initialisation are those of
     the plain layer.
+
+    Attributes:
+        dtype: of the output; None: that of the inputs.
     """
+
+    dtype: Any = None
 
     def __call__(
         self,
@@ -159,9 +164,12 @@ class Dense(Affine):
             first, highest = parts[0], jax.lax.Precision.HIGHEST
             bias = bias + jnp.matmul(before[1], first, precision=highest)
             parts[0] = jnp.matmul(before[0], first, precision=highest)
-        total = bias.astype(inputs[0].dtype).reshape(-1, *(1,) * (inputs[0].ndim - 1))
+        dtype = inputs[0].dtype if self.dtype is None else self.dtype
+        total = bias.astype(dtype).reshape(-1, *(1,) * (inputs[0].ndim - 1))
         for rows, value in zip(parts, inputs, strict=True):
-            total = total + jnp.tensordot(rows.astype(value.dtype), value, axes=(0, 0))
+            total = total + jnp.tensordot(
+                rows.astype(value.dtype), value, axes=(0, 0), preferred_element_type=self.dtype
+            )
         return total
 
 

@@ -11,8 +11,6 @@ import numpy as np
 from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, update_grid
 from jaxnerf.fields.base import Field
 
-_CHUNK = 8160  # cells evaluated at once; their activations fit into a processor's cache without collisions
-
 Corner = tuple[float, float, float]
 
 
@@ -75,6 +73,7 @@ def make_grid_schedule(
     cells_per_update: int,
     contracted: bool = False,
     initial_passes: int = 8,
+    update_chunk: int = 8160,
 ) -> GridSchedule:
     """Makes the GridSchedule of a box.
 
@@ -89,6 +88,7 @@ def make_grid_schedule(
             cell has been updated initial_passes times; until then neighbours of dense cells are occupied, too.
         contracted: whether the box holds all of space, see OccupancyGrid.
         initial_passes: see cells_per_update.
+        update_chunk: cells of an update that are evaluated at once.
 
     Raises:
         ValueError: if threshold or step_size is not above 0.
@@ -125,7 +125,7 @@ def make_grid_schedule(
 
         def updated():
             # Whole chunks, as a remainder of another size would have to be compiled, too.
-            place = jnp.arange(count + (-count % _CHUNK if count > _CHUNK else 0))
+            place = jnp.arange(count + (-count % update_chunk if count > update_chunk else 0))
             index = num_updates % rounds * count + place
             beyond = (place >= count) | (index >= cells.size)
             chosen = jnp.where(beyond, grid.valid.size, cells[jnp.minimum(index, cells.size - 1)])
@@ -136,7 +136,7 @@ def make_grid_schedule(
                 chosen,
                 threshold=empty_below,
                 spread=young,
-                chunk=_CHUNK,
+                chunk=update_chunk,
             )
 
         return jax.lax.cond(step % interval == interval - 1, updated, lambda: grid)

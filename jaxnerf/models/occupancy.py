@@ -51,10 +51,9 @@ def from_context(context: SamplerContext) -> Model:
 
 def schedule_from_section(section: Mapping[str, Any], field: Field | None) -> GridSchedule:
     """Makes the GridSchedule that a resolved section `occupancy` describes; field: None without updates."""
-    names = ("resolution", "step_size", "threshold", "update_every", "cells_per_update", "contracted")
-    return make_grid_schedule(
-        section["lower"], section["upper"], field=field, **{name: section[name] for name in names}
-    )
+    names = ("resolution", "step_size", "threshold", "update_every", "cells_per_update", "contracted", "update_chunk")
+    options = {name: section[name] for name in names if name in section}  # configs of older versions lack some
+    return make_grid_schedule(section["lower"], section["upper"], field=field, **options)
 
 
 def view_options(context: SamplerContext) -> dict[str, Any]:

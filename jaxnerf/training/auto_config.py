@@ -15,9 +15,10 @@ from jaxnerf.data import dataset
 from jaxnerf.data.geometry import poses, visual_hull, world
 from jaxnerf.data.observations import num_shared
 from jaxnerf.data.ray_batches import view_rays
-from jaxnerf.runtime import devices
+from jaxnerf.runtime import devices, processes
 from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.build import build_model
+from jaxnerf.training.dead_networks import CHECK_EVERY
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, where space is not contracted
@@ -31,7 +32,14 @@ _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anyth
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
 
 # These depend on the device, so they are inferred at every start and stay "auto" in the workdir.
-DEVICE_FIELDS = ("train.microbatch_size", "eval.chunk", "eval.max_samples")
+DEVICE_FIELDS = (
+    "hash_grid.compute_dtype",
+    "occupancy.update_chunk",
+    "train.microbatch_size",
+    "train.steps_per_dispatch",
+    "eval.chunk",
+    "eval.max_samples",
+)
 
 
 class Resolved(NamedTuple):
@@ -48,7 +56,7 @@ class Resolved(NamedTuple):
     lines: list[str]
 
 
-def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
+def resolve(config: ConfigDict, views: Views | None = None, *, platform: str | None = None) -> Resolved:
     """Resolves a config against its dataset; explicit values are never changed.
 
     Only DEVICE_FIELDS may stay "auto"; see `resolve_for_device`. Sections that a run does not use are
@@ -57,6 +65,7 @@ def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
     Args:
         config: see configs/default.py; it is not changed.
         views: of the split "train" where they have been read.
+        platform: see `resolve_for_device`. It determines the number of rays per step.
 
     Raises:
         ValueError: names the field or file, what was found and what is expected.
@@ -65,6 +74,7 @@ def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
     lines = lines + _resolve_sizes(config, views)
+    _resolve_batch(config, lines, platform or jax.default_backend())
     views = _resolve_near(config, views, lines)
     left = [name for name in auto_fields(config) if name not in DEVICE_FIELDS]
     if left:
@@ -72,32 +82,57 @@ def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
     return Resolved(config, views, lines)
 
 
-def resolve_for_device(config: ConfigDict) -> tuple[ConfigDict, list[str]]:
+def resolve_for_device(config: ConfigDict, platform: str | None = None) -> tuple[ConfigDict, list[str]]:
     """Resolves DEVICE_FIELDS of an otherwise resolved config for the devices of this process.
+
+    Args:
+        config: see configs/default.py; it is not changed.
+        platform: of the devices to resolve for in place of those of this process: "cpu", "gpu" or "tpu".
 
     Returns:
         A copy of the config, and one line per inferred value.
     """
     config, lines = copy.deepcopy(config), []
     infer = _inferring(lines)
-    cpu = jax.default_backend() == "cpu"
-    # On a CPU activations should stay in the cache; an accelerator needs many samples to be busy.
-    samples, rays = (2**10, 2**12) if cpu else (2**17, 2**16)
+    profile = devices.profile_of(platform or jax.default_backend())
+    rays, samples = profile.chunk.get(config.sampler, min(profile.chunk.values())), profile.max_samples
     infer(config.eval, "max_samples", samples, f"images        {samples} samples per batch, for this device")
     infer(config.eval, "chunk", rays, f"images        {rays} rays per chunk, for this device")
+    line = f"precision     {profile.compute_dtype} in the layers of the hash grid's networks, for this device"
+    infer(config.hash_grid, "compute_dtype", profile.compute_dtype, line, used=config.field == "hash_grid")
+    cells = profile.update_chunk
+    line = f"grid          {cells} cells evaluated at once in an update, for this device"
+    infer(config.occupancy, "update_chunk", cells, line, used=config.sampler == "occupancy")
     if is_auto(config.train.microbatch_size):
         used = devices.devices_of(config.train.parallel)
         device_rays = config.train.batch_size // len(used)
-        size = devices.default_microbatch(device_rays, build_model(config).samples_per_ray, used[0].platform)
+        size = devices.default_microbatch(
+            device_rays, build_model(config).samples_per_ray, platform or used[0].platform
+        )
         infer(config.train, "microbatch_size", size, f"microbatch    {size} rays, for this device")
+    whole = math.gcd(*host_intervals(config.train))
+    steps = max(count for count in range(1, profile.steps_per_dispatch + 1) if whole % count == 0)
+    infer(config.train, "steps_per_dispatch", steps, f"dispatch      {steps} training steps at a time, for this device")
     return config, lines
+
+
+def host_intervals(train: Any) -> tuple[int, ...]:
+    """Returns the numbers of steps at whose multiples training logs, saves or decides on the host.
+
+    Args:
+        train: the config's section.
+    """
+    intervals = (train.log_every, train.save_every)
+    if train.max_reinits:
+        intervals += (CHECK_EVERY,)
+    return intervals + ((processes.AGREE_EVERY,) if jax.process_count() > 1 else ())
 
 
 def fill_from(config: ConfigDict, resolved: ConfigDict) -> ConfigDict:
     """Returns a copy of a config whose "auto" fields have the values of a resolved one.
 
     Raises:
-        ValueError: if the resolved one lacks such a field.
+        ValueError: if the resolved one lacks such a field, except for DEVICE_FIELDS, which stay "auto".
     """
     config = copy.deepcopy(config)
     for name in auto_fields(config):
@@ -105,6 +140,8 @@ def fill_from(config: ConfigDict, resolved: ConfigDict) -> ConfigDict:
         ours, theirs = config, resolved
         for section in sections:
             ours, theirs = ours[section], theirs.get(section, {})
+        if field not in theirs and name in DEVICE_FIELDS:  # of an older version, which lacks some
+            continue
         if field not in theirs:
             raise ValueError(f"{name} is 'auto', and the config of the workdir has no such field; set a value")
         ours[field] = theirs[field]
@@ -183,6 +220,18 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     infer(train, "max_steps", steps, f"training      {steps:,} steps, for images {side:.0f} px wide")
     infer(train, "lr_steps", train.max_steps, f"training      learning rate decays over {train.max_steps:,} steps")
     return lines
+
+
+def _resolve_batch(config: ConfigDict, lines: list[str], platform: str) -> None:
+    """Fills the number of rays per step into a config.
+
+    An accelerator takes more rays in the same number of steps: the schedules, which count steps, keep their meaning.
+    """
+    rays, why = config.train.get("cpu_batch_size"), "train.cpu_batch_size"
+    if platform != "cpu" and config.sampler == "occupancy":
+        filling = devices.profile_of(platform).samples_per_step / config.occupancy.pool_samples_per_ray
+        rays, why = 2 ** max(math.floor(math.log2(filling)), 0), "they keep this device busy"
+    _inferring(lines)(config.train, "batch_size", rays, f"batch         {rays:,} rays per step: {why}")
 
 
 def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:

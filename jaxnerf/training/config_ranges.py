@@ -10,8 +10,9 @@ _RANGES = (
         (
             "data.factor data.width data.size sampling.num_coarse hash_grid.features_per_level hash_grid.table_size "
             "hash_grid.width hash_grid.view_width occupancy.resolution occupancy.update_every "
-            "occupancy.cells_per_update train.microbatch_size train.max_steps train.lr_steps train.log_every "
-            "train.save_every train.max_to_keep train.max_nonfinite eval.chunk eval.max_samples"
+            "occupancy.cells_per_update occupancy.update_chunk train.cpu_batch_size train.microbatch_size "
+            "train.steps_per_dispatch train.max_steps train.lr_steps train.log_every train.save_every "
+            "train.max_to_keep train.max_nonfinite eval.chunk eval.max_samples"
         ),
     ),
     (

@@ -79,10 +79,10 @@ def make_reinitializer(experiment: Any, folder: str | os.PathLike) -> Callable[.
     allowed = experiment.train.max_reinits
 
     def check(step, state, metrics):
-        names = dead_networks(metrics) if allowed and step % CHECK_EVERY == 0 else ()
+        names = dead_networks(state.counters) if allowed and step % CHECK_EVERY == 0 else ()
         if not names:
             return state, metrics
-        done = int(metrics["num_reinits"])
+        done = int(state.counters["num_reinits"])
         if done + len(names) > allowed:
             raise ValueError(
                 f"{folder}: at step {step} the {' and the '.join(names)} network has had no gradient for {PATIENCE} "

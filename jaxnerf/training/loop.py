@@ -18,12 +18,12 @@ from jaxnerf.core.types import Views
 from jaxnerf.data.ray_batches import Gathered
 from jaxnerf.runtime import devices, memory, processes, signals
 from jaxnerf.training import build, metric_log, workdir
-from jaxnerf.training.auto_config import resolve, resolve_for_device
+from jaxnerf.training.auto_config import host_intervals, resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config_ranges import check_ranges
 from jaxnerf.training.dead_networks import make_reinitializer
 from jaxnerf.training.state import TrainState, create_state
-from jaxnerf.training.step import make_train_step
+from jaxnerf.training.step import make_train_step, repeat_step
 
 
 def train(
@@ -54,8 +54,8 @@ def train(
     started = time.perf_counter()
     check_ranges(config)
     config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves no trace
-    build.check_views(config, views)
     on_device, device_lines = resolve_for_device(config)
+    build.check_views(on_device, views)
     experiment = build.build(on_device)
     options = experiment.train
     num_devices = len(devices.devices_of(options.parallel))
@@ -84,7 +84,7 @@ def run_training(
 ) -> bool:
     """Runs the loop of `train` on the Views of the split "train"; returns whether it has completed."""
     options = experiment.train
-    run, state, data, seconds = _compile(experiment, views)
+    dispatch, state, data, seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, max_to_keep=options.max_to_keep)
     state, unreadable = checkpoints.load_newest(state)
     first = int(state.step)
@@ -99,10 +99,15 @@ def run_training(
     recent = []
     done = processes.any_of(first >= options.max_steps or 0 < options.max_seconds <= before)
     with signals.Interrupt() as interrupt:
-        for step in range(first + 1, first + 1 if done else options.max_steps + 1):
-            state, metrics = reinitialize_dead(step, *run(state, pace.data_of(step)))
+        step = options.max_steps if done else first
+        while step < options.max_steps:
+            count = dispatch.count_after(step)
+            with clock.paused():
+                dispatch.compile(count)
+            run, step = dispatch.runs[count], step + count
+            state, metrics = reinitialize_dead(step, *run(state, pace.data_of(step - count + 1)))
             recent.append(metrics)
-            jax.block_until_ready(recent[-2:][0])  # at most one step in flight, so that stopping is prompt
+            jax.block_until_ready(recent[-2:][0])  # at most one dispatch in flight, so that stopping is prompt
             out_of_time = 0 < options.max_seconds <= clock.seconds()
             stopped = processes.any_of(out_of_time or interrupt.caught, step)
             last = step == options.max_steps or stopped
@@ -139,8 +144,35 @@ def run_training(
     return not interrupted
 
 
+class _Dispatch:
+    """The compiled training step: for as many steps in one dispatch as are configured, and for single ones.
+
+    Single steps are taken where a full dispatch would go past a step at which the host logs, saves or decides, so the
+    result does not depend on the number of steps in a dispatch.
+
+    Attributes:
+        runs: by number of steps, (state, data) -> (state, metrics), see `devices.compile_step` and `repeat_step`.
+    """
+
+    def __init__(self, options: Any, num_steps: int, compile_steps: Callable[[int], tuple]):
+        self._options, self._num_steps, self._compile_steps = options, num_steps, compile_steps
+        self.runs: dict[int, Callable[..., tuple]] = {}
+
+    def compile(self, count: int) -> tuple:
+        """Compiles the step for a number of steps in a dispatch, unless it has been; returns the initial state, data"""
+        placed = ()
+        if count not in self.runs:
+            self.runs[count], *placed = self._compile_steps(count)
+        return placed
+
+    def count_after(self, step: int) -> int:
+        """Returns the number of steps of the dispatch that follows a step."""
+        ends = [self._options.max_steps - step, *(every - step % every for every in host_intervals(self._options))]
+        return self._num_steps if min(ends) >= self._num_steps else 1
+
+
 def _compile(experiment, views):
-    """Returns run, state, data, see `devices.compile_step`; and the seconds that it took, by name."""
+    """Returns _Dispatch, state, data, see `devices.compile_step`; and the seconds that it took, by name."""
     options = experiment.train
     started = time.perf_counter()
     cells, data = experiment.prepare(views)
@@ -156,21 +188,28 @@ def _compile(experiment, views):
         experiment.model, experiment.optimizer, experiment.draw, experiment.losses, experiment.cameras
     )
 
-    def compile_step(state, data, microbatch_size):
-        sizes = {"batch_size": options.batch_size, "microbatch_size": microbatch_size}
-        return devices.compile_step(step, state, data, mode=options.parallel, **sizes)
+    def compile_steps(count):
+        def compile_step(state, data, microbatch_size):
+            sizes = {"batch_size": options.batch_size, "microbatch_size": microbatch_size}
+            return devices.compile_step(repeat_step(step, count), state, data, mode=options.parallel, **sizes)
 
-    run, *placed = memory.fit_step(
-        compile_step,
-        functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, cells),
-        data,
-        min(options.microbatch_size, options.batch_size // len(devices.devices_of(options.parallel))),
-    )
-    if gather:
-        ids = functools.partial(experiment.pixel_ids, positions=np.arange(options.batch_size))
-        run = _gather_ahead(run, jax.jit(lambda step, data: ids(step, data=data)), pixels)
+        run, *placed = memory.fit_step(
+            compile_step,
+            functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, cells),
+            data,
+            min(options.microbatch_size, options.batch_size // len(devices.devices_of(options.parallel))),
+        )
+        if gather:
+            ids = functools.partial(experiment.pixel_ids, positions=np.arange(options.batch_size))
+            run = _gather_ahead(run, jax.jit(lambda step, data: ids(step, data=data)), pixels)
+        return run, *placed
+
+    # Pixels that stay on the host are sent for one step at a time.
+    num_steps = 1 if gather else options.steps_per_dispatch
+    dispatch = _Dispatch(options, num_steps, compile_steps)
+    placed = dispatch.compile(num_steps)
     seconds = {"prepare_seconds": prepared - started, "compile_seconds": time.perf_counter() - prepared}
-    return run, *placed, seconds
+    return dispatch, *placed, seconds
 
 
 def _stay_on_host(pixels):

@@ -217,13 +217,14 @@ def row(
     Args:
         experiment: of the run.
         step: steps taken.
-        recent: the metrics of each step since the last row. Losses and errors are averaged over them; of all
-            other metrics the last values count.
+        recent: the metrics of the steps since the last row, numbers or arrays [steps of a dispatch]. Losses and
+            errors are averaged over them; of all other metrics the last values count.
         seconds: of training so far.
         rate: rays so far -> rays per second since the last row.
         compile_seconds: that compiling the step took.
     """
-    values = {name: np.array([float(metrics[name]) for metrics in recent]) for name in recent[0]}
+    recent = jax.device_get(recent)  # one transfer for all
+    values = {name: np.concatenate([np.ravel(part[name]).astype(float) for part in recent]) for name in recent[0]}
     last = {name: value[-1] for name, value in values.items()}
     rays_dropped = int(last.get("rays_dropped", 0))
     rays = step * experiment.train.batch_size - rays_dropped

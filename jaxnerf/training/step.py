@@ -164,6 +164,26 @@ def make_train_step(
     return train_step
 
 
+def repeat_step(train_step: Callable[..., tuple], num_steps: int) -> Callable[..., tuple]:
+    """Makes a function that takes several training steps in one dispatch: the host waits for the device less often.
+
+    Args:
+        train_step: see `make_train_step`.
+        num_steps: at least 1.
+
+    Returns:
+        The function with the arguments of train_step. Its metrics are arrays [num_steps]; for one step they are those
+        of train_step, and so is the function. The state is the same, bit for bit in float32 on a CPU.
+    """
+    if num_steps == 1:
+        return train_step
+
+    def repeated(state, data, positions, **options):
+        return jax.lax.scan(lambda state, _: train_step(state, data, positions, **options), state, length=num_steps)
+
+    return repeated
+
+
 def _scaled(weight, value):
     """Returns weight * value; a constant weight of 1 adds no operation."""
     return value if isinstance(weight, int | float) and weight == 1 else weight * value

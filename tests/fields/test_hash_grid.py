@@ -47,6 +47,24 @@ def inside(shape, seed=2):
     return lower + np.random.default_rng(seed).uniform(size=(*shape, 3)).astype(np.float32) * (upper - lower)
 
 
+def test_bfloat16_concerns_the_layers_alone():
+    options = {"resolutions": (4,), "features_per_level": 2, "view_width": 8, "view_depth": 1, "width": 16}
+    exact, rough = (hash_grid_field(**BOX, **options, compute_dtype=dtype) for dtype in (None, jnp.bfloat16))
+    shapes, rng = jax.eval_shape(exact.init, jax.random.key(0)), np.random.default_rng(6)
+    params = jax.tree.map(lambda leaf: np.float32(rng.normal(scale=0.3, size=leaf.shape)), shapes)
+    x, viewdirs = inside((2, 30)), directions((2, 1))
+
+    def outputs_and_gradient(field):
+        def total(params):
+            outputs = field.apply(params, x, viewdirs)
+            return sum(map(jnp.sum, outputs)), outputs
+
+        return jax.tree.leaves(jax.jit(jax.grad(total, has_aux=True))(params))
+
+    for one, two in zip(outputs_and_gradient(exact), outputs_and_gradient(rough), strict=True):
+        assert two.dtype == jnp.float32 and 0 < np.linalg.norm(one - two) < 0.05 * np.linalg.norm(one)
+
+
 @pytest.fixture(scope="module")
 def field():
     """A small field with a dense level and one that shares rows, parameters, and its compiled functions."""

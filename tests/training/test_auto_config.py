@@ -40,9 +40,12 @@ AUTO_FIELDS = {
     "occupancy.resolution": 32,
     "occupancy.near_gradient_distance": 0.5,
     "occupancy.min_views": 2,
+    "occupancy.update_chunk": 4096,
     "data.near": 0.5,
     "cameras.num_images": 60,
+    "train.batch_size": 512,
     "train.microbatch_size": 128,
+    "train.steps_per_dispatch": 8,
     "train.max_steps": 300,
     "train.lr_steps": 300,
     "eval.chunk": 512,
@@ -217,23 +220,44 @@ def test_fields_that_nothing_infers_are_an_error(views):
         resolve(config, views)
 
 
-@pytest.mark.parametrize("backend, chunk", [("cpu", 2**12), ("gpu", 2**16)])
-def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_path, backend, chunk):
+@pytest.mark.parametrize(
+    "backend, chunk, cells, steps", [("cpu", 2**13, 8160, 1), ("gpu", 2**16, 2**18, 10), ("tpu", 2**16, 2**18, 10)]
+)
+def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_path, backend, chunk, cells, steps):
     """They stay "auto" in config.json, so the same workdir continues on another device."""
     given = copy.deepcopy(resolved.config)
-    given.eval.chunk = AUTO
     assert set(auto_fields(given)) == set(DEVICE_FIELDS)
     workdir.claim(tmp_path, given)
     read = workdir.read_config(tmp_path)
     assert set(auto_fields(read)) == set(DEVICE_FIELDS)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     config, lines = resolve_for_device(read)
-    assert not auto_fields(config) and len(lines) == 3 and config.eval.chunk == chunk
+    assert not auto_fields(config) and len(lines) == len(DEVICE_FIELDS)
+    assert config.eval.chunk == chunk and config.occupancy.update_chunk == cells
+    # 10 divides the numbers of steps between which rows are logged, checkpoints saved and dead networks sought.
+    assert config.train.steps_per_dispatch == steps
+    assert config.hash_grid.compute_dtype == ("float32" if backend == "cpu" else "bfloat16")
     assert config.train.batch_size % config.train.microbatch_size == 0
-    read.eval.update({"chunk": 5, "max_samples": 6})
-    read.train.microbatch_size = 64
+    explicit = {"eval.chunk": 5, "eval.max_samples": 6, "train.microbatch_size": 64}
+    explicit |= {"train.steps_per_dispatch": 3, "occupancy.update_chunk": 7, "hash_grid.compute_dtype": "float32"}
+    read.update_from_flattened_dict(explicit)
     config, lines = resolve_for_device(read)
-    assert (config.eval.chunk, config.eval.max_samples, config.train.microbatch_size, lines) == (5, 6, 64, [])
+    assert {name: config[name.split(".")[0]][name.split(".")[1]] for name in explicit} == explicit and not lines
+
+
+@pytest.mark.parametrize(
+    "sampler, platform, rays",
+    [("occupancy", "cpu", 300), ("occupancy", "gpu", 2**15), ("occupancy", "tpu", 2**15), ("hierarchical", "gpu", 300)],
+)
+def test_rays_per_step_depend_on_the_device(views, sampler, platform, rays):
+    config = auto_config()
+    config.sampler, config.train.cpu_batch_size, config.occupancy.pool_samples_per_ray = sampler, 300, 7
+    config.train.batch_size = AUTO
+    found, _, lines = resolve(config, views, platform=platform)
+    assert found.train.batch_size == rays and any(line.startswith(f"batch         {rays:,} rays") for line in lines)
+    assert resolve(found, views, platform="tpu").config.train.batch_size == rays  # a workdir's stays on other devices
+    config.train.batch_size = 100
+    assert resolve(config, views, platform=platform).config.train.batch_size == 100
 
 
 def of_cameras(to_world, near=2.0, far=6.0):

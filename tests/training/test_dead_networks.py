@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import shutil
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -270,10 +271,10 @@ def test_healthy_run_is_the_same_with_and_without_reinitialization(tmp_path):
 def test_run_that_keeps_dying_stops_with_advice(tmp_path):
     experiment = smoke_experiment(max_reinits=3)
     check = dead_networks.make_reinitializer(experiment, tmp_path)
-    metrics = {"dead_coarse": 100, "dead_fine": 130, "num_reinits": 2}
-    assert check(149, None, metrics) == (None, metrics)
+    state = SimpleNamespace(counters={"dead_coarse": 100, "dead_fine": 130, "num_reinits": 2})
+    assert check(149, state, {}) == (state, {})
     with pytest.raises(ValueError, match="step 150 the coarse and the fine network .* after 2 .*lower train.lr_init"):
-        check(150, None, metrics)
+        check(150, state, {})
 
 
 def test_networks_of_any_structure_and_number_are_counted_by_name():

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from helpers import assert_same, random_rays
-from jaxnerf.training import loop
+from jaxnerf.training import loop, metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
-from jaxnerf.training.step import make_train_step
+from jaxnerf.training.step import make_train_step, repeat_step
 from runs import smoke_experiment
-from toys import LOSSES, OPTIMIZER, toy_draw, toy_model
+from toys import LOSSES, OPTIMIZER, run_steps, toy_draw, toy_model
 
 
 def run_toy(num_steps, *, num_microbatches=1, bad_steps=(-1,), model=None):
@@ -75,3 +75,36 @@ def test_too_many_nonfinite_steps_in_a_row_stop_the_run(tmp_path):
         loop.run_training(experiment, views, tmp_path / "run")
     assert str(tmp_path / "run") in str(caught.value)
     assert Checkpoints(tmp_path / "run").steps() == [2, 3, 4]
+
+
+@pytest.mark.parametrize("mode", ["jit", "sharded", "pmap"])
+def test_steps_of_one_dispatch_are_the_same_bit_for_bit(mode):
+    model, data = toy_model(), (random_rays(0, (16,)), jnp.array([3]))
+    step, options = make_train_step(model, OPTIMIZER, toy_draw, LOSSES), {"batch_size": 16, "mode": mode}
+    single, rows = run_steps(step, create_state(model, OPTIMIZER, 0), data, 6, **options)
+    several, dispatches = run_steps(repeat_step(step, 3), create_state(model, OPTIMIZER, 0), data, 2, **options)
+    assert_same(several, single, rtol=0, atol=0)
+    for name in rows[0]:
+        whole = np.concatenate([metrics[name] for metrics in dispatches])
+        np.testing.assert_array_equal(whole, [row[name] for row in rows])
+
+
+def test_a_run_of_several_steps_a_dispatch_logs_and_saves_at_the_same_steps(tmp_path):
+    rows, states = [], []
+    for count in (1, 4):
+        experiment = smoke_experiment(log_every=5, save_every=10, max_steps=23, max_reinits=0, steps_per_dispatch=count)
+        views, rays = experiment.load_split("train"), random_rays(0, (64,))
+        experiment = experiment._replace(
+            model=toy_model(),
+            draw=lambda step, positions, _, rays=rays: toy_draw(step, positions, (rays, jnp.array([7]))),
+        )
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        assert loop.run_training(experiment, views, folder)
+        state = create_state(experiment.model, experiment.optimizer, 0)
+        states.append([jax.device_get(Checkpoints(folder).load(step, state)) for step in Checkpoints(folder).steps()])
+        timed = ("seconds", "compile_seconds", "rays_per_second")
+        rows.append([{k: v for k, v in row.items() if k not in timed} for row in metric_log.read_rows(folder)])
+    assert [row["step"] for row in rows[0]] == [5, 10, 15, 20, 23] and [int(s.step) for s in states[0]] == [10, 20, 23]
+    assert rows[1] == rows[0]
+    assert_same(states[1], states[0], rtol=0, atol=0)
