@@ -4,7 +4,7 @@ BIN := .venv/bin
 DEMO := runs/demo
 PYTEST := $(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile
 
-.PHONY: demo test test-slow test-extra lint clean
+.PHONY: demo test test-slow test-extra docs lint clean
 
 $(BIN)/.installed: setup.cfg pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -12,7 +12,7 @@ $(BIN)/.installed: setup.cfg pyproject.toml
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
-	$(BIN)/pip install --quiet --editable '.[dev,check,export,tensorboard]'
+	$(BIN)/pip install --quiet --editable '.[dev,check,docs,export,tensorboard]'
 	touch $@
 
 demo: $(BIN)/.installed
@@ -29,14 +29,23 @@ test-slow: $(BIN)/.dev
 
 # These take longer, or need root to mount small disks; .ci/run does not call them.
 test-extra: $(BIN)/.dev
+	$(BIN)/pip install --quiet --editable '.[notebooks]'
+	$(BIN)/python tests/slow/notebooks.py
+	$(BIN)/python tests/slow/minimal_nerf.py
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/device_matrix.py runs/extra/device_matrix
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/kill_many.py --kills=20 --seed=1 --out=runs/extra/kill_many
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/cameras_from_images.py runs/extra/cameras
+
+# zensical prints what griffe finds in docstrings, but does not fail.
+docs: $(BIN)/.dev
+	@mkdir -p build
+	@$(BIN)/zensical build --clean --strict >build/site.log 2>&1 && ! grep -q griffe: build/site.log || (cat build/site.log; exit 1)
+	@tail -1 build/site.log
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
 clean:
-	rm -rf .venv runs build *.egg-info
+	rm -rf .venv runs build site *.egg-info

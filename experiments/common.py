@@ -30,7 +30,9 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 REFERENCE_GFLOPS = 93.0  # matrix product of the machine that the project's limits in seconds refer to
 _SCORED = "scored.json"  # in the workdir of a run that is trained to its end and scored
 _MATRIX_SIDE = 1024
-README = flags.DEFINE_string("readme", None, "Markdown file in which the tables of this study are replaced.")
+PAGE = flags.DEFINE_string(
+    "page", None, "Markdown file, such as docs/results/speed.md, in which the tables of this study are replaced."
+)
 
 
 def configuration(base: str, overrides: Mapping[str, Any] | Sequence = (), *, seed: int = 0):
@@ -214,10 +216,10 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def publish(lines: Sequence[str], name: str) -> None:
-    """Prints the lines of a study; with --readme replaces the table of that name in the file, too."""
+    """Prints the lines of a study; with --page replaces the table of that name in the file, too."""
     print("\n".join(lines))
-    if README.value:
-        replace(pathlib.Path(README.value), lines, name)
+    if PAGE.value:
+        replace(pathlib.Path(PAGE.value), lines, name)
 
 
 def replace(path: pathlib.Path, lines: Sequence[str], name: str) -> None:

@@ -11,7 +11,7 @@ from runs import ROOT
 if str(ROOT / "experiments") not in sys.path:
     sys.path.append(str(ROOT / "experiments"))
 
-import common  # noqa: F401  before `study` removes flags: --readme stays
+import common  # noqa: F401  before `study` removes flags: --page stays
 
 
 def study(name: str) -> ModuleType:

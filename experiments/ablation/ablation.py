@@ -2,11 +2,11 @@
 
     JAXNERF_SCENES=... python experiments/ablation/ablation.py --out=DIR [--data_dir=/path/to/lego] \
         [--scenes=lego,embedded] [--steps=6000 | --minutes=2] [--seeds=0,1,2] \
-        [--only="no hierarchy,5 octaves"] [--readme=README.md]
+        [--only="no hierarchy,5 octaves"] [--page=FILE.md]
 
 Trains and scores configs/ablation.py and, for as many steps, its variants without one part; then times their steps
 in turn. Writes DIR/ablation.json, DIR/pictures.png and, with the extra `experiments`, DIR/ablation.png, and prints
-the tables. The same command resumes what was interrupted; other seeds, scenes or variants are added. With --readme
+the tables. The same command resumes what was interrupted; other seeds, scenes or variants are added. With --page
 the tables replace what lies between <!-- ablation --> and <!-- end of ablation --> in that file.
 """
 

@@ -1,7 +1,7 @@
 """Measures what each loss gains and costs on a capture: held-out and training views, depth of sparse points, time.
 
     JAXNERF_SCENES=... python experiments/ablation/losses.py --out=DIR [--data_dir=can] [--steps=600] [--seeds=0] \
-        [--only="mse,depth 0.1"] [--readme=README.md]
+        [--only="mse,depth 0.1"] [--page=FILE.md]
 
 Trains configs/capture.py for as many steps with each loss in turn, on the training views without every 8th, and scores
 those. The depth error is |t - D| / D at the observations of the dataset's sparse points in the held-out views: the

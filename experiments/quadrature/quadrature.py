@@ -1,7 +1,7 @@
 """Measures error against evaluations and against time of each quadrature rule, on closed forms and trained scenes.
 
     XLA_FLAGS="--xla_cpu_multi_thread_eigen=false" taskset -c 0 python experiments/quadrature/quadrature.py \
-        [--out=runs/quadrature] [--readme=README.md] [--plot=docs/quadrature.png]
+        [--out=runs/quadrature] [--page=FILE.md] [--plot=docs/results/quadrature.png]
     JAXNERF_SCENES=... python experiments/quadrature/quadrature.py --workdir=runs/a,runs/b [--out=...] ...
     python experiments/quadrature/quadrature.py --report_only [--out=...] ...
 
@@ -15,7 +15,7 @@ hierarchical ones are guided by the trained coarse network. Evaluations are of t
 
 Writes closed.json or trained_NAME.json into --out, prints the tables of all *.json there, and plots error against
 evaluations and against time; for the closed forms the former in float64 and the latter in float32, as the times are.
-With --readme the tables replace what lies between <!-- quadrature --> and <!-- /quadrature --> in that file.
+With --page the tables replace what lies between <!-- quadrature --> and <!-- /quadrature --> in that file.
 """
 
 import functools

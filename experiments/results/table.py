@@ -1,8 +1,8 @@
 """Prints the table of measured results, from the results.json files under workdirs.
 
-    python experiments/results/table.py WORKDIR ... [--readme=README.md] [--table=results]
+    python experiments/results/table.py WORKDIR ... [--page=FILE.md] [--table=results]
 
-Prints one row per scored checkpoint. With --readme the table in that file between the lines <!-- results --> and
+Prints one row per scored checkpoint. With --page the table in that file between the lines <!-- results --> and
 <!-- end of results --> is replaced; --table is the word in these marks.
 """
 

@@ -1,7 +1,7 @@
 """Finds what a scene needs: the smallest model that is hardly worse than the complete one, as a config.
 
     python experiments/scene_needs/scene_needs.py --config=capture --out=DIR [--data_dir=...] [--loss=0.2]
-        [--seeds=0,1,2] [--steps=800] [--only=view_dependence,width] [--readme=README.md --table=NAME]
+        [--seeds=0,1,2] [--steps=800] [--only=view_dependence,width] [--page=FILE.md --table=NAME]
 
 Trains the config's model, and the same with each of PARTS removed or made smaller, for a few steps with every seed,
 and scores them on views held out of training. A part is not needed if its removal costs less than --loss dB: the
@@ -120,7 +120,7 @@ _LOSS = flags.DEFINE_float("loss", 0.2, "dB that the result may lose.", lower_bo
 _SEEDS = flags.DEFINE_list("seeds", ["0", "1", "2"], "Seeds of each run, at least two.")
 _STEPS = flags.DEFINE_integer("steps", 800, "Steps of each run.", lower_bound=1)
 _ONLY = flags.DEFINE_list("only", list(PARTS), "Parts that are tried.")
-_TABLE = flags.DEFINE_string("table", "needs", "Name of the table in the marks of --readme.")
+_TABLE = flags.DEFINE_string("table", "needs", "Name of the table in the marks of --page.")
 
 
 def _sections(config):

@@ -1,11 +1,11 @@
 """Measures what a baked occupancy grid gains for a run that was trained without one, and what it loses.
 
     JAXNERF_SCENES=... taskset -c 0 python experiments/speed/bake_occupancy.py --workdir=runs/lego_small \
-        [--settings=sample_multiplier/early_stop_eps/chunk/max_samples,...] [--split=train] [--readme=README.md]
+        [--settings=sample_multiplier/early_stop_eps/chunk/max_samples,...] [--split=train] [--page=FILE.md]
 
 Renders views of a split along whole rays, as `jaxnerf.eval` does without flags, and with each of the settings, view
 by view, so that other load on the machine slows all of them alike. Choose settings on the training views; score the
-choice with --split=test. With --readme the table replaces what lies between <!-- skipping --> and
+choice with --split=test. With --page the table replaces what lies between <!-- skipping --> and
 <!-- end of skipping --> in that file.
 """
 

@@ -54,3 +54,12 @@ RENDERING = [  # seconds of an 800x800 frame, but where another size is said
     _entry("nerf-pytorch", None, 4870, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
     _entry("JaxNeRF", None, 3840, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
 ]
+
+# Peers on one core of the kind of machine that `speed_vs_error.py` was run on, process CPU seconds, one
+# run each, by hand: TensoRF (VM decomposition, grid 32^3 to 100^3) in PyTorch, and OpenSplat's CPU build from COLMAP's
+# points. Curve of this project beside them: {peer: {seconds: PSNR}}.
+PEERS = {
+    "grid without alpha": {"TensoRF": {15: 28.7, 30: 30.3, 60: 31.9, 120: 32.9}},
+    "grid": {"OpenSplat": {25: 26.1, 52: 28.4, 109: 30.2}},
+    "capture can": {"OpenSplat": {60: 22.6, 120: 23.7, 300: 24.5}},
+}

@@ -2,12 +2,12 @@
 
     JAXNERF_SCENES=... python experiments/speed/speed_vs_error.py --out=DIR \
         [--parts=training,rendering,limits,cost] [--curves=grid,dense] \
-        [--workdir=DIR of a trained run, or none] [--readme=README.md]
+        [--workdir=DIR of a trained run, or none] [--page=FILE.md]
 
 Writes DIR/<part>.json, DIR/published.json (what others report, with its source) and DIR/speed_vs_error.png, and
 prints the tables. What DIR holds already is kept: the same command resumes after an interruption. The parts
 rendering and limits take the run of --workdir, or the longest of the curve "grid"; with "none" they do without.
-With --readme the tables replace what lies between <!-- speed --> and <!-- end of speed --> in that file.
+With --page the tables replace what lies between <!-- speed --> and <!-- end of speed --> in that file.
 """
 
 import math
@@ -101,7 +101,7 @@ def _training(kept):
     for name, curve in kept["curves"].items():
         if not any(curve["runs"].values()):
             continue
-        for point in medians(curve["runs"]):
+        for point in training.medians(curve["runs"]):
             spread = f" ({min(point['seeds']):.2f} to {max(point['seeds']):.2f})" if len(point["seeds"]) > 1 else ""
             rows.append(
                 (
@@ -252,18 +252,6 @@ def slope(values: list[float], costs: list[float]) -> float:
     return float(np.polyfit(np.log(values), np.log(costs), 1)[0])
 
 
-def medians(runs: dict[str, list[dict]]) -> list[dict]:
-    """Returns the points of a curve: the medians over its runs, at each time at which all were scored."""
-    time_limits = sorted(set.intersection(*({point["time_limit"] for point in points} for points in runs.values())))
-    found = []
-    for time_limit in time_limits:
-        same = [point for points in runs.values() for point in points if point["time_limit"] == time_limit]
-        numbers = [key for key, value in same[0].items() if isinstance(value, (int, float))]
-        found.append({key: statistics.median(point[key] for point in same) for key in numbers})
-        found[-1]["seeds"] = [point["psnr"] for point in same]
-    return found
-
-
 def plot(measured: dict[str, dict], path: pathlib.Path) -> None:
     """Plots PSNR against seconds of training, and of rendering, for the parts that were measured."""
     pyplot = common.pyplot()
@@ -280,7 +268,7 @@ def plot(measured: dict[str, dict], path: pathlib.Path) -> None:
 def _plot_training(axis, kept):
     small = []
     for name, curve in kept["curves"].items():
-        points = medians(curve["runs"]) if all(curve["runs"].values()) and curve["runs"] else []
+        points = training.medians(curve["runs"]) if all(curve["runs"].values()) and curve["runs"] else []
         line = [(point["seconds"], point["psnr"]) for point in points]
         if not line:
             continue

@@ -1,10 +1,10 @@
 """Measures the time from the command to the end of the first step: first start, second start, another seed.
 
     taskset -c 0 python experiments/speed/startup.py [--configs=quickstart,lego_small,lego_fast] [--data_dir=lego] \
-        [--repeats=3] [--readme=README.md]
+        [--repeats=3] [--page=FILE.md]
 
 Each config begins with an empty cache folder of its own. Later starts find what the first one left there; their
-median is shown. `taskset` selects the cores. With --readme the table between <!-- startup --> and
+median is shown. `taskset` selects the cores. With --page the table between <!-- startup --> and
 <!-- end of startup --> in that file is replaced.
 """
 

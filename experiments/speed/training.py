@@ -1,6 +1,7 @@
 """The part "training" of speed_vs_error.py: curves of PSNR against seconds of training."""
 
 import pathlib
+import statistics
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -140,3 +141,15 @@ def run_to(time_limit: float, config, where: pathlib.Path) -> dict[str, Any] | N
         "rays": result["rays_seen"],
         **{key: result[key] for key in ("step", "psnr", "ssim", "seconds_per_frame", "views", "parameters")},
     }
+
+
+def medians(runs: dict[str, list[dict]]) -> list[dict]:
+    """Returns the points of a curve: the medians over its runs, at each time at which all were scored."""
+    time_limits = sorted(set.intersection(*({point["time_limit"] for point in points} for points in runs.values())))
+    found = []
+    for time_limit in time_limits:
+        same = [point for points in runs.values() for point in points if point["time_limit"] == time_limit]
+        numbers = [key for key, value in same[0].items() if isinstance(value, (int, float))]
+        found.append({key: statistics.median(point[key] for point in same) for key in numbers})
+        found[-1]["seeds"] = [point["psnr"] for point in same]
+    return found

@@ -1,11 +1,11 @@
 """Counts how often a training collapses to an image of one colour, with and without reinitialization.
 
-    python experiments/stability/collapse.py [--seeds=20] [--steps=600] [--out=runs/collapse] [--readme=README.md]
-    python experiments/stability/collapse.py --painted [--seeds=10] [--steps=480] [--out=...] [--readme=README.md]
+    python experiments/stability/collapse.py [--seeds=20] [--steps=600] [--out=runs/collapse] [--page=FILE.md]
+    python experiments/stability/collapse.py --painted [--seeds=10] [--steps=480] [--out=...] [--page=FILE.md]
 
 Trains the embedded scene with a network that tends to die (ReLU density, eight narrow layers without a skip, a high
 learning rate), each seed with train.max_reinits=0 and with the default. Prints one row per run, then the table;
---out keeps both as collapse.json. With --readme the table between <!-- collapse --> and <!-- end of collapse --> is
+--out keeps both as collapse.json. With --page the table between <!-- collapse --> and <!-- end of collapse --> is
 replaced. A run has collapsed when its network is dead at the end; see jaxnerf/training/dead_networks.py.
 
 With --painted it trains a hash grid on the embedded scene, small and pale in front of a white, black or grey

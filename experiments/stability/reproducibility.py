@@ -1,11 +1,11 @@
 """Measures how reproducible a run is: the same seed twice, other seeds, other numbers of devices.
 
-    python experiments/stability/reproducibility.py --out=DIR [--steps=600] [--seeds=0,1,2,3,4] [--readme=README.md]
+    python experiments/stability/reproducibility.py --out=DIR [--steps=600] [--seeds=0,1,2,3,4] [--page=FILE.md]
 
 Trains configs/quickstart.py (the embedded scene): each seed in a process of its own, the first twice, and the first
 on four virtual CPU devices. Compares parameters bit for bit, gives the spread of PSNR over the seeds, and the drift of
 the parameters between one device and four after DRIFT steps, with the learning rate of quickstart.py and with the
-paper's. Runs that DIR holds are not repeated. With --readme the lines replace what lies between
+paper's. Runs that DIR holds are not repeated. With --page the lines replace what lies between
 <!-- reproducibility --> and <!-- end of reproducibility --> in that file.
 """
 

@@ -1,10 +1,10 @@
 """Measures how far the renderer is from exact on the hard cases, and what exactness costs.
 
-    python experiments/stability/stability.py [--readme=README.md] [--cost_only]
+    python experiments/stability/stability.py [--page=FILE.md] [--cost_only]
 
 Prints for each case of tests/hard_cases the error that is nearest to its bar, or furthest beyond it, of the values
 and of the gradients; the sums by family, beside the forms of the released codes on the same cases; and the time of
-value and gradient of jaxnerf's compositing beside the released codes' cumulative product, in turn. With --readme the
+value and gradient of jaxnerf's compositing beside the released codes' cumulative product, in turn. With --page the
 table of families in that file, between the lines <!-- stability --> and <!-- /stability -->, is replaced.
 """
 
@@ -40,8 +40,8 @@ def main(argv: list[str]) -> None:
     for line in cost():
         print(line, flush=True)
         lines.append(line + "  ")
-    if common.README.value and not _COST_ONLY.value:
-        common.replace(pathlib.Path(common.README.value), lines, "stability")
+    if common.PAGE.value and not _COST_ONLY.value:
+        common.replace(pathlib.Path(common.PAGE.value), lines, "stability")
 
 
 def _table():

@@ -17,7 +17,8 @@ def pixel_grid(height: int, width: int, *, offset: float = 0.5) -> Float[Array, 
     """Computes the (x, y) of every pixel, in px from the top left corner of the image.
 
     Args:
-        height, width: px.
+        height: px.
+        width: px.
         offset: the point in the pixel's square that its ray passes through. 0.5 is the centre; the 2020 code
             uses 0.
 
@@ -82,7 +83,8 @@ def rays_from_pixels(
     Args:
         camera: one Camera (use jax.vmap for a stack).
         pixels: [..., 2] px, as from pixel_grid.
-        near, far: scalars or [...] in t, which here is the distance along the camera's axis.
+        near: scalar or [...] in t, which here is the distance along the camera's axis.
+        far: as near.
 
     Returns:
         Rays [...]; directions reach the plane at distance 1 (not unit length), as in the released

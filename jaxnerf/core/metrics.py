@@ -19,7 +19,8 @@ def mse(
     """Computes the mean squared error of images over pixels and channels.
 
     Args:
-        a, b: [..., H, W, C].
+        a: [..., H, W, C].
+        b: [..., H, W, C].
         mask: [..., H, W] bool, the pixels that count; all when None.
 
     Returns:
@@ -62,7 +63,8 @@ def psnr(
     """Computes the peak signal-to-noise ratio in dB of images with colours in [0, 1].
 
     Args:
-        a, b: [..., H, W, C].
+        a: [..., H, W, C].
+        b: [..., H, W, C].
         mask: [..., H, W] bool, the pixels that count; all when None.
 
     Returns:
@@ -81,7 +83,8 @@ def ssim(a: Num[ArrayLike, "*batch H W C"], b: Num[ArrayLike, "*batch H W C"]) -
     k2 = 0.03, population variances, and the mean over windows and channels, as the paper's tables and dm_pix do.
 
     Args:
-        a, b: [..., H, W, C].
+        a: [..., H, W, C].
+        b: [..., H, W, C].
 
     Returns:
         [...] in [-1, 1], 1 for identical images.

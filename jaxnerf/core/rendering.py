@@ -53,7 +53,7 @@ def render_samples(
         delta=(samples.delta, "... S"),
     )
     kept = ~(samples.delta <= 0)  # NaN is kept, so that it is visible
-    t = jnp.where(kept, samples.t, jnp.broadcast_to(rays.near[..., None], samples.t.shape))
+    t = jnp.where(kept, samples.t, jnp.broadcast_to(jnp.asarray(rays.near)[..., None], samples.t.shape))
     x = points_on_rays(rays, t)
     x = jnp.where(kept[..., None], x, jax.lax.stop_gradient(x))  # a NaN gradient must not reach the rays
     density, rgb = scene(x, rays.viewdirs[..., None, :])
@@ -143,7 +143,8 @@ def render_hierarchical(
 
     Args:
         key: None for fixed samples, one key, or one key per ray [...].
-        coarse, fine: scenes, see render_samples. They may be the same.
+        coarse: scene, see render_samples.
+        fine: scene; it may be the same.
         rays: Rays [...].
         num_coarse: samples of the coarse scene.
         num_fine: importance points. The fine scene is evaluated at num_coarse + num_fine samples.

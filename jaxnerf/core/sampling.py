@@ -17,7 +17,8 @@ def uniform_edges(
     """Computes the edges of segments of equal length, in t or in 1 / t.
 
     Args:
-        near, far: [...] in t, near <= far. If they are equal, all edges are.
+        near: [...] in t.
+        far: [...] in t, near <= far. If they are equal, all edges are.
         num_segments: S >= 1.
         in_disparity: equal steps in 1 / t instead: 1 / t = (1 - s) / near + s / far, which may
             reach far = inf and needs near > 0.
@@ -61,7 +62,8 @@ def stepped_edges(
     Args:
         key: None, one key, or one key per ray [...]. A key shifts all edges of a ray towards near by the same
             random fraction of a step.
-        near, far: [...] in t, near <= far, both finite.
+        near: [...] in t, finite.
+        far: [...] in t, finite, near <= far.
         step_size: [...] or a number, in t, > 0.
         num_segments: S >= 1. Segments beyond far are empty; if S steps do not reach far, the last is longer.
 
@@ -253,7 +255,8 @@ def stratified_points(
 
     Args:
         key: None for evenly spaced points, one key, or one key per ray [...].
-        near, far: [...] in t.
+        near: [...] in t.
+        far: [...] in t.
         num_points: S >= 2.
         in_disparity: equal steps in 1 / t.
 

@@ -95,7 +95,8 @@ class HashGrid(linen.Module):
     """Interpolated features, a network for the density's logarithm, and one for colour (arXiv:2201.05989).
 
     Attributes:
-        lower, upper: [3] world units, the box.
+        lower: [3] world units, a corner of the box.
+        upper: [3] world units, the opposite corner.
         resolutions: vertices along the longest side, for each level.
         features_per_level: features of each vertex.
         table_size: maximal rows per level; a level with more vertices shares rows by a hash.

@@ -61,14 +61,14 @@ def test_what_is_written_can_be_trained_and_read(found, tmp_path, monkeypatch):
     out.mkdir()
     settings = {"loss": 0.2, "steps": 800, "seeds": [0, 1, 2]}
     lines = scene_needs.write(out, quickstart.get_config(), found, settings)
-    readme = tmp_path / "README.md"
-    readme.write_text("a\n<!-- needs -->\n<!-- end of needs -->\nb\n")
-    common.replace(readme, lines, "needs")
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- needs -->\n<!-- end of needs -->\nb\n")
+    common.replace(page, lines, "needs")
     monkeypatch.syspath_prepend(str(out))
     config = importlib.import_module("needed").get_config()
     expected = common.changed(quickstart.get_config(), found.overrides)
     assert config.to_dict() == expected.to_dict()
-    assert "| frequencies:" in readme.read_text() and readme.read_text().endswith("b\n")
+    assert "| frequencies:" in page.read_text() and page.read_text().endswith("b\n")
     assert json.loads((out / "needs.json").read_text())["overrides"] == found.overrides
 
 

@@ -40,7 +40,7 @@ def test_a_bar_is_reached_at_the_first_score_of_at_least_that():
 def test_a_curve_has_medians_where_all_seeds_were_scored():
     run = lambda *scores: [{"time_limit": time_limit, "psnr": psnr} for time_limit, psnr in scores]  # noqa: E731
     runs = {"0": run((1, 20.0), (2, 25.0)), "1": run((1, 22.0)), "2": run((1, 27.0), (2, 21.0))}
-    (point,) = speed.medians(runs)
+    (point,) = training.medians(runs)
     assert point["psnr"] == 22.0 and point["seeds"] == [20.0, 22.0, 27.0]
 
 

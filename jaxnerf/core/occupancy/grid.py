@@ -51,7 +51,8 @@ def create_grid(
     """Creates the grid of a box before any update, when only the valid cells are known (as in arXiv:2201.05989).
 
     Args:
-        lower, upper: [3] world units.
+        lower: [3] world units.
+        upper: [3] world units.
         valid: [X, Y, Z] bool, x first.
         initial_density: 1 / world unit, the density_max of every cell, a number or [X, Y, Z]. An empty cell stays
             occupied until updates bring that down to the threshold: log(initial_density / threshold) /
@@ -151,9 +152,11 @@ def grid_from_scene(
     Args:
         key: for the points in the cells.
         scene: see render_samples.
-        lower, upper: [3] world units, the box; the scene is not evaluated outside of it.
+        lower: [3] world units, a corner of the box; the scene is not evaluated outside of it.
+        upper: [3] world units, the opposite corner.
         shape: cells along x, y and z.
-        threshold, chunk: see update_grid.
+        threshold: see update_grid.
+        chunk: see update_grid.
         contracted: see create_grid.
         num_updates: random points in each cell. A cell is occupied if the density at one of them, or at one of a
             neighbour's, exceeds the threshold. Matter much thinner than a cell may be missed.

@@ -1,0 +1,55 @@
+"""Prints the table of the README: quality against seconds on one CPU core, beside peers.
+
+    python experiments/results/headline.py runs/speed/training.json [--page=README.md]
+
+The curves are those of `experiments/speed/speed_vs_error.py`, the peers those of `experiments/speed/published.py`. With
+--page the table in that file between the lines <!-- headline --> and <!-- end of headline --> is replaced.
+"""
+
+import pathlib
+import sys
+
+sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
+import common
+from speed import published, training
+
+from jaxnerf.runtime import cli
+
+WORK = {
+    "grid": "lego, 100 px",
+    "grid without alpha": "lego, 100 px, alpha not used",
+    "capture fox": "fox, phone images with a lens, 200 px",
+    "capture fern": "fern, forward-facing, 200 px",
+    "capture can": "can, phone images, 180 px",
+}
+
+
+def main(argv: list[str]) -> None:
+    """Prints the table of the measurements in the JSON file named on the command line."""
+    if len(argv) != 2:
+        raise ValueError("name one training.json of experiments/speed/speed_vs_error.py")
+    common.publish(table(common.read_json(pathlib.Path(argv[1]))), "headline")
+
+
+def table(measured: dict) -> list[str]:
+    """Returns the lines of the table; curves that were not measured are skipped."""
+    rows = []
+    for name, work in WORK.items():
+        runs = measured["curves"].get(name, {}).get("runs")
+        peers = published.PEERS.get(name, {})
+        if runs:
+            points = training.medians(runs)
+            ours = {point["comparable"]: point["psnr"] for point in points}
+            cells = [f"{peer}: {_scores(scores)}" for peer, scores in peers.items()]
+            rows.append((work, _scores(ours), f"{points[-1]['seconds_per_frame']:.2f} s", "; ".join(cells) or "-"))
+    heads = ("dataset, one CPU core", "PSNR after seconds of training", "a frame", "measured beside it")
+    return [*common.markdown(heads, rows), "", "How: [speed against error](docs/results/speed.md)."]
+
+
+def _scores(scores):
+    """Returns {seconds: PSNR} as text."""
+    return ", ".join(f"{psnr:.1f} dB ({seconds:.0f} s)" for seconds, psnr in scores.items())
+
+
+if __name__ == "__main__":
+    cli.run(main, positional=True)

@@ -1,0 +1,48 @@
+"""The documents: links lead somewhere, every public name and every page is listed, and Python examples run."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+import jaxnerf
+from runs import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+EXAMPLES = [
+    pytest.param(found.group(1), id=f"{page.relative_to(ROOT)}:{page.read_text()[: found.start()].count(chr(10)) + 2}")
+    for page in PAGES
+    for found in re.finditer(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    if "--8<--" not in found.group(1) and "load_scene(" not in found.group(1)  # the latter needs a trained run
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_and_included_files_exist(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\(([^)#\s]+)", text):
+        assert re.match(r"[a-z]+:", target) or (page.parent / target).exists(), target
+    for target in re.findall(r'--8<-- "([^"]+)"', page.read_text()):
+        assert (ROOT / target).exists(), target
+
+
+def test_every_page_is_in_the_navigation():
+    listed = set(re.findall(r"\s(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert listed == {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
+
+
+def test_every_public_name_is_on_one_page():
+    text = "".join(page.read_text() for page in (DOCS / "api").iterdir())
+    assert sorted(re.findall(r"^::: jaxnerf\.(\w+)$", text, re.MULTILINE)) == sorted(jaxnerf.__all__)
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 130
+
+
+@pytest.mark.parametrize("code", EXAMPLES)
+def test_python_examples_run(code, tmp_path):
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
