@@ -12,7 +12,7 @@ $(BIN)/.installed: setup.cfg pyproject.toml
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
-	$(BIN)/pip install --quiet --editable '.[dev,check,docs,tensorboard]'
+	$(BIN)/pip install --quiet --editable '.[dev,check,docs,export,tensorboard]'
 	touch $@
 
 demo: $(BIN)/.installed

@@ -43,10 +43,11 @@ from jaxnerf.core.volume_rendering import (
     composite,
     expected_depth,
     expected_disparity,
+    median_depth,
     transmittance,
     weights_from_density,
 )
-from jaxnerf.registry import register_field, register_loss, register_reader, register_sampler
+from jaxnerf.registry import register_exporter, register_field, register_loss, register_reader, register_sampler
 
 if _typing.TYPE_CHECKING:
     from jaxnerf.data.dataset import load_dataset
@@ -92,6 +93,7 @@ __all__ = [
     "importance_points", "merge_edges", "points_on_rays",
     # from densities to colour
     "Rendering", "weights_from_density", "transmittance", "composite", "expected_depth", "expected_disparity",
+    "median_depth",
     # renderers
     "SceneFn", "render_samples", "render_rays", "render_hierarchical", "render_image",
     # occupancy
@@ -104,5 +106,5 @@ __all__ = [
     # runs
     "load_scene", "restore_run", "TrainedRun", "train_and_evaluate",
     # registration
-    "register_field", "register_sampler", "register_loss", "register_reader",
+    "register_field", "register_sampler", "register_loss", "register_reader", "register_exporter",
 ]  # fmt: skip

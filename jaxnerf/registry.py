@@ -1,4 +1,4 @@
-"""The parts of a run that a config selects by name: fields, samplers, losses and dataset readers.
+"""The parts that a config or a flag selects by name: fields, samplers, losses, dataset readers and exporters.
 
 Built-in parts are imported when they are first used. Code outside the package adds parts with the `register_*`
 functions; a program imports such code with `--plugins=module,...`.
@@ -108,6 +108,16 @@ READERS = Registry(
         "llff": "jaxnerf.data.readers.llff:READER",
     },
 )
+EXPORTERS = Registry(
+    "exporter",
+    "jaxnerf.register_exporter",
+    {
+        "mesh": "jaxnerf.exporters.mesh:export_mesh",
+        "points": "jaxnerf.exporters.points:export_points",
+        "depth": "jaxnerf.exporters.depth:export_depth",
+        "splats": "jaxnerf.exporters.splats:export_splats",
+    },
+)
 
 
 def register_field(name: str, make: Callable[..., Any]) -> None:
@@ -173,3 +183,17 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
         ValueError: if another format has that name.
     """
     READERS.add(name, Reader(read, detect or (lambda folder: False)))
+
+
+def register_exporter(name: str, export: Callable[..., Any]) -> None:
+    """Registers a way to export a trained run under a name for `jaxnerf-export --kind`.
+
+    Args:
+        name: of the exporter.
+        export: (source: ExportSource, folder: Path) -> None, see `jaxnerf.exporters.base.ExportSource`. It writes files
+            into the folder, which is moved into place when it returns.
+
+    Raises:
+        ValueError: if another exporter has that name.
+    """
+    EXPORTERS.add(name, export)

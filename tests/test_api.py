@@ -32,17 +32,20 @@ SURFACE = {
     "composite": "weights values | background=None transmittance=None",
     "expected_depth": "weights t transmittance | far",
     "expected_disparity": "weights t |",
-    "render_samples": "scene rays samples | background=None",
-    "render_rays": "key scene rays | num_samples rule='segments' in_disparity=False background=None render",
+    "median_depth": "density length t delta | far rule='segments'",
+    "render_samples": "scene rays samples | background=None median_depth=False",
+    "render_rays": "key scene rays | num_samples rule='segments' in_disparity=False background=None render "
+    "median_depth=False",
     "render_hierarchical": "key coarse fine rays | num_coarse num_fine rule='segments' in_disparity=False "
-    "importance_padding=0.0 background=None",
+    "importance_padding=0.0 background=None median_depth=False",
     "render_image": "render rays | chunk",
     "create_grid": "lower upper valid | initial_density contracted=False",
     "update_grid": "key grid scene cells | threshold decay=0.6 smoothing=0.2 spread=True chunk=8192",
     "grid_from_scene": "key scene lower upper shape | threshold contracted=False num_updates=4 chunk=8192",
     "mask_scene": "scene grid |",
     "render_packed": (
-        "scene grid rays samples | max_samples early_stop_eps=0.0 near_gradient_distance=0.0 background=None"
+        "scene grid rays samples | max_samples early_stop_eps=0.0 near_gradient_distance=0.0 background=None "
+        "median_depth=False"
     ),
     "mse": "a b | mask=None",
     "psnr": "a b | mask=None",
@@ -63,6 +66,7 @@ SURFACE = {
     "register_sampler": "name make |",
     "register_loss": "name function | on='renderings' needs=()",
     "register_reader": "name read | detect=None",
+    "register_exporter": "name export |",
 }
 TYPES = ["Rays", "Samples", "PackedSamples", "Rendering", "Camera", "Views", "Batch", "OccupancyGrid", "SceneFn"]
 TYPES += ["SparsePoints", "TrainedRun"]
@@ -122,9 +126,9 @@ def test_docstring_describes_arguments_and_result(name):
 # Functions with a source in the paper, its code or the literature name it. These are plain mathematics or read files.
 PLAIN = {
     *("uniform_edges", "merge_edges", "points_on_rays", "render_image", "look_at", "turntable", "ndc_to_t"),
-    *("mse", "psnr", "round_to_8_bits", "expected_depth", "expected_disparity", "transmittance"),
+    *("mse", "psnr", "round_to_8_bits", "expected_depth", "expected_disparity", "median_depth", "transmittance"),
     *("load_dataset", "draw_batch", "still_life", "mlp_field", "load_scene", "restore_run", "train_and_evaluate"),
-    *("register_field", "register_sampler", "register_loss", "register_reader"),
+    *("register_field", "register_sampler", "register_loss", "register_reader", "register_exporter"),
 }
 
 

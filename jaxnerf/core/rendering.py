@@ -19,7 +19,14 @@ def points_on_rays(rays: Rays, t: Num[ArrayLike, "*batch samples"]) -> Float[Arr
     return rays.origins[..., None, :] + t[..., None] * rays.directions[..., None, :]
 
 
-def render_samples(scene: SceneFn, rays: Rays, samples: Samples, *, background: Background | None = None) -> Rendering:
+def render_samples(
+    scene: SceneFn,
+    rays: Rays,
+    samples: Samples,
+    *,
+    background: Background | None = None,
+    median_depth: bool = False,
+) -> Rendering:
     """Renders rays through a scene that is evaluated at the given samples (Eq. 3).
 
     Args:
@@ -28,6 +35,7 @@ def render_samples(scene: SceneFn, rays: Rays, samples: Samples, *, background: 
         samples: Samples [..., S]. Where delta is 0, the scene is evaluated at the near end of the ray, and
             the result, even NaN, affects neither value nor gradient.
         background: the colour behind the scene, [3] or [..., 3]; None for black.
+        median_depth: whether the Rendering has a median depth; see volume_rendering.median_depth.
 
     Returns:
         Rendering [...]. An empty ray has the background's colour, depth far and disparity 0.
@@ -60,6 +68,10 @@ def render_samples(scene: SceneFn, rays: Rays, samples: Samples, *, background: 
     )  # before the sums: in bfloat16 each would round its gradient
     weights = volume_rendering.weights_from_density(density, length, rule=samples.rule)
     transmittance = volume_rendering.transmittance(density, length)
+    median = None
+    if median_depth:
+        options = {"far": rays.far, "rule": samples.rule}
+        median = volume_rendering.median_depth(density, length, t, jnp.where(kept, samples.delta, 0), **options)
     return Rendering(
         rgb=volume_rendering.composite(weights, rgb, background=background, transmittance=transmittance),
         opacity=volume_rendering.opacity(density, length),
@@ -68,6 +80,7 @@ def render_samples(scene: SceneFn, rays: Rays, samples: Samples, *, background: 
         weights=weights,
         num_dropped=jnp.zeros(t.shape[:-1], jnp.int32),
         samples=Samples(t=t, delta=jnp.where(kept, samples.delta, 0), rule=samples.rule),
+        median_depth=median,
     )
 
 
@@ -81,6 +94,7 @@ def render_rays(
     in_disparity: bool = False,
     background: Background | None = None,
     render: Callable[..., Rendering] = render_samples,
+    median_depth: bool = False,
 ) -> Rendering:
     """Renders rays with evenly spaced samples between near and far.
 
@@ -94,6 +108,7 @@ def render_rays(
         in_disparity: whether the samples are evenly spaced in 1 / t (requires near > 0).
         background: see render_samples.
         render: render_samples, or a function with the same arguments and result.
+        median_depth: see render_samples.
 
     Returns:
         Rendering [...].
@@ -106,7 +121,8 @@ def render_rays(
     else:
         edges = _uniform_edges("num_samples", rays, num_samples, rule, in_disparity)
         samples = sampling.samples_from_edges(key, edges, rule=rule)
-    return render(scene, rays, samples, background=background)
+    extras = {"median_depth": True} if median_depth else {}
+    return render(scene, rays, samples, background=background, **extras)
 
 
 def render_hierarchical(
@@ -121,6 +137,7 @@ def render_hierarchical(
     in_disparity: bool = False,
     importance_padding: float = 0.0,
     background: Background | None = None,
+    median_depth: bool = False,
 ) -> tuple[Rendering, Rendering]:
     """Renders a coarse scene, and a fine scene at samples where the coarse one has weight (Section 5.2).
 
@@ -137,6 +154,7 @@ def render_hierarchical(
         in_disparity: whether the coarse samples are evenly spaced in 1 / t.
         importance_padding: padding of importance_points; the released codes use 1e-5.
         background: see render_samples.
+        median_depth: whether the fine Rendering has a median depth.
 
     Returns:
         (Rendering, Rendering): coarse and fine. No gradient flows from the fine one to the coarse scene.
@@ -163,7 +181,7 @@ def render_hierarchical(
             point_key, edges, weights, num_points=num_points, padding=importance_padding
         )
         samples = sampling.samples_from_edges(fine_key, sampling.merge_edges(edges, points), rule=rule)
-    return first, render_samples(fine, rays, samples, background=background)
+    return first, render_samples(fine, rays, samples, background=background, median_depth=median_depth)
 
 
 def render_image(render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int) -> Rendering:

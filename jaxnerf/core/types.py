@@ -114,6 +114,8 @@ class Rendering:
         weights: [..., S] compositing weight of each sample; None where dropped.
         num_dropped: [...] number of samples that did not fit into the packed buffer; 0 unless packed.
         samples: the evaluated samples, for losses; None where dropped.
+        median_depth: [...] in t, where the transmittance falls to one half, far where it does not; None unless the
+            renderer is called with median_depth=True.
     """
 
     rgb: Float[Array, "*batch 3"]
@@ -123,6 +125,7 @@ class Rendering:
     weights: Float[Array, "*batch samples"] | None
     num_dropped: Int[Array, "*batch"]
     samples: Samples | PackedSamples | None = None
+    median_depth: Float[Array, "*batch"] | None = None
 
 
 def without_samples(rendering: Rendering) -> Rendering:

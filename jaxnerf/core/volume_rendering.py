@@ -40,7 +40,7 @@ def weights_from_density(
     Raises:
         ValueError: if the shapes differ (they are not broadcast), the rule is unknown, or S is odd for "gauss".
     """
-    depth = _optical_depth("weights_from_density", density, length)
+    depth = optical_depth("weights_from_density", density, length)
     weights = _weights(depth)
     if rule in ("segments", "points"):
         return weights
@@ -67,7 +67,7 @@ def transmittance(
     Raises:
         ValueError: if the shapes differ.
     """
-    return jnp.exp(-_optical_depth("transmittance", density, length).sum(axis=-1))
+    return jnp.exp(-optical_depth("transmittance", density, length).sum(axis=-1))
 
 
 def opacity(
@@ -77,7 +77,7 @@ def opacity(
 
     Takes the arguments of `transmittance` and raises its errors.
     """
-    return _absorbed(_optical_depth("opacity", density, length).sum(axis=-1))
+    return _absorbed(optical_depth("opacity", density, length).sum(axis=-1))
 
 
 def exclusive_sum(values: Float[ArrayLike, "*batch samples"]) -> Float[Array, "*batch samples"]:
@@ -159,6 +159,77 @@ def expected_depth(
     return multiply_or_zero(weights, t).sum(axis=-1) + multiply_or_zero(transmittance, far)
 
 
+def median_depth(
+    density: Num[ArrayLike, "*batch samples"],
+    length: Num[ArrayLike, "*batch samples"],
+    t: Num[ArrayLike, "*batch samples"],
+    delta: Num[ArrayLike, "*batch samples"],
+    *,
+    far: Num[ArrayLike, "*batch"],
+    rule: str = "segments",
+) -> Float[Array, "*batch"]:
+    """Computes the depth at which the transmittance of each ray falls to one half.
+
+    Behind an edge or in front of a second surface the expected depth lies between surfaces; the median lies on one.
+    It is exact if the density is constant inside each segment and each t is in the middle of its segment; for
+    "gauss" it is exact within 0.08 delta.
+
+    Args:
+        density, length: [..., S], as in weights_from_density.
+        t, delta: [..., S] in t, the fields of Samples.
+        far: [...] in t.
+        rule: the rule of the samples. With "points", a segment begins at its sample.
+
+    Returns:
+        [...] in t, at most far; far where the transmittance stays above one half. A segment of infinite delta counts
+        as opaque where it begins. The depth jumps where another surface reaches one half, so that its gradient
+        describes only the surface that it lies on.
+
+    Raises:
+        ValueError: on other shapes.
+    """
+    depth = optical_depth("median_depth", density, length)
+    t, delta, far = at_least_float32(t, delta, far)
+    shapes = {"density": (density, "... S"), "t": (t, "... S"), "delta": (delta, "... S"), "far": (far, "...")}
+    check_shapes("median_depth", **shapes)
+    places = half_depths(depth, running_sum(depth), t, delta, rule=rule)
+    return jnp.minimum(first_finite(places), far)
+
+
+def half_depths(
+    depth: Float[Array, "*batch samples"],
+    behind: Float[Array, "*batch samples"],
+    t: Float[ArrayLike, "*batch samples"],
+    delta: Float[ArrayLike, "*batch samples"],
+    *,
+    rule: str,
+    before: Float[ArrayLike, "*#batch #samples"] = 0.0,
+) -> Float[Array, "*batch samples"]:
+    """Computes the t in each segment from which on the transmittance is at most one half; the first is the median.
+
+    Args:
+        depth: [..., S] optical depth of each segment.
+        behind: [..., S] its sum up to and including the segment.
+        t, delta, rule: see median_depth.
+        before: optical depth in front of the first segment.
+
+    Returns:
+        [..., S] in t; inf for segments at whose end the transmittance is above one half and for empty ones, NaN where
+        depth is.
+    """
+    behind = behind + before
+    fraction = jnp.clip(1 - (behind - math.log(2)) / jnp.where(depth > 0, depth, 1), 0, 1)
+    fraction = fraction if rule == "points" else fraction - 0.5
+    place = t + fraction * jnp.where(jnp.isinf(delta), 0, delta)
+    return jnp.where((behind < math.log(2)) | (depth <= 0), jnp.inf, place)
+
+
+def first_finite(places: Float[Array, "*batch samples"]) -> Float[Array, "*batch"]:
+    """Returns the first value [...] that is not inf; NaN counts, and without any the result is inf."""
+    first = (~jnp.isinf(places)).argmax(axis=-1)
+    return jnp.take_along_axis(places, first[..., None], axis=-1)[..., 0]
+
+
 def expected_disparity(
     weights: Num[ArrayLike, "*batch samples"], t: Num[ArrayLike, "*batch samples"]
 ) -> Float[Array, "*batch"]:
@@ -196,7 +267,7 @@ def packed_weights(
     Raises:
         ValueError: if the shapes differ.
     """
-    depth = _optical_depth("packed_weights", density, length)
+    depth = optical_depth("packed_weights", density, length)
     check_shapes("packed_weights", density=(density, "K"), starts=(starts, "K"))
     return _packed_weights(depth, starts, longest), depth
 
@@ -221,10 +292,13 @@ def _sum_over_samples(weights, values):
     return jnp.stack([(weights * values[..., i]).sum(axis=-1) for i in range(values.shape[-1])], axis=-1)
 
 
-def _optical_depth(function, density, length):
+def optical_depth(
+    function: str, density: Num[ArrayLike, "*batch samples"], length: Num[ArrayLike, "*batch samples"]
+) -> Float[Array, "*batch samples"]:
     """Computes sigma l, at most _OPAQUE; 0 for segments of length 0 and for empty segments of infinite length.
 
-    In these cases both factors are replaced, because the derivative of a product multiplies by them.
+    In these cases both factors are replaced, because the derivative of a product multiplies by them. The name of the
+    calling function is for errors.
     """
     density, length = at_least_float32(density, length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))

@@ -33,8 +33,8 @@ class TrainedRun(NamedTuple):
         variables: step -> (params, grid) of that checkpoint; the grid is None where the model has none.
         render: (variables, Rays [...]) -> Rendering [...] without weights, jitted.
         identity: text that is equal for configs that render alike, see `build.identity`.
-        render_image: (variables, Rays [...], chunk=None) -> Rendering [...] as `render`, in chunks that fit
-            into memory.
+        render_image: (variables, Rays [...], chunk=None, median_depth=False) -> Rendering [...] as `render`, in
+            chunks that fit into memory.
     """
 
     experiment: build.Experiment
@@ -93,19 +93,27 @@ def restore_run(
         shapes = jax.eval_shape(lambda: create_state(trained, experiment.optimizer, experiment.seed))
         return jax.tree.map(lambda leaf: jax.device_put(np.zeros(leaf.shape, leaf.dtype)), shapes)
 
-    @jax.jit
-    def render(variables, rays):
-        return model.view(*variables, rays)
+    def render(variables, rays, **options):
+        return model.view(*variables, rays, **options)
 
     def variables(step):
         state = checkpoints.load(step, template())
         params = averaged_params(state)
         return params, bake(params) if bake else state.grid
 
-    cull = model.cull and jax.jit(lambda variables, rays: model.cull(variables[1], rays))
-    render_image = image_renderer(render, experiment.eval.chunk, cull)
+    def cull(variables, rays, **options):
+        return model.cull(variables[1], rays, **options)
+
+    @functools.cache
+    def renderer(**options):
+        part, mask = (jax.jit(functools.partial(each, **options)) for each in (render, cull))
+        return image_renderer(part, experiment.eval.chunk, model.cull and mask)
+
+    def render_image(variables, rays, chunk=None, median_depth=False):
+        return renderer(**{"median_depth": True} if median_depth else {})(variables, rays, chunk)
+
     identity = build.identity(config)
-    return TrainedRun(experiment, checkpoints.steps, variables, render, identity, render_image)
+    return TrainedRun(experiment, checkpoints.steps, variables, jax.jit(render), identity, render_image)
 
 
 def render_settings(run: TrainedRun) -> dict[str, Any]:

@@ -50,6 +50,29 @@ def shiny_still_life(x: Positions, viewdirs: Directions) -> Output:
     return _still_life(x, viewdirs, ball=True, others=True)
 
 
+def opaque_distance(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
+    """Returns the signed distance [...] of x [..., 3] from the nearest opaque body, negative inside one.
+
+    It is exact outside the bodies; their density is half its peak where it is 0.
+    """
+    return _nearest(x, (_plinth, _pillar, _ring, _lamp_core, _ball))
+
+
+def glass_distance(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
+    """Returns the signed distance [...] of x [..., 3] from the nearest transparent body, the brick or the lamp's glass.
+
+    That from the brick is approximate, and 0 where it should be.
+    """
+    return _nearest(x, (_brick, _lamp_glass))
+
+
+def _nearest(x, bodies):
+    x = jnp.asarray(x)
+    place = x[..., 0], x[..., 1], x[..., 2]
+    distances = [body(*place, *(None,) * (body in (_pillar, _ring, _lamp_core, _ball)))[0] for body in bodies]
+    return jnp.min(jnp.stack(distances), axis=0)
+
+
 def _still_life(x, viewdirs, *, ball=False, others=False):
     """Returns the density and the colour; ball, others: whether these bodies have highlights."""
     pattern = "... 1 3" if jnp.shape(viewdirs)[-2:-1] == (1,) else "... S 3"

@@ -18,13 +18,14 @@ class Model(NamedTuple):
         init: key -> params, a dict with an entry for each network. "fine" is the network of the final rendering.
         render: (keys [B], params, grid, Rays [B], step) -> Renderings [B] for training, that of "fine" last.
             They carry weights and samples, for losses.
-        view: (params, grid, Rays [...]) -> Rendering [...] without weights and samples, for images.
+        view: (params, grid, Rays [...]) -> Rendering [...] without weights and samples, for images. With
+            median_depth=True it has a median depth; a sampler whose images need none may lack that argument.
         scene: (params, grid) -> the scene of the final rendering.
         samples_per_ray: approximate number of evaluations of the largest network per ray in training.
         grid_schedule: how the occupancy grid is created and updated; None without one.
         input_layers, color_layers: by network, see `Field`.
-        cull: (grid, Rays [...]) -> bool [...], which rays may hit an occupied cell, and the Rendering [...]
-            of those that cannot; None where all may.
+        cull: (grid, Rays [...], median_depth=False) -> bool [...], which rays may hit an occupied cell, and the
+            Rendering [...] of those that cannot; None where all may.
     """
 
     init: Callable[[jax.Array], Any]

@@ -68,7 +68,7 @@ def hierarchical_model(
         keys = jax.random.split(key, len(fields))
         return {name: field.init(key) for (name, field), key in zip(fields.items(), keys, strict=True)}
 
-    def render(keys, params, grid, rays, step, multiplier=1.0):
+    def render(keys, params, grid, rays, step, multiplier=1.0, median_depth=False):
         del grid, step
         noise = density_noise if keys is not None else 0.0
         keys, *noise_keys = split_key(keys, 1 + len(fields)) if noise else (keys, *[None] * len(fields))
@@ -84,12 +84,12 @@ def hierarchical_model(
             for number in (num_coarse, num_fine)
         )
         if len(scenes) == 1:
-            return (render_rays(keys, *scenes, rays, num_samples=first, **options),)
+            return (render_rays(keys, *scenes, rays, num_samples=first, median_depth=median_depth, **options),)
         counts = {"num_coarse": first, "num_fine": more, "importance_padding": importance_padding}
-        return render_hierarchical(keys, *scenes, rays, **counts, **options)
+        return render_hierarchical(keys, *scenes, rays, median_depth=median_depth, **counts, **options)
 
-    def view(params, grid, rays):
-        return without_samples(render(None, params, grid, rays, None, sample_multiplier)[-1])
+    def view(params, grid, rays, median_depth=False):
+        return without_samples(render(None, params, grid, rays, None, sample_multiplier, median_depth)[-1])
 
     def scene(params, grid):
         del grid

@@ -170,11 +170,12 @@ def render_with_grid(
     early_stop_eps: float,
     max_samples: int,
     background: Background | None = None,
+    median_depth: bool = False,
 ) -> Rendering:
     """Renders rays [...] through the occupied cells of a grid: Rendering [...] without weights.
 
     Args:
-        scene, grid, rays, background: see `render_packed`.
+        scene, grid, rays, background, median_depth: see `render_packed`.
         step_size, cell: see `march_rays`.
         early_stop_eps: transmittance below which a ray ends; 0: it ends when no light is left.
         max_samples: samples evaluated at once; the rest follow in further rounds.
@@ -188,18 +189,20 @@ def render_with_grid(
         max_samples=max_samples,
         early_stop_eps=early_stop_eps or _SMALLEST_EPS,
         background=background,
+        median_depth=median_depth,
     )
 
 
 def _cull(schedule, background):
-    def cull(grid, rays):
-        return rays_may_hit(grid, rays, cell=schedule.cell), render_background(rays, background=background)
+    def cull(grid, rays, median_depth=False):
+        empty = render_background(rays, background=background, median_depth=median_depth)
+        return rays_may_hit(grid, rays, cell=schedule.cell), empty
 
     return cull
 
 
 def _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background):
-    def view(params, grid, rays):
+    def view(params, grid, rays, median_depth=False):
         return render_with_grid(
             scene(params),
             grid,
@@ -209,6 +212,7 @@ def _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, backg
             early_stop_eps=early_stop_eps,
             max_samples=max_samples,
             background=background,
+            median_depth=median_depth,
         )
 
     return view

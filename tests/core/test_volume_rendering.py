@@ -8,6 +8,7 @@ from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 
 composite, transmittance = compiled(jaxnerf.composite), compiled(jaxnerf.transmittance)
 weights_from_density = compiled(jaxnerf.weights_from_density)
+median_depth = compiled(jaxnerf.median_depth, "rule")
 expected_depth, expected_disparity = compiled(jaxnerf.expected_depth), compiled(jaxnerf.expected_disparity)
 slopes_of_weights = compiled(jax.jacrev(jaxnerf.weights_from_density))
 
@@ -120,6 +121,33 @@ def test_the_depth_of_a_wall_does_not_depend_on_far():
     beyond = jnp.array([1.0, 2.0, jnp.inf])  # the last segment of a ray of infinite length
     assert expected_depth(weights, beyond, jnp.float32(0.0), far=jnp.float32(jnp.inf)) == 2
     assert expected_disparity(weights, beyond) == 0.5
+
+
+def test_the_median_depth_halves_the_transmittance():
+    """In segments of constant density it is where the piecewise linear optical depth is log 2."""
+    density, length = random_segments(3)
+    edges = 1 + np.concatenate([np.zeros_like(length[:, :1]), np.cumsum(length, axis=-1)], axis=-1)
+    delta, far = np.diff(edges), np.float32(edges[:, -1])
+    got = median_depth(density, length, edges[:, :-1] + delta / 2, delta, far=far)
+    behind = np.cumsum(density * length, axis=-1)
+    for ray, half in enumerate(got):
+        depth = np.interp(half, edges[ray], np.append(0, behind[ray]))
+        assert half == far[ray] if behind[ray, -1] < np.log(2) else depth == pytest.approx(np.log(2), rel=1e-3)
+    assert (got < far).any()
+
+
+def test_the_median_depth_of_limits():
+    t, ones, far = np.float32([1, 2, 3]), np.ones(3, np.float32), np.float32(3.5)
+    assert median_depth(0 * ones, ones, t, ones, far=far) == far
+    assert median_depth(np.float32([0.1, jnp.inf, 1]), ones, t, ones, far=far) == pytest.approx(1.5, abs=1e-4)
+    assert np.isnan(median_depth(np.float32([0.1, jnp.nan, 1]), ones, t, ones, far=far))
+    last = np.float32([1, 1, jnp.inf])
+    assert median_depth(np.float32([0.1, 0, 2]), last, t, last, far=far, rule="points") == 3
+    assert median_depth(np.float32([0.1, 2, 0]), ones, t, ones, far=far, rule="points") == pytest.approx(
+        2 + (np.log(2) - 0.1) / 2
+    )
+    with pytest.raises(ValueError, match="median_depth: far"):
+        jaxnerf.median_depth(np.ones((2, 3)), np.ones((2, 3)), np.ones((2, 3)), np.ones((2, 3)), far=np.ones(3))
 
 
 def test_batch_is_vmap_is_jit():

@@ -1,5 +1,8 @@
 """The examples of this folder: each adds a part from one file outside the package, and trains with it by name."""
 
+import shutil
+
+import density_exporter
 import gabor_field  # noqa: F401
 import mask_loss  # noqa: F401
 import numpy as np
@@ -10,7 +13,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import captures
+import export_sources
 import jaxnerf
+from jaxnerf.registry import EXPORTERS
 from jaxnerf.training.metric_log import read_rows
 from runs import ROOT, SMOKE_FLAGS, smoke_config, start
 
@@ -101,6 +106,28 @@ def test_a_wrong_line_is_named(tum_folder, tmp_path):
     (tmp_path / "trajectory.txt").write_text("# file x y z qx qy qz qw\n000.png 1 2 3\n")
     with pytest.raises(ValueError, match="trajectory.txt: line 2 has 3 numbers, expected 7"):
         jaxnerf.load_dataset(tmp_path)
+
+
+def test_an_exporter(tmp_path):
+    assert EXPORTERS.get("density") is density_exporter.export_density
+    density_exporter.export_density(export_sources.source_of(resolution=16), tmp_path)
+    content = np.load(tmp_path / "density.npz")
+    center = (content["upper"] + content["lower"]) / 2
+    assert content["density"].shape == (16, 16, 16) and content["density"][8, 8, 8] > 100
+    assert content["density"][0, 0, 0] < 1 and (center == 0).all()
+
+
+@pytest.mark.slow
+def test_the_export_program_restores_a_run_without_a_grid(trained, tmp_path):
+    """Its grid is extracted; the second call finds the folder."""
+    folder = shutil.copytree(trained, tmp_path / "run")
+    flags = ["--plugins=density_exporter", "--kind=density", "--resolution=16", f"--workdir={folder}"]
+    path = f"{ROOT / 'tests' / 'extending'}:{ROOT}"
+    for code, want in ((0, "exports/density-20/density.npz"), (1, "exists already; give --overwrite")):
+        process = start("export", *flags, PYTHONPATH=path)
+        out, err = process.communicate(timeout=240)
+        assert process.returncode == code and want in out + err
+        assert "Traceback" not in err
 
 
 @pytest.mark.slow

@@ -48,6 +48,7 @@ def render_packed(
     early_stop_eps: float = 0.0,
     near_gradient_distance: float = 0.0,
     background: Background | None = None,
+    median_depth: bool = False,
 ) -> Rendering:
     """Renders samples as render_samples does, but evaluates the scene only in the grid's occupied cells.
 
@@ -71,19 +72,25 @@ def render_packed(
             near it grows with 1 / d^2 (arXiv:2305.02756). Otherwise fog forms in front of the cameras. Only without
             early termination.
         background: see render_samples.
+        median_depth: see render_samples; an early_stop_eps must then be at most 0.5.
 
     Returns:
         Rendering [...] without weights; num_dropped [...] is the number of a ray's samples that did not fit.
         Without early termination `samples` is PackedSamples [K].
 
     Raises:
-        ValueError: as render_samples; on rule "gauss"; if max_samples < 1.
+        ValueError: as render_samples; on rule "gauss"; if max_samples < 1; if rays end before their median depth.
     """
+    if median_depth and early_stop_eps > 0.5:
+        raise ValueError(
+            f"render_packed: early_stop_eps is {early_stop_eps} and median_depth is True, expected at most 0.5: rays "
+            "would end before their median depth"
+        )
     shape = rays.near.shape
     rays, samples = _flattened("render_packed", rays, samples, max_samples)
     words = _occupied_words(grid, rays, samples)
     if early_stop_eps > 0:
-        options = {"max_samples": max_samples, "early_stop_eps": early_stop_eps}
+        options = {"max_samples": max_samples, "early_stop_eps": early_stop_eps, "median_depth": median_depth}
         sums = _march_until_terminated("render_packed", scene, rays, samples, words, **options)
         num_dropped, packed = jnp.zeros_like(rays.near, jnp.int32), None
     else:
@@ -92,7 +99,7 @@ def render_packed(
         t, delta = (jnp.where(buffer.used, leaf[buffer.ray, buffer.source], 0) for leaf in (samples.t, samples.delta))
         num_dropped = occupied.count - jnp.clip(max_samples - _first(occupied), 0, occupied.count)
         placed = PlacedSamples(t, delta, buffer.ray, buffer.used, num_dropped)
-        options = {"rule": samples.rule, "longest": samples.t.shape[-1]}
+        options = {"rule": samples.rule, "longest": samples.t.shape[-1], "median_depth": median_depth}
         sums, packed = _composite("render_packed", scene, rays, placed, near_gradient_distance, **options)
     flat = _rendering(sums, num_dropped, rays.far, shape, background)
     return dataclasses.replace(flat, samples=packed)
@@ -207,6 +214,7 @@ class _Sums(NamedTuple):
         rgb: [B, 3] on black.
         depth: [B] sum of w t.
         disparity: [B] sum of w / t.
+        median_depth: [B] in t, inf where the transmittance stays above one half; None unless it is wanted.
     """
 
     transmittance: Array
@@ -214,6 +222,7 @@ class _Sums(NamedTuple):
     rgb: Array
     depth: Array
     disparity: Array
+    median_depth: Array | None = None
 
 
 def _flattened(function, rays, samples, max_samples):
@@ -242,6 +251,7 @@ def _rendering(sums, num_dropped, far, shape, background):
         disparity=sums.disparity,
         weights=None,
         num_dropped=num_dropped,
+        median_depth=None if sums.median_depth is None else jnp.minimum(sums.median_depth, far),
     )
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)
 
@@ -339,7 +349,7 @@ def _evaluate(function, scene, rays, t, ray_index, used):
     return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
 
 
-def _composite(function, scene, rays, placed, near_gradient_distance, *, rule, longest):
+def _composite(function, scene, rays, placed, near_gradient_distance, *, rule, longest, median_depth=False):
     """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
     t, ray = placed.t, placed.ray_index
     density, rgb = _evaluate(function, scene, rays, t, ray, placed.used)
@@ -354,12 +364,20 @@ def _composite(function, scene, rays, placed, near_gradient_distance, *, rule, l
     parts = [optical_depth, *colours, weights * t, volume_rendering.divide_or_zero(weights, t)]
     sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
     packed = PackedSamples(weights=weights, t=t, delta=placed.delta, ray_index=ray, used=placed.used, rule=rule)
+    median = None
+    if median_depth:
+        behind = volume_rendering.running_sum_since(starts, optical_depth, longest)
+        places = volume_rendering.half_depths(optical_depth, behind, t, placed.delta, rule=rule)
+        slot = jnp.where(jnp.isinf(places), places.size, jnp.arange(places.size))
+        first = jax.ops.segment_min(slot, ray, rays.near.size, indices_are_sorted=True)
+        median = places.at[first].get(mode="fill", fill_value=jnp.inf)
     return _Sums(
         transmittance=jnp.exp(-sums[:, 0]),
         opacity=-jnp.expm1(-sums[:, 0]),
         rgb=sums[:, 1:4],
         depth=sums[:, 4],
         disparity=sums[:, 5],
+        median_depth=median,
     ), packed
 
 
@@ -372,7 +390,7 @@ class _Slots(NamedTuple):
     Attributes:
         ray: [L] int32; B: none.
         num_done: [L] int32, the number of the ray's samples that were evaluated.
-        sums: [7, L], the columns of _Sums.
+        sums: [7, L], the columns of _Sums; [8, L] with the median depth, which is not a sum.
     """
 
     ray: Array
@@ -380,7 +398,7 @@ class _Slots(NamedTuple):
     sums: Array
 
 
-def _march_until_terminated(function, scene, rays, samples, words, *, max_samples, early_stop_eps):
+def _march_until_terminated(function, scene, rays, samples, words, *, max_samples, early_stop_eps, median_depth=False):
     """Marches each ray until its transmittance is at most early_stop_eps, or to its end.
 
     The remaining light of a terminated ray is assumed to look like the rest of the ray, so such a ray is opaque.
@@ -393,6 +411,7 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
         words: [B, W] uint32, see _occupied_words.
         max_samples: samples evaluated at once, L N at most.
         early_stop_eps: > 0.
+        median_depth: whether it is computed.
 
     Returns:
         _Sums [B].
@@ -408,16 +427,17 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
     order = _longest_first(count, samples.t.shape[-1])
     waiting = (count > 0).sum()
 
-    def evaluate(ray, num_done):
+    def evaluate(ray, num_done, transmittance):
         n = num_done[:, None] + row
         used = n < count.at[ray, None].get(mode="fill", fill_value=0)
         ray = jnp.minimum(ray, ray_count - 1)
         own, some = _nth_samples(rays, samples, words, up_to, ray, n, used)
-        return _sum_run(function, scene, own, some, used)
+        return _sum_run(function, scene, own, some, used, samples.rule, transmittance if median_depth else None)
 
     no_ray = jnp.full(slot_count, ray_count)
     none_done = jnp.zeros_like(no_ray)
-    start = jnp.zeros((7, 1), jax.eval_shape(evaluate, no_ray, none_done).dtype).at[0].set(1)
+    run = jax.eval_shape(evaluate, no_ray, none_done, jnp.ones(slot_count))
+    start = jnp.zeros((run.shape[0], 1), run.dtype).at[0].set(1).at[7:].set(jnp.inf)
 
     def refill(slots, num_taken):
         """Gives the next rays to the slots without one; returns the _Slots and how many rays were taken."""
@@ -430,8 +450,12 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
     def step(state):
         slots, num_taken, finished = state
         slots, num_taken = refill(slots, num_taken)
-        run, transmittance = evaluate(slots.ray, slots.num_done), slots.sums[:1]
-        sums = jnp.concatenate([transmittance * run[:1], slots.sums[1:] + transmittance * run[1:]])
+        transmittance = slots.sums[:1]
+        run = evaluate(slots.ray, slots.num_done, transmittance[0])
+        sums = [transmittance * run[:1], slots.sums[1:7] + transmittance * run[1:7]]
+        if median_depth:
+            sums.append(jnp.where(jnp.isinf(slots.sums[7:]), run[7:], slots.sums[7:]))
+        sums = jnp.concatenate(sums)
         num_done = slots.num_done + row.size
         terminates = ~(sums[0] > early_stop_eps)  # NaN terminates, so that it is visible
         ends = terminates | (num_done >= count.at[slots.ray].get(mode="clip"))
@@ -443,11 +467,12 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
         slots, num_taken, _ = state
         return (num_taken < waiting) | (slots.ray < ray_count).any()
 
-    slots = _Slots(no_ray, none_done, jnp.broadcast_to(start, (7, slot_count)))
-    finished = jnp.broadcast_to(start, (7, ray_count))
+    slots = _Slots(no_ray, none_done, jnp.broadcast_to(start, (start.shape[0], slot_count)))
+    finished = jnp.broadcast_to(start, (start.shape[0], ray_count))
     finished = jax.lax.while_loop(continues, step, (slots, jnp.zeros_like(waiting), finished))[2]
-    transmittance, opacity, *rgb, depth, disparity = finished
-    return _Sums(transmittance, opacity, jnp.stack(rgb, axis=-1), depth, disparity)
+    transmittance, opacity, *rgb, depth, disparity = finished[:7]
+    median = finished[7] if median_depth else None
+    return _Sums(transmittance, opacity, jnp.stack(rgb, axis=-1), depth, disparity, median)
 
 
 def _longest_first(count, most):
@@ -463,8 +488,8 @@ def _longest_first(count, most):
 
 
 def _made_opaque(sums):
-    """Returns sums [7, L] of terminated rays, whose remaining light is assumed to look like the rest of the ray."""
-    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:] / sums[1:2]])
+    """Returns the sums [7, L] or [8, L] of terminated rays, whose remaining light looks like the rest of the ray."""
+    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:7] / sums[1:2], sums[7:]])
 
 
 def _nth_samples(rays, samples, words, up_to, ray, n, used):
@@ -477,8 +502,11 @@ def _nth_samples(rays, samples, words, up_to, ray, n, used):
     return jax.tree.map(lambda leaf: leaf[ray[:, 0]], rays), (t, delta)
 
 
-def _sum_run(function, scene, rays, samples, used):
-    """Returns [7, L], the columns of _Sums of consecutive samples, as if nothing lay in front of them."""
+def _sum_run(function, scene, rays, samples, used, rule, transmittance):
+    """Returns [7, L], the columns of _Sums of consecutive samples, as if nothing lay in front of them.
+
+    If the transmittance [L] in front of them is given, the result is [8, L], with the median depth.
+    """
     t, delta = samples
     x = rendering.points_on_rays(rays, t)
     density, rgb = scene(x, rays.viewdirs[:, None])
@@ -486,12 +514,17 @@ def _sum_run(function, scene, rays, samples, used):
     density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
     length = rendering.segment_lengths(delta, rays.directions)
     weights = volume_rendering.weights_from_density(density, length)
-    return jnp.stack(
-        [
-            volume_rendering.transmittance(density, length),
-            volume_rendering.opacity(density, length),
-            *volume_rendering.composite(weights, rgb).T,
-            volume_rendering.multiply_or_zero(weights, t).sum(axis=-1),
-            volume_rendering.expected_disparity(weights, t),
-        ]
-    )
+    sums = [
+        volume_rendering.transmittance(density, length),
+        volume_rendering.opacity(density, length),
+        *volume_rendering.composite(weights, rgb).T,
+        volume_rendering.multiply_or_zero(weights, t).sum(axis=-1),
+        volume_rendering.expected_disparity(weights, t),
+    ]
+    if transmittance is not None:
+        depth = volume_rendering.optical_depth(function, density, length)
+        before = -jnp.log(transmittance)[:, None]
+        behind = volume_rendering.running_sum(depth)
+        places = volume_rendering.half_depths(depth, behind, t, delta, rule=rule, before=before)
+        sums.append(volume_rendering.first_finite(places))
+    return jnp.stack(sums)

@@ -46,15 +46,15 @@ def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> B
     return (hit & (length > 0)) | jnp.isnan(sum(numbers))
 
 
-def render_background(rays: Rays, *, background: Background | None = None) -> Rendering:
+def render_background(rays: Rays, *, background: Background | None = None, median_depth: bool = False) -> Rendering:
     """Renders rays through empty space.
 
     Args:
         rays: Rays [...].
-        background: see render_samples.
+        background, median_depth: see render_samples.
 
     Returns:
-        Rendering [...] without weights: the background's colour, depth far, opacity and disparity 0.
+        Rendering [...] without weights: the background's colour, depths far, opacity and disparity 0.
     """
     shape = rays.near.shape
     behind = jnp.zeros(3) if background is None else jnp.asarray(background)
@@ -65,6 +65,7 @@ def render_background(rays: Rays, *, background: Background | None = None) -> Re
         disparity=jnp.zeros(shape),
         weights=None,
         num_dropped=jnp.zeros(shape, jnp.int32),
+        median_depth=rays.far if median_depth else None,
     )
 
 

@@ -74,6 +74,21 @@ def test_a_full_grid_changes_nothing(rays, samples):
     assert got.weights is None and got.num_dropped.shape == (RAYS,) and not got.num_dropped.any()
 
 
+@pytest.mark.parametrize("early_stop_eps", [0.0, 1e-6, 0.5])
+def test_the_median_depth_is_that_of_all_samples(rays, samples, early_stop_eps):
+    options = {"max_samples": 64 if early_stop_eps else RAYS * SEGMENTS, "early_stop_eps": early_stop_eps}
+    dense = jax.jit(lambda: jaxnerf.render_samples(scene, rays, samples, median_depth=True))()
+    got = jax.jit(lambda: jaxnerf.render_packed(scene, full_grid(), rays, samples, median_depth=True, **options))()
+    np.testing.assert_allclose(got.median_depth, dense.median_depth, rtol=1e-5)
+    opaque = np.asarray(dense.opacity) > 0.5
+    assert 0.2 < opaque.mean() < 1 and (np.asarray(dense.median_depth == rays.far) == ~opaque).all()
+
+
+def test_rays_do_not_end_before_their_median_depth(rays, samples):
+    with pytest.raises(ValueError, match="early_stop_eps is 0.6"):
+        jaxnerf.render_packed(scene, None, rays, samples, max_samples=8, early_stop_eps=0.6, median_depth=True)
+
+
 def test_a_full_grid_changes_no_gradient(rays, samples):
     slopes = np.float32(np.random.default_rng(2).normal(size=(RAYS, 6)))
 

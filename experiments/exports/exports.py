@@ -1,0 +1,124 @@
+"""Measures the exports of a run on the embedded scene against its closed form.
+
+    python experiments/exports/exports.py --workdir=W [--resolution=256] [--out=docs/results/exports.md]
+
+The mesh: the chamfer distance to the surfaces of the opaque bodies is the sum of two means, from points of the mesh to
+the bodies, in closed form, and from points of the bodies to the mesh. Points of the mesh that are nearer to the glass
+(the brick, and that of the lamp) than to an opaque body have no counterpart among these and are excluded; "with glass"
+includes them. The underside of the plinth counts, although few training views see it. The splats: the PSNR that the
+export states. Of all exports: seconds, which include compilation, and the size of the files.
+"""
+
+import pathlib
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import trimesh
+from absl import flags
+from scipy.spatial import cKDTree
+
+sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
+import common
+
+from jaxnerf.exporters.base import ExportSettings, export_run
+from jaxnerf.fields.still_life import glass_distance, opaque_distance
+from jaxnerf.runtime import cli
+from jaxnerf.runtime.atomic_files import write_text
+
+_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run on the embedded scene.", required=True)
+_RESOLUTION = flags.DEFINE_integer("resolution", 256, "Voxels along the longest side.")
+_NUM_POINTS = flags.DEFINE_integer("num_points", 200_000, "Points or Gaussians.")
+_OUT = flags.DEFINE_string("out", None, "Markdown page; replaces it.")
+_SAMPLES = 400_000  # points on each surface
+_EXTENT = 1.2  # half the side of the box that holds the scene
+
+_opaque, _glass = jax.jit(opaque_distance), jax.jit(glass_distance)
+
+
+def main(argv: list[str]) -> None:
+    """Exports and measures."""
+    del argv
+    workdir, lines = _WORKDIR.value, []
+    settings = ExportSettings(resolution=_RESOLUTION.value, num_points=_NUM_POINTS.value)
+    rows = []
+    for kind in ("mesh", "points", "splats", "depth"):
+        said, started = [], time.perf_counter()
+        folder = export_run(workdir, kind, settings=settings, name=f"study-{kind}", overwrite=True, say=said.append)
+        seconds = time.perf_counter() - started
+        size = sum(path.stat().st_size for path in folder.rglob("*.*")) / 1e6
+        rows.append([kind, f"{seconds:.0f}", f"{size:.1f}", said[-1]])
+        if kind == "mesh":
+            lines += [*table(chamfer(trimesh.load(folder / "mesh.ply"))), ""]
+    lines += common.markdown(("export", "seconds", "MB", "what the program says"), rows)
+    page = [
+        "# Exports of the embedded scene",
+        "",
+        f"Written by `{' '.join(['python', 'experiments/exports/exports.py', *sys.argv[1:]])}` at commit {commit()} on "
+        f"{common.describe_machine()}.",
+        "",
+        *lines,
+        "",
+    ]
+    print("\n".join(lines))
+    if _OUT.value:
+        write_text(_OUT.value, "\n".join(page))
+
+
+def table(found: dict[str, float]) -> list[str]:
+    """Returns the table of what `chamfer` measures."""
+    heads = ("mesh to bodies", "bodies to mesh", "chamfer, opaque bodies", "with glass", "within 0.02 of the mesh")
+    together = found["accuracy"] + found["completeness"]
+    whole = found["accuracy_with_glass"] + found["completeness"]
+    return common.markdown(
+        heads,
+        [
+            [f"{found['accuracy']:.4f}", f"{found['completeness']:.4f}", f"{together:.4f}", f"{whole:.4f}"]
+            + [f"{found['within']:.1%}"]
+        ],
+    )
+
+
+def chamfer(mesh: trimesh.Trimesh) -> dict[str, float]:
+    """Returns mean distances between a mesh and the opaque bodies, in world units; see the module's docstring."""
+    points = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)[0].astype(np.float32)
+    distance = np.abs(np.asarray(_opaque(points)))
+    on_glass = np.abs(np.asarray(_glass(points))) < distance
+    bodies = body_points(np.random.default_rng(0))
+    missed = cKDTree(points).query(bodies)[0]
+    return {
+        "accuracy": float(distance[~on_glass].mean()),
+        "accuracy_with_glass": float(distance.mean()),
+        "completeness": float(missed.mean()),
+        "within": float((missed < 0.02).mean()),
+    }
+
+
+def body_points(rng: np.random.Generator) -> np.ndarray:
+    """Returns points [N, 3] on the surfaces of the opaque bodies, evenly by area."""
+    found, width = [], 0.01  # a shell around the surfaces, of even thickness
+    while sum(map(len, found)) < _SAMPLES:
+        x = rng.uniform(-_EXTENT, _EXTENT, (1_000_000, 3)).astype(np.float32)
+        near = np.abs(np.asarray(_opaque(x))) < width
+        x = np.asarray(_on_surface(x))
+        found.append(x[near & (np.abs(np.asarray(_opaque(x))) < 1e-4)])
+    return np.concatenate(found)[:_SAMPLES]
+
+
+@jax.jit
+def _on_surface(x):
+    for _ in range(3):
+        x = x - opaque_distance(x)[:, None] * jax.vmap(jax.grad(opaque_distance))(x)
+    return x
+
+
+def commit() -> str:
+    """Returns the commit of the working tree, with a plus sign if files differ from it."""
+    call = ["git", "-C", str(common.ROOT), "describe", "--always", "--dirty=+", "--exclude=*"]
+    return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,83 @@
+"""Exports a trained run for other programs: jaxnerf-export --workdir=DIR --kind=mesh.
+
+`python -m jaxnerf.export` is the same program. It writes DIR/exports/KIND-STEP/, in the units and axes of the dataset's
+files: a mesh with vertex colours, points with normals, depth images with cameras, or Gaussian splats. It needs
+scikit-image, scipy and trimesh: pip install 'jaxnerf[export]'.
+"""
+
+import sys
+
+from absl import flags
+
+from jaxnerf.registry import EXPORTERS
+from jaxnerf.runtime import cli
+
+_WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
+_KIND = flags.DEFINE_string(
+    "kind", None, f"What to export: {', '.join(EXPORTERS.names())}, or a registered exporter.", required=True
+)
+_DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
+_STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is exported.")
+_RESOLUTION = flags.DEFINE_integer("resolution", 256, "mesh: the voxels along the longest side of the box.")
+_BOX = flags.DEFINE_list(
+    "box",
+    None,
+    "The box to export as X0,Y0,Z0,X1,Y1,Z1 in units of the dataset's files. When it is not given, it holds all "
+    "surfaces, or in an unbounded scene those between the cameras.",
+)
+_SIZE = flags.DEFINE_integer(
+    "size",
+    None,
+    "The longer side in px of the depth images from which everything is made. When it is not given, it is 1.25 times "
+    "the resolution, and for depth that of the dataset's images.",
+)
+_NUM_VIEWS = flags.DEFINE_integer("num_views", 100, "The largest number of training views to render.")
+_NUM_POINTS = flags.DEFINE_integer("num_points", 200_000, "points, splats: the largest number of points or Gaussians.")
+_FORMAT = flags.DEFINE_string("format", "ply", "mesh: ply, glb or obj.")
+_MAX_FACES = flags.DEFINE_integer(
+    "max_faces", 0, "mesh: the number of triangles to which it is decimated; 0: it is not."
+)
+_MIN_PIECE = flags.DEFINE_float(
+    "min_piece", 0.005, "mesh: connected pieces with fewer triangles than this fraction of all are dropped."
+)
+_NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP.")
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an existing folder of that name.")
+
+
+def main(argv):
+    del argv
+    # Imported after the flags are parsed, so that a wrong flag is reported at once.
+    from jaxnerf.exporters.base import ExportSettings, export_run
+
+    names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
+    names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE}
+    try:
+        box = None if _BOX.value is None else tuple(map(float, _BOX.value))
+    except ValueError:
+        raise ValueError(f"box is {','.join(_BOX.value)}, expected six numbers; correct --box") from None
+    settings = ExportSettings(box=box, **{name: flag.value for name, flag in names.items()})
+    try:
+        folder = export_run(
+            _WORKDIR.value,
+            _KIND.value,
+            step=_STEP.value,
+            data_dir=_DATA_DIR.value,
+            settings=settings,
+            name=_NAME.value,
+            overwrite=_OVERWRITE.value,
+            say=lambda line: print(line, file=sys.stderr),
+        )
+    except ImportError as error:
+        if error.name is None or error.name.partition(".")[0] == "jaxnerf":
+            raise
+        raise ValueError(f"the export needs {error.name}; run pip install 'jaxnerf[export]'") from error
+    print(*sorted(path for path in folder.iterdir()), sep="\n")
+
+
+def run():
+    """Runs the program."""
+    cli.run(main, stopped="before anything was written; the same command starts again")
+
+
+if __name__ == "__main__":
+    run()

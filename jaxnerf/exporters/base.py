@@ -1,0 +1,154 @@
+"""What an exporter is, and the call that runs one: restore a run, export it, move the finished folder into place."""
+
+import os
+import pathlib
+import secrets
+import shutil
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxnerf.core.types import Views
+from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
+from jaxnerf.registry import EXPORTERS
+from jaxnerf.runtime import atomic_files
+
+MAX_RESOLUTION, MAX_SIZE, MAX_POINTS = 1024, 4096, 10_000_000
+FORMATS = ("ply", "glb", "obj")
+
+
+class ExportSettings(NamedTuple):
+    """What the flags of the program set. An exporter reads those that concern it.
+
+    Attributes:
+        resolution: voxels along the longest side of the box.
+        box: [6] the lower and the upper corner of what is exported, in units of the dataset's files; None: all of a
+            bounded scene, and of an unbounded one what is between the cameras.
+        size: px, the longer side of the depth images that are rendered; None: it follows the resolution.
+        num_views: the largest number of training views whose poses are rendered, spread evenly over all.
+        num_points: the largest number of points or Gaussians.
+        format: of a mesh, "ply", "glb" or "obj".
+        max_faces: the number of triangles to which a mesh is decimated; 0: it is not.
+        min_piece: connected pieces of a mesh with fewer triangles than this fraction of all are dropped.
+    """
+
+    resolution: int = 256
+    box: tuple[float, ...] | None = None
+    size: int | None = None
+    num_views: int = 100
+    num_points: int = 200_000
+    format: str = "ply"
+    max_faces: int = 0
+    min_piece: float = 0.005
+
+
+class ExportSource(NamedTuple):
+    """A restored run, as an exporter receives it.
+
+    Attributes:
+        run: with an occupancy grid: that of training, or else one that is extracted from its visible density.
+        step: of the checkpoint.
+        variables: its parameters and grid, for `run.render_image`.
+        views: of the split "train", with the cameras that the run has refined.
+        settings: of the export.
+        say: called with a line of text for the user.
+    """
+
+    run: TrainedRun
+    step: int
+    variables: Any
+    views: Views
+    settings: ExportSettings
+    say: Callable[[str], None]
+
+
+def export_run(
+    workdir: str | os.PathLike,
+    kind: str,
+    *,
+    step: int | None = None,
+    data_dir: str | None = None,
+    settings: ExportSettings | None = None,
+    name: str | None = None,
+    overwrite: bool = False,
+    say: Callable[[str], None] = print,
+) -> pathlib.Path:
+    """Exports a trained run to the folder <workdir>/exports/<name>, which appears complete or not at all.
+
+    Args:
+        workdir: the folder that training wrote.
+        kind: the name of an exporter.
+        step: of the checkpoint; the newest when None.
+        data_dir: see `restore_run`.
+        settings: its defaults when None.
+        name: of the folder; KIND-STEP when None.
+        overwrite: whether an existing folder of that name is replaced.
+        say: called with each line for the user.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: if there is no such run, checkpoint or exporter, a setting is out of range, or the folder exists.
+    """
+    export = EXPORTERS.get(kind)
+    settings = settings or ExportSettings()
+    _check_settings(settings)
+    if name and (pathlib.Path(name).name != name or name.startswith(".")):
+        raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
+    run = restore_run(workdir, data_dir=data_dir)
+    step = newest_step(run, workdir, step)
+    target = pathlib.Path(workdir) / "exports" / (name or f"{kind}-{step}")
+    atomic_files.check_tree(target.parent)
+    if target.exists() and not overwrite:
+        raise ValueError(f"{target}: exists already; give --overwrite to replace it, or another --name")
+    if run.experiment.model.grid_schedule is None:  # whole rays through a dense network would take hours
+        run = restore_run(workdir, data_dir=data_dir, settings={"bake_occupancy": True})
+    variables = run.variables(step)
+    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    target.parent.mkdir(exist_ok=True)
+    partial = target.with_name(f"{target.name}.{secrets.token_hex(8)}.tmp")
+    partial.mkdir()
+    try:
+        with atomic_files.naming(partial):
+            export(ExportSource(run, step, variables, views, settings, say), partial)
+        _move(partial, target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return target
+
+
+def check_memory(needed: float, available: float | None, remedy: str) -> None:
+    """Raises a ValueError if bytes that are needed at once are not free; available: None where that is unknown."""
+    if available is not None and needed > available:
+        raise ValueError(
+            f"the export needs about {needed / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are free; {remedy}"
+        )
+
+
+def _check_settings(settings):
+    limits = {"resolution": (16, MAX_RESOLUTION), "size": (16, MAX_SIZE), "num_points": (1, MAX_POINTS)}
+    limits |= {"num_views": (1, 100_000), "max_faces": (0, 10**9), "min_piece": (0.0, 1.0)}
+    for field, (least, most) in limits.items():
+        value = getattr(settings, field)
+        if value is not None and not least <= value <= most:
+            raise ValueError(f"{field} is {value}, expected {least} to {most:,}; correct --{field}")
+    if settings.format not in FORMATS:
+        raise ValueError(f"format is {settings.format!r}, expected one of {', '.join(FORMATS)}; correct --format")
+    box = settings.box
+    if box is not None and not (len(box) == 6 and np.isfinite(box).all() and (np.subtract(box[3:], box[:3]) > 0).all()):
+        found = ", ".join(map(str, box))
+        raise ValueError(
+            f"box is {found}, expected six numbers X0,Y0,Z0,X1,Y1,Z1 in units of the dataset's files, each lower one "
+            "below its upper one; correct --box"
+        )
+
+
+def _move(partial, target):
+    """Moves a finished folder into place; one that it replaces is removed afterwards."""
+    replaced = partial.with_name(f"{partial.name}.old")
+    if target.exists():
+        target.rename(replaced)
+    partial.rename(target)
+    shutil.rmtree(replaced, ignore_errors=True)

@@ -1,0 +1,154 @@
+"""Fuses depth images into a truncated signed distance field and extracts its zero level set (Curless and Levoy 1996).
+
+Only voxels near a surface of some depth image are stored and updated, a few per cent of the box.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import ndimage
+from skimage import measure
+
+from jaxnerf.core.cameras import project
+from jaxnerf.exporters.surfaces import DepthImage, inside
+
+_TRUNCATION = 2.5  # voxels
+_FREE = 3.0  # truncations in front of a surface, from which on space counts as free whatever the surface's normal
+_MIN_WEIGHT = 0.05  # of all views of a vertex; one that sees an opaque surface at 45 degrees has 0.7
+_CHUNK = 2**18  # vertices updated at once
+_EMPTY_WEIGHT = 0.3  # of a pixel that shows empty space
+
+
+class Fused(NamedTuple):
+    """A truncated signed distance field on the vertices of a grid of voxels, stored where it is known.
+
+    Attributes:
+        lower: [3] the grid's lower corner, in units of the dataset's files.
+        voxel: the spacing of the vertices.
+        shape: vertices along x, y and z.
+        index: [M] flat index of each stored vertex, ascending.
+        distance: [M] in truncations, in [-1, 1], positive outside; NaN where no view sees the vertex.
+        rgb: [M, 3] in [0, 255].
+    """
+
+    lower: Float[np.ndarray, "3"]
+    voxel: float
+    shape: tuple[int, int, int]
+    index: Int[np.ndarray, " M"]
+    distance: Float[np.ndarray, " M"]
+    rgb: Float[np.ndarray, "M 3"]
+
+
+def grid_shape(box: Float[np.ndarray, "2 3"], resolution: int) -> tuple[float, tuple[int, int, int]]:
+    """Returns the side of a voxel and the number of vertices along x, y and z."""
+    sides = box[1] - box[0]
+    voxel = float(sides.max() / resolution)
+    return voxel, tuple(int(count) for count in np.ceil(sides / voxel - 1e-9).astype(int) + 1)
+
+
+def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution: int) -> Fused:
+    """Fuses depth images.
+
+    The distance of a vertex from a surface is measured along the normal at the pixel that sees the vertex, not along
+    the ray: that is exact for a plane, however obliquely it is seen. A view counts by the cosine between its ray and
+    the normal and by the light that the surface absorbs within the truncation: views along a surface and those
+    into glass or fog are least accurate. Vertices well in front of a surface, and those before empty space, count as
+    outside; those behind a surface are not seen. Pixels at the edges of surfaces are not used.
+
+    Args:
+        images: all of one size.
+        box: what is fused.
+        resolution: voxels along its longest side.
+
+    Returns:
+        Fused, without a vertex if no surface is in the box.
+    """
+    voxel, shape = grid_shape(box, resolution)
+    truncation = _TRUNCATION * voxel
+    surfaces = [(image.points(), *image.normals()) for image in images]
+    index = _vertices_near([points[cosine > 0] for points, _, cosine in surfaces], box[0], voxel, shape)
+    x = np.float32(box[0] + voxel * np.stack(np.unravel_index(index, shape), axis=-1))
+    x = jnp.asarray(np.resize(x, (-(-max(len(x), 1) // _CHUNK), _CHUNK, 3)))  # padded with copies of the first
+    total = jnp.zeros((*x.shape[:2], 6), jnp.float32)
+    for image, (points, normal, cosine) in zip(images, surfaces, strict=True):
+        absorbed = -np.expm1(-np.maximum(image.extinction, 0) * truncation)
+        weight = np.where(np.isinf(image.depth), _EMPTY_WEIGHT, cosine * absorbed)
+        planes = [np.stack([image.depth, weight], axis=-1), points, normal, image.rgb]
+        planes = np.concatenate(planes, axis=-1).astype(np.float32)
+        total = _integrate(total, image.camera, planes, x, np.float32(truncation))
+    total = np.asarray(total).reshape(-1, 6)[: len(index)]
+    weight, distance, rgb_weight = total[:, 0], total[:, 1], total[:, 2:3]
+    seen = weight > _MIN_WEIGHT
+    distance = np.where(seen, distance / np.where(seen, weight, 1), np.nan)
+    return Fused(box[0], voxel, shape, index, distance, total[:, 3:] / np.maximum(rgb_weight, 1e-6))
+
+
+def level_set(fused: Fused) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Extracts the surface at distance 0 by marching cubes (Lorensen and Cline 1987, in scikit-image).
+
+    Returns:
+        vertices [V, 3] in units of the dataset's files; faces [F, 3], counterclockwise seen from outside; and rgb
+        [V, 3] uint8. No face is in a voxel with a corner that no view sees. All are empty where there is no surface.
+    """
+    known = ~np.isnan(fused.distance)
+    field, row = np.ones(fused.shape, np.float32), np.full(fused.shape, -1, np.int32)
+    field.reshape(-1)[fused.index] = np.where(known, fused.distance, 1)
+    row.reshape(-1)[fused.index[known]] = np.flatnonzero(known)
+    cubes = row >= 0
+    for axis in range(3):  # scikit-image marches the cube below each vertex that is in the mask
+        lower = np.roll(cubes, 1, axis=axis)
+        lower[tuple(0 if i == axis else slice(None) for i in range(3))] = False
+        cubes &= lower
+    try:
+        vertices, faces, _, _ = measure.marching_cubes(field, 0.0, mask=cubes, allow_degenerate=False)
+    except (ValueError, RuntimeError):  # the level is outside the field's range, or no cube has a surface
+        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
+    low, high = np.floor(vertices).astype(int), np.ceil(vertices).astype(int)
+    fraction = (vertices - low).max(axis=1, keepdims=True)  # a vertex is on an edge, between two voxels' corners
+    first, second = (fused.rgb[row[tuple(ends.T)]] for ends in (low, high))
+    rgb = np.rint(np.clip((1 - fraction) * first + fraction * second, 0, 255)).astype(np.uint8)
+    return fused.lower + fused.voxel * vertices, faces, rgb
+
+
+def _vertices_near(parts, lower, voxel, shape):
+    """Returns the flat indices of the vertices within the truncation of points, given as arrays [N, 3]."""
+    near = np.zeros(shape, bool)
+    for points in parts:
+        place = np.rint((points - lower) / voxel).astype(int)
+        place = place[inside(place, np.array([[0, 0, 0], np.subtract(shape, 1)]))]
+        near[tuple(place.T)] = True
+    reach = int(np.ceil(_TRUNCATION)) + 1  # a point is up to half a voxel from its vertex, and pixels leave gaps
+    for axis in range(3):
+        near = ndimage.maximum_filter1d(near, 2 * reach + 1, axis=axis, mode="constant")
+    return np.flatnonzero(near)
+
+
+@jax.jit
+def _integrate(total, camera, planes, x, truncation):
+    """Returns total [C, N, 6] with what one view sees of vertices x [C, N, 3].
+
+    The sums are those of weights, of weights times distances, of the weights of colours, and of those times colours.
+    """
+    height, width = planes.shape[:2]
+    rows = planes.reshape(height * width, -1)
+
+    def add(part):
+        total, x = part
+        pixels, depth = project(camera, x)
+        column, line = (jnp.floor(jnp.clip(pixels[:, axis], -1, 1e6)).astype(jnp.int32) for axis in range(2))
+        visible = (depth > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
+        row = rows[jnp.where(visible, line * width + column, 0)]
+        surface, weight, points, normal, rgb = row[:, 0], row[:, 1], row[:, 2:5], row[:, 5:8], row[:, 8:11]
+        ahead = (surface - depth) / truncation
+        distance = jnp.clip(((x - points) * normal).sum(axis=-1) / truncation, -1, 1)
+        distance = jnp.where(ahead > _FREE, 1, distance)
+        weight = jnp.where(visible & (ahead > -1), weight, 0)
+        colored = jnp.where(ahead > _FREE, 0, weight * (1 - jnp.abs(distance)))[:, None]
+        weight = weight[:, None]
+        return total + jnp.concatenate([weight, weight * distance[:, None], colored, colored * rgb], axis=-1)
+
+    return jax.lax.map(add, (total, x))

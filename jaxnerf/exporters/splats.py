@@ -1,0 +1,126 @@
+"""The export "splats": Gaussians on the surfaces of a run (after arXiv:2405.09717), and their held-out PSNR."""
+
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from jaxnerf.core.cameras import pixel_grid, undistort
+from jaxnerf.core.metrics import psnr
+from jaxnerf.core.types import Camera
+from jaxnerf.evaluation.metrics import pixel_mask, reference
+from jaxnerf.evaluation.restore import refined_views
+from jaxnerf.exporters.base import ExportSource
+from jaxnerf.exporters.gaussians import Gaussians, harmonics, rasterize, write_gaussians
+from jaxnerf.exporters.points import surface_points, thinned
+from jaxnerf.exporters.surfaces import export_box, in_file, render_depth_images
+
+_PIXELS_PER_VOXEL = 1.25
+_NUM_DIRECTIONS = 32  # from which the colour of a point is evaluated
+_NUM_NEIGHBORS = 4
+_WIDTH, _THICKNESS = 0.6, 0.15  # standard deviations along and across the surface, in distances to the neighbours
+_RIDGE = 0.02  # keeps the harmonics small in directions from which the surface is not seen
+_CHUNK = 4096  # points whose colours are evaluated at once
+_NUM_SCORED = 12  # views
+
+
+def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
+    """Writes splats.ply: one Gaussian at each of the points on the surfaces, and states its PSNR on held-out views.
+
+    A Gaussian is a disk in the surface, as wide as the distance to its neighbours. Its opacity is that of the field
+    over its width, and its colours are the field's from all directions in front of the surface, in harmonics of
+    degree 2.
+
+    Raises:
+        ValueError: if no surface is in the box.
+    """
+    settings = source.settings
+    images = render_depth_images(source, settings.size or round(_PIXELS_PER_VOXEL * settings.resolution))
+    points, normals, _, extinction, field_x = surface_points(images, export_box(source, images))
+    chosen = thinned(points, settings.num_points)
+    points, normals, extinction, field_x = (each[chosen] for each in (points, normals, extinction, field_x))
+    gaussians = make_gaussians(points, normals, extinction, colors_of(source, field_x, normals))
+    write_gaussians(folder / "splats.ply", gaussians)
+    value, count = score(source, gaussians)
+    source.say(
+        f"{len(points):,} Gaussians; PSNR {value:.2f} dB over {count} views of {source.run.experiment.eval.split}"
+    )
+
+
+def make_gaussians(points: np.ndarray, normals: np.ndarray, extinction: np.ndarray, colors: np.ndarray) -> Gaussians:
+    """Makes Gaussians on a surface.
+
+    Args:
+        points, normals: [N, 3].
+        extinction: [N] 1 / unit, the density of the matter.
+        colors: [N, 9, 3] harmonics, see Gaussians.
+    """
+    number = min(_NUM_NEIGHBORS, len(points) - 1)
+    distance = np.ones(len(points))
+    if number:
+        distance = cKDTree(points).query(points, k=number + 1)[0][:, 1:].mean(axis=1)
+        distance = np.clip(distance, 1e-12, 4 * np.median(distance))  # a lone point is no large disk
+    opacity = np.clip(-np.expm1(-np.maximum(extinction, 0) * 2 * distance), 0.02, 0.98)
+    half = np.concatenate([1 + normals[:, 2:], np.cross([0.0, 0.0, 1.0], normals)], axis=1)  # from z to the normal
+    half[normals[:, 2] < -1 + 1e-6] = [0, 1, 0, 0]
+    rotation = half / np.linalg.norm(half, axis=1, keepdims=True)
+    scale = distance[:, None] * np.array([_WIDTH, _WIDTH, _THICKNESS])
+    floats = (np.float32(each) for each in (points, rotation, scale, opacity, colors))
+    return Gaussians(*floats)
+
+
+def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Fits harmonics [N, 9, 3] to the field's colours at points [N, 3] in the field's coordinates.
+
+    The fit is linear least squares over directions, weighted by the cosine at which they meet the normals.
+    """
+    rotation = in_file(np.eye(3, 4)[None], source.views.to_file)[0, :, :3]
+    steps = np.arange(_NUM_DIRECTIONS) + 0.5
+    height, angle = 1 - 2 * steps / _NUM_DIRECTIONS, np.pi * (1 + np.sqrt(5)) * steps
+    around = np.sqrt(1 - height**2)
+    directions = np.float32(np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1))
+    basis, in_world = harmonics(directions), jnp.float32(directions @ rotation)
+    ridge = _RIDGE * jnp.diag(jnp.float32([1e-3, *[1.0] * 8]))
+    params, grid = source.variables
+
+    @jax.jit
+    def fit(params, grid, x, normals):
+        scene = source.run.experiment.model.scene(params, grid)
+        shape = (len(x), *directions.shape)
+        _, rgb = scene(jnp.broadcast_to(x[:, None], shape), jnp.broadcast_to(in_world[None], shape))
+        weights = jnp.maximum(-normals @ directions.T, 0)
+        square = jnp.einsum("nd,dk,dl->nkl", weights, basis, basis) + ridge[None]
+        return jnp.linalg.solve(square, jnp.einsum("nd,dk,ndc->nkc", weights, basis, rgb - 0.5))
+
+    count, parts = len(field_x), []
+    for start in range(0, count, _CHUNK):
+        index = np.minimum(np.arange(start, start + _CHUNK), count - 1)  # one compiled shape
+        parts.append(np.asarray(fit(params, grid, np.float32(field_x[index]), np.float32(normals[index]))))
+    return np.concatenate(parts)[:count]
+
+
+def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
+    """Returns the mean PSNR of rasterized Gaussians over views of the split `eval.split`, and how many these are."""
+    run = source.run
+    views = refined_views(run, run.experiment.load_split(run.experiment.eval.split), "test", source.variables[0])
+    poses = in_file(np.asarray(views.cameras.to_world), views.to_file)
+    count = min(_NUM_SCORED, len(views.size))
+    values = []
+    for index in map(int, np.arange(count) * len(views.size) // count):
+        camera = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], views.cameras)
+        height, width = (int(side) for side in views.size[index])
+        pinhole = Camera(to_world=poses[index], focal=camera.focal, center=camera.center, height=height, width=width)
+        image = rasterize(gaussians, pinhole, views.background)
+        if camera.distortion is not None:
+            pixels = undistort(camera, pixel_grid(height, width))[0] * camera.focal + camera.center - 0.5
+            rows = np.asarray(pixels).reshape(-1, 2).T[::-1]
+            planes = [
+                ndimage.map_coordinates(plane, rows, order=1, mode="nearest") for plane in np.moveaxis(image, -1, 0)
+            ]
+            image = np.stack(planes, axis=-1).reshape(height, width, 3)
+        image = np.clip(image, 0, 1).astype(np.float32)
+        values.append(float(psnr(jnp.asarray(image), reference(views, index), mask=pixel_mask(views, index))))
+    return float(np.mean(values)), count
