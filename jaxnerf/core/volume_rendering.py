@@ -13,7 +13,7 @@ from jaxnerf.core.types import check_shapes
 
 # Beyond this optical depth exp(-x) is 0 in every float type. Larger or infinite depths are replaced by it, so that
 # sums and products stay finite.
-_OPAQUE = 1e4
+OPAQUE = 1e4
 
 
 def weights_from_density(
@@ -40,7 +40,7 @@ def weights_from_density(
     Raises:
         ValueError: if the shapes differ (they are not broadcast), the rule is unknown, or S is odd for "gauss".
     """
-    depth = _optical_depth("weights_from_density", density, length)
+    depth = optical_depth("weights_from_density", density, length)
     weights = _weights(depth)
     if rule in ("segments", "points"):
         return weights
@@ -67,7 +67,7 @@ def transmittance(
     Raises:
         ValueError: if the shapes differ.
     """
-    return jnp.exp(-_optical_depth("transmittance", density, length).sum(axis=-1))
+    return jnp.exp(-optical_depth("transmittance", density, length).sum(axis=-1))
 
 
 def opacity(
@@ -77,7 +77,7 @@ def opacity(
 
     Takes the arguments of `transmittance` and raises its errors.
     """
-    return _absorbed(_optical_depth("opacity", density, length).sum(axis=-1))
+    return _absorbed(optical_depth("opacity", density, length).sum(axis=-1))
 
 
 def exclusive_sum(values: Float[ArrayLike, "*batch samples"]) -> Float[Array, "*batch samples"]:
@@ -196,7 +196,7 @@ def packed_weights(
     Raises:
         ValueError: if the shapes differ.
     """
-    depth = _optical_depth("packed_weights", density, length)
+    depth = optical_depth("packed_weights", density, length)
     check_shapes("packed_weights", density=(density, "K"), starts=(starts, "K"))
     return _packed_weights(depth, starts, longest), depth
 
@@ -221,18 +221,18 @@ def _sum_over_samples(weights, values):
     return jnp.stack([(weights * values[..., i]).sum(axis=-1) for i in range(values.shape[-1])], axis=-1)
 
 
-def _optical_depth(function, density, length):
-    """Computes sigma l, at most _OPAQUE; 0 for segments of length 0 and for empty segments of infinite length.
+def optical_depth(function, density, length):
+    """Computes sigma l, at most OPAQUE; 0 for segments of length 0 and for empty segments of infinite length.
 
     In these cases both factors are replaced, because the derivative of a product multiplies by them.
     """
     density, length = at_least_float32(density, length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))
-    opaque = density * length > _OPAQUE
+    opaque = density * length > OPAQUE
     empty = (length <= 0) | (jnp.isinf(length) & (density == 0))
     plain = ~(opaque | empty)
     depth = jnp.where(plain, density, 0) * jnp.where(plain, length, 0)
-    return jnp.where(opaque & ~empty, _OPAQUE, depth)
+    return jnp.where(opaque & ~empty, OPAQUE, depth)
 
 
 @jax.custom_jvp
