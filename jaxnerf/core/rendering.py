@@ -60,7 +60,7 @@ def render_samples(
     check_scene_output("render_samples", density, rgb, x)
     density = jnp.where(kept, density, 0)
     rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # channel by channel, as in composite
-    length = segment_lengths(samples.delta, rays.directions)
+    length = segment_lengths(samples.delta, rays)
     dtype = jnp.result_type(length.dtype, density.dtype, rgb.dtype)
     density, rgb = (
         density.astype(dtype),
@@ -176,7 +176,8 @@ def render_hierarchical(
         samples = sampling.samples_from_points(sampling.merge_edges(samples.t, points))
     else:
         num_points = _num_segments("num_fine", num_fine, rule)
-        weights = first.weights.reshape(*edges.shape[:-1], edges.shape[-1] - 1, -1).sum(axis=-1)
+        count = edges.shape[-1] - 1
+        weights = first.weights.reshape(*edges.shape[:-1], count, num_coarse // count).sum(axis=-1)
         points = sampling.importance_points(
             point_key, edges, weights, num_points=num_points, padding=importance_padding
         )
@@ -234,13 +235,16 @@ def check_scene_output(function: str, density: Array, rgb: Array, x: Float[Array
         )
 
 
-def segment_lengths(
-    delta: Num[ArrayLike, "*batch samples"], directions: Num[ArrayLike, "*batch 3"]
-) -> Float[Array, "*batch samples"]:
-    """Converts delta from t to world units, delta * |d|; an infinite delta gets no derivative, as 0 * inf is NaN."""
-    speed = norm(directions)[..., None]
+def segment_lengths(delta: Num[ArrayLike, "*batch samples"], rays: Rays) -> Float[Array, "*batch samples"]:
+    """Converts delta from t to world units, delta * |d|; an infinite delta gets no derivative, as 0 * inf is NaN.
+
+    Where the origin is NaN the length is NaN, too, so that the ray is visible whatever a scene returns for NaN.
+    """
+    speed = norm(rays.directions)[..., None]
     infinite = jnp.isinf(delta)
-    return jnp.where(infinite & (speed > 0), jnp.inf, jnp.where(infinite, 0, delta) * speed)
+    length = jnp.where(infinite & (speed > 0), jnp.inf, jnp.where(infinite, 0, delta) * speed)
+    unknown = jnp.isnan(rays.origins).any(axis=-1)[..., None]
+    return jnp.where(unknown & (delta > 0), jnp.nan, length)
 
 
 def _uniform_points(key, rays, num_samples, in_disparity):

@@ -44,7 +44,12 @@ def at_least_float32(*arrays: Num[ArrayLike, "..."]) -> list[Float[Array, "..."]
 
 
 def norm(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch"]:
-    """Computes the length of vectors without over- or underflow; 0, with gradient 0, for a zero vector."""
+    """Computes the length of vectors without over- or underflow; 0, with gradient 0, for a zero vector.
+
+    Returns:
+        [...], at least float32: the squares of half precision would lose digits.
+    """
+    (vectors,) = at_least_float32(vectors)
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
     nonzero = largest != 0  # NaN stays NaN
     largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
@@ -53,7 +58,8 @@ def norm(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch"]:
 
 
 def normalize(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch D"]:
-    """Scales vectors to unit length; 0, with gradient 0, for a zero vector."""
+    """Scales vectors to unit length; 0, with gradient 0, for a zero vector. The result is at least float32."""
+    (vectors,) = at_least_float32(vectors)
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
     nonzero = largest != 0  # NaN stays NaN
     scaled = vectors / jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))

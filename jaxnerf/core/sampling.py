@@ -157,7 +157,7 @@ def inverse_cdf(
     Returns:
         [..., N] in t, within [first edge, last edge], ascending where u is. Gradients with respect
         to edges and u are those of the interpolation. In a segment that ends at inf, 1 / t is
-        interpolated.
+        interpolated. If a weight is NaN, all points are.
 
     Raises:
         ValueError: on other shapes.
@@ -181,7 +181,8 @@ def inverse_cdf(
     lower_sum, upper_sum = _take(cdf, index), _take(cdf, index + 1)
     lower, upper = _take(edges, index), _take(edges, index + 1)
     width = upper_sum - lower_sum
-    fraction = jnp.where(width > 0, divide(target - lower_sum, jnp.where(width > 0, width, 1)), 0)
+    empty = width <= 0  # NaN is not, so that it is visible
+    fraction = jnp.where(empty, 0, divide(target - lower_sum, jnp.where(empty, 1, width)))
     return clamp(_interpolate(lower, upper, fraction), lower, upper)
 
 
@@ -207,7 +208,7 @@ def importance_points(
             moves samples into empty space on nearly empty rays. The argument exists for parity with them.
 
     Returns:
-        [..., N] ascending points in t, within the edges. No gradient flows through them.
+        [..., N] ascending points in t, within the edges; NaN if a weight is. No gradient flows through them.
 
     Raises:
         ValueError: on other shapes, or N < 1.

@@ -13,7 +13,7 @@ from jaxnerf.core.types import check_shapes
 
 # Beyond this optical depth exp(-x) is 0 in every float type. Larger or infinite depths are replaced by it, so that
 # sums and products stay finite.
-_OPAQUE = 1e4
+OPAQUE = 1e4
 
 
 def weights_from_density(
@@ -295,18 +295,18 @@ def _sum_over_samples(weights, values):
 def optical_depth(
     function: str, density: Num[ArrayLike, "*batch samples"], length: Num[ArrayLike, "*batch samples"]
 ) -> Float[Array, "*batch samples"]:
-    """Computes sigma l, at most _OPAQUE; 0 for segments of length 0 and for empty segments of infinite length.
+    """Computes sigma l, at most OPAQUE; 0 for segments of length 0 and for empty segments of infinite length.
 
     In these cases both factors are replaced, because the derivative of a product multiplies by them. The name of the
     calling function is for errors.
     """
     density, length = at_least_float32(density, length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))
-    opaque = density * length > _OPAQUE
+    opaque = density * length > OPAQUE
     empty = (length <= 0) | (jnp.isinf(length) & (density == 0))
     plain = ~(opaque | empty)
     depth = jnp.where(plain, density, 0) * jnp.where(plain, length, 0)
-    return jnp.where(opaque & ~empty, _OPAQUE, depth)
+    return jnp.where(opaque & ~empty, OPAQUE, depth)
 
 
 @jax.custom_jvp

@@ -10,6 +10,7 @@ import numpy as np
 from flax import linen
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxnerf.core.safe_math import clamp
 from jaxnerf.core.types import TableLevel, Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network
 from jaxnerf.fields.mlp import Dense
@@ -194,13 +195,13 @@ def interpolate(
             which vertices share by the hash of arXiv:2201.05989 (Eq. 4).
 
     Returns:
-        [N, F]. The derivative with respect to place is that of the linear pieces.
+        [N, F]. The derivative with respect to place is that of the linear pieces, also on a face of the box.
 
     Raises:
         ValueError: on another shape of the table.
     """
     check_shapes("interpolate", table=(table, "T F"), x=(place[0], "N"), y=(place[1], "N"), z=(place[2], "N"))
-    spread = [jnp.clip(value, 0, 1) * (count - 1) for value, count in zip(place, size, strict=True)]
+    spread = [clamp(value, 0, 1) * (count - 1) for value, count in zip(place, size, strict=True)]
     low = [jnp.minimum(value.astype(jnp.int32), count - 2) for value, count in zip(spread, size, strict=True)]
     fractions = [value - start for value, start in zip(spread, low, strict=True)]
     corner_weights = _of_corners(jnp.multiply, [(1 - fraction, fraction) for fraction in fractions])

@@ -161,6 +161,22 @@ def test_importance_points_of_an_empty_ray_and_of_one_wall():
     np.testing.assert_allclose(wall, [4 + 1 / 6, 4.5, 5 - 1 / 6], rtol=1e-6)
 
 
+def test_one_hot_weights_place_all_points_in_their_segment():
+    """Also at u = 0 and u = 1, whatever the number of empty segments before and behind."""
+    e = np.broadcast_to(np.arange(9, dtype=np.float32) ** 2, (8, 9))
+    got = inverse_cdf(e, np.eye(8, dtype=np.float32), np.broadcast_to(f32([0, 0.5, 1]), (8, 3)))
+    np.testing.assert_allclose(got, np.stack([e[0, :-1], (e[0, :-1] + e[0, 1:]) / 2, e[0, 1:]], axis=-1))
+
+
+@pytest.mark.parametrize("place", [0, SEGMENTS - 1])
+def test_nan_weights_show(edges, weights, place):
+    """Numbers would look like points of a field that works."""
+    broken = weights.copy()
+    broken[2, place] = np.nan
+    points = importance_points(None, edges, broken, num_points=POINTS)
+    np.testing.assert_array_equal(np.isnan(points), np.broadcast_to(np.arange(RAYS)[:, None] == 2, points.shape))
+
+
 def test_one_importance_point_is_the_median():
     got = importance_points(None, f32([0.0, 1.0, 2.0]), f32([1.0, 3.0]), num_points=1)
     np.testing.assert_allclose(got, [4 / 3], rtol=1e-6)

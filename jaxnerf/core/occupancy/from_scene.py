@@ -14,6 +14,7 @@ from jaxnerf.core.occupancy.grid import (
 from jaxnerf.core.occupancy.packed import visible_samples
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import Background, Rays, SceneFn, Vector
+from jaxnerf.core.varying import vary_like
 
 _CHUNK = 2**11  # rays
 _MAX_ERROR = 1 / 512  # of a colour: half a step of 8 bits
@@ -66,7 +67,8 @@ def visible_grid(
         return mark_cells(marked, grid, rays, samples.t, needed), None
 
     parts = jax.tree.map(lambda leaf: leaf.reshape(-1, _CHUNK, *leaf.shape[1:]), rays)
-    marked = jax.lax.scan(mark, jnp.zeros(shape, bool), parts)[0]
+    marked = vary_like(jnp.zeros(shape, bool), grid, rays)
+    marked = jax.lax.scan(mark, marked, parts)[0]
     return keep_cells(grid, marked)
 
 

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxnerf.core import contraction, volume_rendering
+from jaxnerf.core.safe_math import at_least_float32
 from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, check_shapes, pytree
+from jaxnerf.core.varying import vary_like
 
 _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 
@@ -171,7 +173,7 @@ def grid_from_scene(
         options = {"threshold": threshold, "decay": 1.0, "smoothing": 1 / (index + 1), "chunk": chunk}
         return update_grid(jax.random.fold_in(key, index), grid, scene, cells, **options)
 
-    return jax.lax.fori_loop(0, num_updates, update, grid)
+    return jax.lax.fori_loop(0, num_updates, update, vary_like(grid, jax.eval_shape(update, 0, grid)))
 
 
 def cells_along(grid: OccupancyGrid, rays: Rays, samples: Samples) -> Int[Array, "*batch samples"]:
@@ -213,18 +215,19 @@ def widen(occupied: Bool[ArrayLike, "X Y Z"]) -> Bool[Array, "X Y Z"]:
 
 
 def clip_rays_to_box(grid: OccupancyGrid, rays: Rays) -> Rays:
-    """Returns the rays with near and far clipped to the grid's box; near = far where they miss it."""
+    """Returns the rays with near and far clipped to the grid's box; near = far where they miss it, NaN stays NaN."""
     return clip_rays(rays, grid.lower, grid.upper)
 
 
 def clip_rays(rays: Rays, lower: Float[ArrayLike, "3"], upper: Float[ArrayLike, "3"]) -> Rays:
-    """Returns the rays with near and far clipped to a box from lower to upper; near = far where they miss it."""
+    """Returns the rays with near and far clipped to a box from lower to upper; see clip_rays_to_box."""
     origins, directions = rays.origins, rays.directions
     level = directions == 0
     lower, upper = (jnp.asarray(bound).reshape(*(1,) * rays.near.ndim, 3) for bound in (lower, upper))
-    inside = (origins >= lower) & (origins < upper)
+    inside = jnp.where((origins >= lower) & (origins < upper), -jnp.inf, jnp.inf)
+    inside = jnp.where(jnp.isnan(origins), jnp.nan, inside)
     ends = [(bound - origins) / jnp.where(level, 1, directions) for bound in (lower, upper)]
-    enter = jnp.where(level, jnp.where(inside, -jnp.inf, jnp.inf), jnp.minimum(*ends)).max(axis=-1)
+    enter = jnp.where(level, inside, jnp.minimum(*ends)).max(axis=-1)
     leave = jnp.where(level, jnp.inf, jnp.maximum(*ends)).min(axis=-1)
     near = jnp.clip(enter, rays.near, rays.far)
     return dataclasses.replace(rays, near=near, far=jnp.clip(leave, near, rays.far))
@@ -233,9 +236,14 @@ def clip_rays(rays: Rays, lower: Float[ArrayLike, "3"], upper: Float[ArrayLike, 
 def is_occupied(
     grid: OccupancyGrid, rays: Rays, t: Float[ArrayLike, "*batch samples"]
 ) -> Bool[Array, "*batch samples"]:
-    """Returns whether the cell around each x(t) is occupied; True where t is NaN, so that it is visible."""
+    """Returns whether the cell around each x(t) is occupied; True where t or the ray is NaN, so that it is visible."""
     index, inside = _cells_of(grid, _along_rays(grid, rays, t))
-    return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t)
+    return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t) | has_nan(rays)[..., None]
+
+
+def has_nan(rays: Rays) -> Bool[Array, "*batch"]:
+    """Returns whether the origin, the direction, near or far of each ray is NaN."""
+    return jnp.isnan(rays.origins.sum(axis=-1) + rays.directions.sum(axis=-1) + rays.near + rays.far)
 
 
 def mask_samples(
@@ -273,15 +281,19 @@ def estimate_optical_depth(
         samples: Samples [..., S].
 
     Returns:
-        [..., S] bool, whether a sample has a length and is in an occupied cell, or is NaN, so that it is visible; and
-        [..., S], its optical depth, 0 where it is not.
+        [..., S] bool, whether a sample has a length and is in an occupied cell, or it or its ray is NaN, so that it is
+        visible; and [..., S], its optical depth, 0 where it is not, and at most 1e4.
     """
     index, inside = _cells_of(grid, _along_rays(grid, rays, samples.t))
-    mean = jnp.where(inside & ~(samples.delta <= 0), grid.density_mean.reshape(-1)[index], -1)
+    has_length = ~(samples.delta <= 0)
+    mean = jnp.where(inside & has_length, grid.density_mean.reshape(-1)[index], -1)
     # A plain norm, as it is computed again for every sample; an estimate need not be accurate at lengths of 1e-20.
-    x, y, z = (rays.directions[..., axis] for axis in range(3))
+    x, y, z = (at_least_float32(rays.directions[..., axis])[0] for axis in range(3))
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
-    return ~(mean < 0) | jnp.isnan(samples.t), jnp.maximum(mean, 0) * samples.delta * size
+    # The bound keeps sums finite: the mean of a cell may be infinite.
+    optical_depth = jnp.where(mean > 0, jnp.minimum(mean * samples.delta * size, volume_rendering.OPAQUE), 0)
+    unknown = jnp.isnan(samples.t) | (has_length & has_nan(rays)[..., None])
+    return ~(mean < 0) | unknown, optical_depth
 
 
 def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
@@ -292,13 +304,19 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
         grid: OccupancyGrid. Outside its box space is empty, too.
 
     Returns:
-        A scene, whose density is 0, with gradient 0, in empty cells.
+        A scene, whose density is 0, with gradient 0, in empty cells; its colour there is that of another position.
+        The given scene is not evaluated in empty cells unless no position is in an occupied one. NaN is evaluated, so
+        that it is visible.
     """
 
     def masked(x, viewdirs):
-        density, rgb = scene(x, viewdirs)
         index, inside = _cells_around(grid, x)
-        return jnp.where(inside & grid.occupied.reshape(-1)[index], density, 0), rgb
+        kept = (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(x).any(axis=-1)
+        flat = x.reshape(-1, 3)
+        # Where the scene is undefined, the gradient of what is masked would be NaN.
+        safe = jax.lax.stop_gradient(flat[jnp.argmax(kept.reshape(-1))]) if flat.size else jnp.zeros(3)
+        density, rgb = scene(jnp.where(kept[..., None], x, safe.reshape(*(1,) * (x.ndim - 1), 3)), viewdirs)
+        return jnp.where(kept, density, 0), rgb
 
     return masked
 
@@ -330,7 +348,7 @@ def flat_index(places: Sequence[Int[Array, "*batch"]], shape: tuple[int, ...]) -
     would not be vectorised at all.
     """
     strides = jnp.array([shape[1] * shape[2], shape[2], 1]).reshape(3, *(1,) * places[0].ndim)
-    return (jnp.stack(places) * strides).sum(axis=0)
+    return (jnp.stack(places) * strides).sum(axis=0, dtype=jnp.int32)
 
 
 def _along_rays(grid, rays, t):
@@ -365,7 +383,8 @@ def _cells_of(grid, places):
 
 def _contracted(places, shape):
     """Returns where contract puts places, three arrays [...] in cells; axis by axis, which is faster."""
-    along = [place * (4 / size) - 2 for place, size in zip(places, shape, strict=True)]
+    # Bounded as in contraction.contract: infinity times a scale of 0 would be NaN.
+    along = [jnp.clip(place * (4 / size) - 2, -1e30, 1e30) for place, size in zip(places, shape, strict=True)]
     largest = jnp.maximum(jnp.maximum(*map(jnp.abs, along[:2])), jnp.abs(along[2]))
     safe = jnp.maximum(largest, 1)
     # The box ends at infinity, and a point there is in its last cell.

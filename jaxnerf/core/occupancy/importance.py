@@ -59,10 +59,14 @@ def importance_samples(
             f"importance_samples: rule is {candidates.rule!r}, max_samples {max_samples} and uniform_fraction "
             f"{uniform_fraction}, expected 'segments', at least 1, and above 0 up to 1"
         )
+    if not rays.near.size:
+        zeros, none = jnp.zeros(max_samples), jnp.zeros(0, jnp.int32)
+        index = jnp.zeros(max_samples, jnp.int32)
+        return PlacedSamples(t=zeros, delta=zeros, ray_index=index, used=index > 0, num_dropped=none), none > 0
     occupied, optical_depth = estimate_optical_depth(grid, rays, candidates)
     in_front = exclusive_sum(optical_depth)
     kept = occupied & ~(in_front > max_optical_depth)
-    count = kept.sum(axis=-1)
+    count = kept.sum(axis=-1, dtype=jnp.int32)
     number = divide_slots(count, max_samples)
     weights = jnp.where(kept, jnp.exp(-in_front) * -jnp.expm1(-optical_depth), 0)
     weights = jnp.where((number < count)[:, None], (1 - uniform_fraction) * weights, 0)
@@ -73,10 +77,10 @@ def importance_samples(
     delta = jnp.where(kept, candidates.delta, 0)
     length = running_sum(delta)
 
-    first = jnp.cumsum(number) - number
-    slot = jnp.arange(max_samples)
+    first = jnp.cumsum(number, dtype=jnp.int32) - number
+    slot = jnp.arange(max_samples, dtype=jnp.int32)
     ended = jnp.zeros(max_samples, jnp.int32).at[first + number].add(1, mode="drop")
-    ray = jnp.minimum(jnp.cumsum(ended), count.size - 1)
+    ray = jnp.minimum(jnp.cumsum(ended, dtype=jnp.int32), count.size - 1)
     used = slot < number.sum()
     row, total = slot - first[ray], cumulative[ray, -1]
     spacing = total / jnp.maximum(number[ray], 1)
@@ -114,11 +118,11 @@ def divide_slots(count: Int[ArrayLike, " B"], num_slots: int) -> Int[Array, " B"
     count = jnp.asarray(count)
     ascending = jnp.sort(count)
     # The sum is the least of the lines below_k + above_k m, so m is the largest of their solutions.
-    below, above = jnp.cumsum(ascending) - ascending, jnp.arange(count.size, 0, -1)
+    below, above = jnp.cumsum(ascending, dtype=jnp.int32) - ascending, jnp.arange(count.size, 0, -1, dtype=jnp.int32)
     most = jnp.maximum((num_slots - below) // above, 0).max()
     number = jnp.minimum(count, most)
     more = count > most
-    return number + (more & (jnp.cumsum(more) <= num_slots - number.sum()))
+    return number + (more & (jnp.cumsum(more) <= num_slots - number.sum())).astype(number.dtype)
 
 
 def _count_up_to(ascending, row, value):

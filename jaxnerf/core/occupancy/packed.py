@@ -5,6 +5,7 @@ size and composites them there. Images march each ray only until it is opaque.
 """
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
 from jaxnerf.core.safe_math import norm, scale_gradient
 from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
+from jaxnerf.core.varying import vary_like
 
 _OPAQUE = 1e-3  # transmittance below which a ray counts as opaque
 _HIGH_EPS = 0.01  # an early_stop_eps above which rays end so soon that long runs waste samples
@@ -76,7 +78,7 @@ def render_packed(
 
     Returns:
         Rendering [...] without weights; num_dropped [...] is the number of a ray's samples that did not fit.
-        Without early termination `samples` is PackedSamples [K].
+        Without early termination `samples` is PackedSamples [K]; K is 0 if there are no rays.
 
     Raises:
         ValueError: as render_samples; on rule "gauss"; if max_samples < 1; if rays end before their median depth.
@@ -94,15 +96,14 @@ def render_packed(
         sums = _march_until_terminated("render_packed", scene, rays, samples, words, **options)
         num_dropped, packed = jnp.zeros_like(rays.near, jnp.int32), None
     else:
-        occupied, slot = _count_occupied(words), jnp.arange(max_samples)
+        occupied, slot = _count_occupied(words), jnp.arange(max_samples, dtype=jnp.int32)
         buffer = _fill(occupied, slot, slot < occupied.ends[-1])
         t, delta = (jnp.where(buffer.used, leaf[buffer.ray, buffer.source], 0) for leaf in (samples.t, samples.delta))
         num_dropped = occupied.count - jnp.clip(max_samples - _first(occupied), 0, occupied.count)
         placed = PlacedSamples(t, delta, buffer.ray, buffer.used, num_dropped)
         options = {"rule": samples.rule, "longest": samples.t.shape[-1], "median_depth": median_depth}
         sums, packed = _composite("render_packed", scene, rays, placed, near_gradient_distance, **options)
-    flat = _rendering(sums, num_dropped, rays.far, shape, background)
-    return dataclasses.replace(flat, samples=packed)
+    return _rendering(sums, num_dropped, rays.far, shape, background, packed)
 
 
 def render_placed(
@@ -125,14 +126,14 @@ def render_placed(
         background: see render_samples.
 
     Returns:
-        Rendering [B] without weights; `samples` is PackedSamples [K].
+        Rendering [B] without weights; `samples` is PackedSamples [K], K being 0 if there are no rays.
     """
     check_shapes("render_placed", near=(rays.near, "B"), t=(placed.t, "K"), delta=(placed.delta, "K"))
-    rays = jax.tree.map(jnp.asarray, rays)
+    shape, rays = rays.near.shape, _at_least_one(jax.tree.map(jnp.asarray, rays))
     options = {"rule": "segments", "longest": longest}
     sums, packed = _composite("render_placed", scene, rays, placed, near_gradient_distance, **options)
-    flat = _rendering(sums, placed.num_dropped, rays.far, rays.near.shape, background)
-    return dataclasses.replace(flat, samples=packed)
+    num_dropped = _at_least_one(placed.num_dropped)
+    return _rendering(sums, num_dropped, rays.far, shape, background, packed)
 
 
 def visible_samples(
@@ -167,21 +168,25 @@ def visible_samples(
     """
     name, shape = "visible_samples", samples.t.shape
     rays, samples = _flattened(name, rays, samples, max_samples)
+    if not math.prod(shape):
+        return jnp.zeros(shape, bool)
     occupied = _count_occupied(_occupied_words(grid, rays, samples))
 
     def evaluate_round(index, outputs):
-        slot = index * max_samples + jnp.arange(max_samples)
+        slot = index * max_samples + jnp.arange(max_samples, dtype=jnp.int32)
         buffer = _fill(occupied, slot, slot < occupied.ends[-1])
         t = samples.t[buffer.ray, buffer.source]
-        density, rgb = _evaluate(name, scene, rays, t, buffer.ray, buffer.used)
+        density, rgb, _ = _evaluate(name, scene, rays, t, buffer.ray, buffer.used)
         place = jnp.where(buffer.used, buffer.ray * shape[-1] + buffer.source, outputs.shape[0])
         return outputs.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
 
     rounds = -(-occupied.ends[-1] // max_samples)
-    outputs = jax.lax.fori_loop(0, rounds, evaluate_round, jnp.zeros((samples.t.size, 4)))
+    outputs = jnp.zeros((samples.t.size, 4))
+    outputs = vary_like(outputs, jax.eval_shape(evaluate_round, jnp.zeros_like(rounds), outputs))
+    outputs = jax.lax.fori_loop(0, rounds, evaluate_round, outputs)
     density, *rgb = jnp.moveaxis(outputs.reshape(*samples.t.shape, 4), -1, 0)
-    length = rendering.segment_lengths(jnp.maximum(samples.delta, 0), rays.directions)
-    depth = jnp.where(density == 0, 0, density * length)
+    length = rendering.segment_lengths(jnp.maximum(samples.delta, 0), rays)
+    depth = volume_rendering.optical_depth(name, density, length)
     before = jnp.exp(-volume_rendering.exclusive_sum(depth))
     through = jnp.exp(-depth)
 
@@ -200,7 +205,7 @@ def visible_samples(
     behind = jnp.zeros(3) if background is None else jnp.asarray(background)
     behind = jnp.broadcast_to(behind, (*rays.near.shape, 3))
     opaque = before[:, -1:] * through[:, -1:] < _OPAQUE
-    start = (behind, jnp.zeros_like(behind), opaque[:, 0].astype(behind.dtype))
+    start = vary_like((behind, jnp.zeros_like(behind), opaque[:, 0].astype(behind.dtype)), behind, outputs, length)
     nearest_first = (before.T, through.T, jnp.stack(rgb, axis=-1).swapaxes(0, 1))
     return jax.lax.scan(drop, start, nearest_first, reverse=True)[1].T.reshape(shape)
 
@@ -226,7 +231,10 @@ class _Sums(NamedTuple):
 
 
 def _flattened(function, rays, samples, max_samples):
-    """Returns Rays [B] and Samples [B, S] of any leading axes; ValueError on what cannot be packed."""
+    """Returns Rays [B] and Samples [B, S] of any leading axes; ValueError on what cannot be packed.
+
+    If there are no rays, B is 1: a ray of length 0, which `_rendering` removes.
+    """
     if samples.rule == "gauss":
         raise ValueError(
             f"{function}: rule is 'gauss', whose pairs of samples a cell's border may part; expected 'segments' or "
@@ -236,14 +244,21 @@ def _flattened(function, rays, samples, max_samples):
     if max_samples < 1:
         raise ValueError(f"{function}: max_samples is {max_samples}, expected at least 1")
     leading = rays.near.ndim
-    return jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[leading:]), (rays, samples))
+    flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(rays.near.size, *x.shape[leading:]), (rays, samples))
+    return _at_least_one(flat)
 
 
-def _rendering(sums, num_dropped, far, shape, background):
+def _at_least_one(flat):
+    """Returns a tree of arrays [B, ...]; if B is 0, with one row of zeros, so that indices have something to read."""
+    return jax.tree.map(lambda x: x if len(x) else jnp.zeros((1, *x.shape[1:]), x.dtype), flat)
+
+
+def _rendering(sums, num_dropped, far, shape, background, samples):
+    """Returns the Rendering [*shape], with PackedSamples or None."""
     rgb = sums.rgb
     if background is not None:
         behind = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), (*shape, 3)).reshape(-1, 3)
-        rgb = rgb + sums.transmittance[:, None] * behind
+        rgb = rgb + sums.transmittance[:, None] * _at_least_one(behind)
     flat = Rendering(
         rgb=rgb,
         opacity=sums.opacity,
@@ -253,7 +268,10 @@ def _rendering(sums, num_dropped, far, shape, background):
         num_dropped=num_dropped,
         median_depth=None if sums.median_depth is None else jnp.minimum(sums.median_depth, far),
     )
-    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), flat)
+    count = math.prod(shape)
+    rendering = jax.tree.map(lambda leaf: leaf[:count].reshape(*shape, *leaf.shape[1:]), flat)
+    # Without rays there is nothing that ray_index could refer to.
+    return dataclasses.replace(rendering, samples=samples if count else jax.tree.map(lambda leaf: leaf[:0], samples))
 
 
 # Which samples are occupied: one bit per sample, W words of 32 bits per ray. Packing is cheap because it searches
@@ -303,12 +321,13 @@ def _nth_bit(words, n):
 
 def _count_occupied(words):
     sizes = _count_bits(words)
-    return _Occupied(words.reshape(-1), jnp.cumsum(sizes.reshape(-1)), sizes.sum(-1))
+    ends = jnp.cumsum(sizes.reshape(-1), dtype=jnp.int32)
+    return _Occupied(words.reshape(-1), ends, sizes.sum(-1, dtype=jnp.int32))
 
 
 def _first(occupied):
     """Returns [B], where each ray's samples begin among all occupied samples."""
-    return jnp.cumsum(occupied.count) - occupied.count
+    return jnp.cumsum(occupied.count, dtype=jnp.int32) - occupied.count
 
 
 # One buffer for all rays.
@@ -332,7 +351,7 @@ def _fill(occupied, place, used):
     """Returns the _Buffer of the occupied samples with the indices place [K], which are consecutive."""
     # The number of words that end before each index, by a cumulative sum instead of a search for each index.
     ended = jnp.zeros_like(place).at[jnp.maximum(occupied.ends - place[0], 0)].add(1, mode="drop")
-    word = jnp.minimum(jnp.cumsum(ended), occupied.words.size - 1)
+    word = jnp.minimum(jnp.cumsum(ended, dtype=jnp.int32), occupied.words.size - 1)
     flags = occupied.words[word]
     before = occupied.ends[word] - _count_bits(flags)
     width = occupied.words.size // occupied.count.size
@@ -340,28 +359,38 @@ def _fill(occupied, place, used):
 
 
 def _evaluate(function, scene, rays, t, ray_index, used):
-    """Evaluates the scene at samples t [K] of rays: density [K], rgb [K, 3], both 0 in unused slots."""
-    t = jnp.where(used, t, 0)
-    one = jax.tree.map(lambda leaf: leaf[ray_index][None], rays)  # Rays [1, K], one for each sample
-    x = one.origins + t[None, :, None] * one.directions
-    density, rgb = scene(x, one.viewdirs)
+    """Evaluates the scene at samples t [K] of rays.
+
+    Unused slots evaluate the scene where the first slot does, so that they add no place at which it may be undefined,
+    with a gradient that is NaN. If no slot is used, that place is the near end of a ray, as in render_samples.
+
+    Returns:
+        density [K] and rgb [K, 3], both 0 in unused slots; and Rays [K], those of the samples.
+    """
+    first = ray_index[0]
+    t = jnp.where(used, t, jnp.where(used[0], t[0], rays.near[first]))
+    index = jnp.where(used, ray_index, first)
+    own = jax.tree.map(lambda leaf: leaf[index], rays)
+    x = own.origins + t[:, None] * own.directions
+    x = jnp.where(used[:, None], x, jax.lax.stop_gradient(x))[None]
+    density, rgb = scene(x, own.viewdirs[None])
     rendering.check_scene_output(function, density, rgb, x)
-    return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
+    return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0), own
 
 
 def _composite(function, scene, rays, placed, near_gradient_distance, *, rule, longest, median_depth=False):
     """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
     t, ray = placed.t, placed.ray_index
-    density, rgb = _evaluate(function, scene, rays, t, ray, placed.used)
-    directions = rays.directions[ray]
-    length = rendering.segment_lengths(placed.delta[:, None], directions)[:, 0]
+    density, rgb, own = _evaluate(function, scene, rays, t, ray, placed.used)
+    length = jnp.where(placed.used, rendering.segment_lengths(placed.delta[:, None], own)[:, 0], 0)
     if near_gradient_distance:
-        scale = jnp.minimum(norm(directions) * t / near_gradient_distance, 1) ** 2
+        scale = jnp.minimum(norm(own.directions) * t / near_gradient_distance, 1) ** 2
         density, rgb = scale_gradient(density, scale), scale_gradient(rgb, scale[:, None])
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
     weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=longest)
     colours = [rgb[:, axis] * weights for axis in range(3)]
-    parts = [optical_depth, *colours, weights * t, volume_rendering.divide_or_zero(weights, t)]
+    moments = volume_rendering.multiply_or_zero(weights, t), volume_rendering.divide_or_zero(weights, t)
+    parts = [optical_depth, *colours, *moments]
     sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
     packed = PackedSamples(weights=weights, t=t, delta=placed.delta, ray_index=ray, used=placed.used, rule=rule)
     median = None
@@ -469,7 +498,8 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
 
     slots = _Slots(no_ray, none_done, jnp.broadcast_to(start, (start.shape[0], slot_count)))
     finished = jnp.broadcast_to(start, (start.shape[0], ray_count))
-    finished = jax.lax.while_loop(continues, step, (slots, jnp.zeros_like(waiting), finished))[2]
+    state = vary_like((slots, jnp.zeros_like(waiting), finished), run)
+    finished = jax.lax.while_loop(continues, step, state)[2]
     transmittance, opacity, *rgb, depth, disparity = finished[:7]
     median = finished[7] if median_depth else None
     return _Sums(transmittance, opacity, jnp.stack(rgb, axis=-1), depth, disparity, median)
@@ -493,13 +523,17 @@ def _made_opaque(sums):
 
 
 def _nth_samples(rays, samples, words, up_to, ray, n, used):
-    """Returns the Rays [L] of the slots, and t and delta [L, N] of each one's n-th occupied samples."""
+    """Returns the Rays [L] of the slots, and t and delta [L, N] of each one's n-th occupied samples.
+
+    Unused samples are at the near end of the ray, as in render_samples.
+    """
     word = jnp.minimum((up_to[ray, None] <= n[..., None]).sum(axis=-1), words.shape[-1] - 1)
+    own = jax.tree.map(lambda leaf: leaf[ray], rays)
     ray = ray[:, None]
     flags, end = words[ray, word], up_to[ray, word]
     source = 32 * word + _nth_bit(flags, n - end + _count_bits(flags))
-    t, delta = (jnp.where(used, leaf[ray, source], 0) for leaf in (samples.t, samples.delta))
-    return jax.tree.map(lambda leaf: leaf[ray[:, 0]], rays), (t, delta)
+    t = jnp.where(used, samples.t[ray, source], own.near[:, None])
+    return own, (t, jnp.where(used, samples.delta[ray, source], 0))
 
 
 def _sum_run(function, scene, rays, samples, used, rule, transmittance):
@@ -512,7 +546,7 @@ def _sum_run(function, scene, rays, samples, used, rule, transmittance):
     density, rgb = scene(x, rays.viewdirs[:, None])
     rendering.check_scene_output(function, density, rgb, x)
     density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
-    length = rendering.segment_lengths(delta, rays.directions)
+    length = rendering.segment_lengths(delta, rays)
     weights = volume_rendering.weights_from_density(density, length)
     sums = [
         volume_rendering.transmittance(density, length),

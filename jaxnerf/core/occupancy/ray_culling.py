@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
-from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, flat_index
+from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, flat_index, has_nan
 from jaxnerf.core.types import Background, Rays, Rendering, without_samples
+from jaxnerf.core.varying import vary_like
 
 _COARSE = 2  # cells along a side of a coarse cell
 
@@ -41,9 +42,8 @@ def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> B
         flat = flat_index(places, coarse.shape)
         return hit | coarse.reshape(-1)[flat]
 
-    hit = jax.lax.fori_loop(0, count, read, jnp.zeros(rays.near.shape, bool))
-    numbers = (rays.origins.sum(axis=-1), rays.directions.sum(axis=-1), rays.near, rays.far)
-    return (hit & (length > 0)) | jnp.isnan(sum(numbers))
+    hit = jax.lax.fori_loop(0, count, read, vary_like(jnp.zeros(rays.near.shape, bool), grid, rays))
+    return (hit & (length > 0)) | has_nan(rays)
 
 
 def render_background(rays: Rays, *, background: Background | None = None, median_depth: bool = False) -> Rendering:

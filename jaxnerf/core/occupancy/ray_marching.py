@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box
+from jaxnerf.core.safe_math import at_least_float32
 from jaxnerf.core.sampling import samples_from_edges, stepped_edges
 from jaxnerf.core.types import Keys, Rays, Samples
 
@@ -35,7 +36,7 @@ def march_rays(
     Returns:
         Samples [..., S].
     """
-    x, y, z = (rays.directions[..., axis] for axis in range(3))
+    x, y, z = (at_least_float32(rays.directions[..., axis])[0] for axis in range(3))
     speed = jnp.sqrt(x * x + y * y + z * z)
     sides = [size * count for size, count in zip(cell, grid.valid.shape, strict=True)]
     if grid.contracted:
@@ -72,9 +73,10 @@ def samples_in_contracted_space(
     """
     middle, half = (grid.lower + grid.upper) / 2, (grid.upper - grid.lower).max() / 2
     middle = middle.reshape(*(1,) * rays.near.ndim, 3)
-    squares = (rays.directions**2).sum(axis=-1)
-    nearest = ((middle - rays.origins) * rays.directions).sum(axis=-1) / squares
-    away = rays.origins + nearest[..., None] * rays.directions - middle
+    origins, directions = at_least_float32(rays.origins, rays.directions)
+    squares = (directions**2).sum(axis=-1)
+    nearest = ((middle - origins) * directions).sum(axis=-1) / squares
+    away = origins + nearest[..., None] * directions - middle
     smallest = half / jnp.sqrt(squares)
     scale = jnp.maximum(jnp.sqrt((away**2).sum(axis=-1) / squares), smallest)
     t_step = t_step * scale / smallest
