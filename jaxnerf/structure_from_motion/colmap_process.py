@@ -87,12 +87,20 @@ def call(stage: Callable, *arguments, log: Path, progress: Callable[[int | None]
     raise ValueError(f"{log}: COLMAP failed ({reason}); its messages are there. The same command continues")
 
 
-def count_rows(database: Path, table: str, condition: str = "1") -> int:
-    """Returns the number of rows of a table of COLMAP's database, also while COLMAP writes to it."""
+def count_rows(database: Path, table: str, condition: str = "1", *, running: bool = False) -> int:
+    """Returns the number of rows of a table of COLMAP's database.
+
+    Args:
+        database: the file.
+        table, condition: in SQL.
+        running: whether COLMAP may be using it. It fails if it opens a database while another process reads it, so
+            the file is then read without a lock, and rows that are still in SQLite's log are not counted.
+    """
+    mode = "immutable=1" if running else "mode=ro"
     try:
-        with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+        with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?{mode}", uri=True)) as connection:
             return connection.execute(f"SELECT COUNT(*) FROM {table} WHERE {condition}").fetchone()[0]
-    except sqlite3.Error:  # not created yet, or locked for a moment
+    except sqlite3.Error:  # not created yet, or read while it was changed
         return 0
 
 

@@ -186,12 +186,12 @@ class _Stages:
         """Extracts the features of all images."""
         progress = _Progress(self.say, "features", "images", len(names))
 
-        def count():
-            return colmap_process.count_rows(self.database, "descriptors")
+        def count(running=False):
+            return colmap_process.count_rows(self.database, "descriptors", running=running)
 
         if count() < len(names):
             arguments = (self.database, self.images, names, self.settings["max_size"], self.num_threads)
-            self._call(colmap_process.extract_features, *arguments, progress=lambda _: progress(count()))
+            self._call(colmap_process.extract_features, *arguments, progress=lambda _: progress(count(running=True)))
         if count() < len(names):
             raise ValueError(f"{self.log}: COLMAP found features in {count()} of {len(names)} images; see its messages")
         self.seconds["features"] = progress.end(len(names))
@@ -201,14 +201,14 @@ class _Stages:
         pairs = images_module.image_pairs(names, self.settings["matching"])
         progress = _Progress(self.say, f"{self.settings['matching']} matching", "pairs", len(pairs))
 
-        def count():
-            return colmap_process.count_rows(self.database, "two_view_geometries")
+        def count(running=False):
+            return colmap_process.count_rows(self.database, "two_view_geometries", running=running)
 
         if count() < len(pairs):
             listed = self.work / "pairs.txt"
             write_text(listed, "".join(f"{first} {second}\n" for first, second in pairs))
             arguments = (self.database, listed, self.num_threads)
-            self._call(colmap_process.match_features, *arguments, progress=lambda _: progress(count()))
+            self._call(colmap_process.match_features, *arguments, progress=lambda _: progress(count(running=True)))
         self.seconds["matching"] = progress.end(count())
 
     def map_images(self, names):
