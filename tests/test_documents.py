@@ -24,7 +24,9 @@ def test_links_and_included_files_exist(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
         assert re.match(r"[a-z]+:", target) or (page.parent / target).exists(), target
-    for target in re.findall(r'--8<-- "([^"]+)"', page.read_text()):
+    included = re.findall(r'^--8<-- "([^"]+)"$', page.read_text(), re.MULTILINE)
+    assert len(included) == page.read_text().count("--8")
+    for target in included:
         assert (ROOT / target).exists(), target
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.safe_math import at_least_float32
 
-# A fraction of a turn in two floats has digits for this many octaves. The next group begins with a reduction of its own.
+# A fraction of a turn in two floats has digits for this many octaves; each further group is reduced by itself.
 _GROUP = 16
 _MAX_FREQS = 64
 # 1 / (2 pi) = 0x0.28BE60DB9391... as pieces of 12 bits, so that a product with half the digits of a float32 is exact.

@@ -13,6 +13,7 @@ from ml_collections import ConfigDict
 from jaxnerf.core.types import Rays, Rendering, SceneFn, Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
+from jaxnerf.models.base import Model
 from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import auto_config, build
@@ -35,6 +36,9 @@ class TrainedRun(NamedTuple):
         identity: text that is equal for configs that render alike, see `build.identity`.
         render_image: (variables, Rays [...], chunk=None, median_depth=False) -> Rendering [...] as `render`, in
             chunks that fit into memory.
+        variables_of: (averaged parameters, grid) of a state of training -> (params, grid) as `variables` returns them.
+        model_with: settings of the section `eval`, by name -> the Model that renders with these in place of the run's
+            own. It takes the same variables.
     """
 
     experiment: build.Experiment
@@ -43,6 +47,8 @@ class TrainedRun(NamedTuple):
     render: Callable[[tuple, Rays], Rendering]
     identity: str
     render_image: Callable[..., Rendering]
+    variables_of: Callable[[Any, Any], tuple]
+    model_with: Callable[[dict[str, Any]], Model]
 
 
 def restore_run(
@@ -63,6 +69,19 @@ def restore_run(
     Raises:
         ValueError: if there is no run, or no dataset in data_dir; names the folder.
     """
+    return _restore(workdir, config, data_dir, settings or {}, crop=True)
+
+
+def restore_with_grid(workdir: str | os.PathLike, *, data_dir: str | None = None) -> TrainedRun:
+    """Restores the run in a workdir so that every model renders through an occupancy grid, and all have one shape.
+
+    A model that was trained without a grid renders as with `eval.bake_occupancy`; see `restore_run`.
+    """
+    return _restore(workdir, None, data_dir, {"bake_occupancy": True}, crop=False)
+
+
+def _restore(workdir, config, data_dir, settings, *, crop):
+    """Returns what `restore_run` describes; crop: see `bake_occupancy`."""
     if config is None:
         config = read_config(workdir)
     elif auto_config.auto_fields(config):
@@ -75,7 +94,7 @@ def restore_run(
             config.data.format = "auto"
     if data_dir or is_auto(config.data.ndc):
         config.data, _ = dataset.resolve(config.data)
-    config.eval.update(settings or {})
+    config.eval.update(settings)
     config, _ = auto_config.resolve_for_device(config)
     experiment = build.build(config)
     checkpoints = Checkpoints(workdir)
@@ -85,7 +104,8 @@ def restore_run(
         if auto_config.auto_fields(config):  # of a run that was converted without its dataset
             config = auto_config.resolve_for_device(auto_config.resolve(config, views).config)[0]
         options = {"view_rays": experiment.view_rays, "pixel_offset": experiment.pixel_offset}
-        model, bake = build.bake_model(config, model, functools.partial(random_rays, views, **options))
+        rays = functools.partial(random_rays, views, **options)
+        model, bake = build.bake_model(config, model, rays, crop=crop)
 
     @functools.cache
     def template():
@@ -96,10 +116,18 @@ def restore_run(
     def render(variables, rays, **options):
         return model.view(*variables, rays, **options)
 
+    def variables_of(params, grid):
+        return params, bake(params) if bake else grid
+
     def variables(step):
         state = checkpoints.load(step, template())
-        params = averaged_params(state)
-        return params, bake(params) if bake else state.grid
+        return variables_of(averaged_params(state), state.grid)
+
+    def model_with(settings):
+        other = copy.deepcopy(config)
+        other.eval.update(settings)
+        changed = build.build_model(other)
+        return build.bake_model(other, changed, lambda count: None)[0] if bake else changed
 
     def cull(variables, rays, **options):
         return model.cull(variables[1], rays, **options)
@@ -113,7 +141,9 @@ def restore_run(
         return renderer(**{"median_depth": True} if median_depth else {})(variables, rays, chunk)
 
     identity = build.identity(config)
-    return TrainedRun(experiment, checkpoints.steps, variables, jax.jit(render), identity, render_image)
+    return TrainedRun(
+        experiment, checkpoints.steps, variables, jax.jit(render), identity, render_image, variables_of, model_with
+    )
 
 
 def render_settings(run: TrainedRun) -> dict[str, Any]:

@@ -129,6 +129,7 @@ def bake_occupancy(
     schedule: GridSchedule,
     visibility_rays: Callable[[int], Rays],
     *,
+    crop: bool = True,
     early_stop_eps: float,
     sample_multiplier: float,
     max_samples: int,
@@ -140,6 +141,8 @@ def bake_occupancy(
         model: Model without a grid.
         schedule: GridSchedule of the box that images show.
         visibility_rays: count -> Rays [count] of the training views.
+        crop: whether the grid is cropped to its occupied cells. Images then take less time, but grids of other
+            parameters have other shapes, for which the renderer is compiled again.
         early_stop_eps, sample_multiplier, max_samples, background: see `occupancy_model`.
 
     Returns:
@@ -157,7 +160,7 @@ def bake_occupancy(
     rays = visibility_rays(num_visibility_rays(schedule.shape))
     view = _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background)
     model = model._replace(view=view, cull=_cull(schedule, background))
-    return model, lambda params: crop_grid(find(params, rays))
+    return model, lambda params: crop_grid(find(params, rays)) if crop else find(params, rays)
 
 
 def render_with_grid(

@@ -47,6 +47,7 @@ class Experiment(NamedTuple):
         prepare: Views -> (InitialCells, or None without a grid; TrainData).
         seed: of everything random.
         pixel_offset: px, from a pixel's index to the point that its ray goes through.
+        ndc: whether view_rays returns rays in normalised device coordinates.
         train, eval: the config's sections.
         conventions: see `conventions`.
     """
@@ -64,6 +65,7 @@ class Experiment(NamedTuple):
     prepare: Callable[..., tuple]
     seed: int
     pixel_offset: float
+    ndc: bool
     train: SimpleNamespace
     eval: SimpleNamespace
     conventions: dict[str, Any]
@@ -111,6 +113,7 @@ def build(config: ConfigDict) -> Experiment:
         prepare=functools.partial(_prepare, config, model, extras),
         seed=config.seed,
         pixel_offset=config.data.pixel_offset,
+        ndc=config.data.ndc,
         train=SimpleNamespace(**config.train),
         eval=SimpleNamespace(**config.eval),
         conventions=conventions(config.data),
@@ -192,10 +195,10 @@ def _levels(config):
     return _context(config).make_field("fine").levels
 
 
-def bake_model(config: ConfigDict, model: Model, visibility_rays):
+def bake_model(config: ConfigDict, model: Model, visibility_rays, *, crop: bool = True):
     """Calls `bake_occupancy` for the box of a resolved config's section `occupancy`."""
     schedule = schedule_from_section(_section(config, "occupancy"), None)
-    return bake_occupancy(model, schedule, visibility_rays, **view_options(_context(config)))
+    return bake_occupancy(model, schedule, visibility_rays, crop=crop, **view_options(_context(config)))
 
 
 def load_split(config: ConfigDict, split: str | None = None) -> tuple[Views, str, dict[str, Any]]:

@@ -214,9 +214,14 @@ def widen(occupied: Bool[ArrayLike, "X Y Z"]) -> Bool[Array, "X Y Z"]:
 
 def clip_rays_to_box(grid: OccupancyGrid, rays: Rays) -> Rays:
     """Returns the rays with near and far clipped to the grid's box; near = far where they miss it."""
+    return clip_rays(rays, grid.lower, grid.upper)
+
+
+def clip_rays(rays: Rays, lower: Float[ArrayLike, "3"], upper: Float[ArrayLike, "3"]) -> Rays:
+    """Returns the rays with near and far clipped to a box from lower to upper; near = far where they miss it."""
     origins, directions = rays.origins, rays.directions
     level = directions == 0
-    lower, upper = (bound.reshape(*(1,) * rays.near.ndim, 3) for bound in (grid.lower, grid.upper))
+    lower, upper = (jnp.asarray(bound).reshape(*(1,) * rays.near.ndim, 3) for bound in (lower, upper))
     inside = (origins >= lower) & (origins < upper)
     ends = [(bound - origins) / jnp.where(level, 1, directions) for bound in (lower, upper)]
     enter = jnp.where(level, jnp.where(inside, -jnp.inf, jnp.inf), jnp.minimum(*ends)).max(axis=-1)

@@ -1,0 +1,279 @@
+"""Renders the frames of a free camera: chunks of one size, so that nothing is compiled twice.
+
+Neither the size of a window, nor the camera, nor a new checkpoint changes the shape of anything that is compiled.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
+from jaxnerf.core.occupancy.from_scene import crop_grid
+from jaxnerf.core.occupancy.grid import clip_rays
+from jaxnerf.core.safe_math import norm
+from jaxnerf.core.types import Camera, Views
+from jaxnerf.evaluation import output_images
+from jaxnerf.evaluation.restore import TrainedRun
+
+MODES = ("colour", "depth", "opacity", "normals")
+MAX_SIDE = 4096  # px
+_CHUNK = 4096  # rays; more take longer to abandon, fewer use a CPU's core worse
+_FAST_SAMPLES, _FAST_STOP = 0.5, 0.1  # of frames while the camera moves: factor of the samples, early_stop_eps
+_FARTHEST = 1e10  # in t; at infinity, the length of a ray would be NaN
+_SEEN = 0.5  # opacity from which a pixel has a depth and a normal
+
+
+class FrameCamera(NamedTuple):
+    """A pinhole camera with square pixels and the principal point in the middle, of any size.
+
+    Attributes:
+        to_world: [3, 4] camera to the run's world, x right, y up, looking along -z.
+        fov: radians, vertical.
+        width, height: px.
+    """
+
+    to_world: np.ndarray
+    fov: float
+    width: int
+    height: int
+
+    @property
+    def focal(self) -> float:
+        """The focal length, px."""
+        return 0.5 * self.height / np.tan(0.5 * self.fov)
+
+    def resized(self, width: int, height: int) -> "FrameCamera":
+        """Returns the camera with another size and the same field of view."""
+        return self._replace(width=width, height=height)
+
+
+class SceneState(NamedTuple):
+    """What a frame shows: the parameters of one step.
+
+    Attributes:
+        step: of training.
+        params: of the model.
+        grid: OccupancyGrid; None where the model has none.
+        box: [2, 3] corners of the box that holds all matter, world units; in NDC where the rays are.
+    """
+
+    step: int
+    params: Any
+    grid: Any
+    box: np.ndarray
+
+
+class Frame(NamedTuple):
+    """A rendered frame.
+
+    Attributes:
+        camera: FrameCamera.
+        rgb: [H, W, 3] in [0, 1].
+        opacity: [H, W].
+        distance: [H, W] along the ray to what is seen, in the run's world units; infinite where nothing is.
+    """
+
+    camera: FrameCamera
+    rgb: Float[np.ndarray, "H W 3"]
+    opacity: Float[np.ndarray, "H W"]
+    distance: Float[np.ndarray, "H W"]
+
+
+class FrameRenderer:
+    """Renders frames of a run at two qualities: the run's own, and a faster one for cameras that move."""
+
+    def __init__(self, run: TrainedRun, views: Views, *, chunk: int = _CHUNK):
+        """Makes the renderer; nothing is compiled yet.
+
+        Args:
+            run: see `restore_with_grid`.
+            views: of the split "train", for NDC and, where space is contracted, for near and far.
+            chunk: rays rendered at once.
+        """
+        own = run.experiment.eval
+        fast = {
+            "sample_multiplier": own.sample_multiplier * _FAST_SAMPLES,
+            "early_stop_eps": max(own.early_stop_eps, _FAST_STOP),
+        }
+        models = {False: run.model_with({}), True: run.model_with(fast)}
+        self._baked, self._cull = models[False].grid_schedule is None, models[False].cull
+        self._chunk, self._ndc, self._offset = chunk, run.experiment.ndc, run.experiment.pixel_offset
+        self._middle = np.asarray(views.cameras.to_world)[:, :, 3].mean(axis=0)
+        self._bounds = float(np.min(views.near)), float(np.max(views.far))
+        height, width = (int(side) for side in views.size[0])
+        first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], views.cameras)
+        self._lens = Camera(to_world=first.to_world, focal=first.focal, center=first.center, height=height, width=width)
+        self._may_hit = jax.jit(self._culled)
+        self._parts = {fast: jax.jit(functools.partial(self._planes, model.view)) for fast, model in models.items()}
+
+    @property
+    def num_compiled(self) -> int:
+        """How many programs have been compiled: at most three."""
+        return sum(function._cache_size() for function in (self._may_hit, *self._parts.values()))
+
+    def scene_state(self, step: int, variables: tuple) -> SceneState:
+        """Returns the SceneState of variables (params, grid) of a step."""
+        # Where an array lies is part of what is compiled.
+        params, grid = jax.device_put(variables, jax.local_devices()[0])
+        box = np.float32([[-np.inf] * 3, [np.inf] * 3])
+        if grid is not None and not grid.contracted:
+            tight = crop_grid(grid) if self._baked else grid
+            box = np.stack([np.asarray(tight.lower), np.asarray(tight.upper)])
+        return SceneState(step, params, grid, box)
+
+    def compile(self, state: SceneState) -> None:
+        """Compiles both qualities, so that the first frame does not wait for it."""
+        camera = FrameCamera(np.eye(3, 4, dtype=np.float32), 1.0, 1, 1)
+        for fast in (True, False):
+            arrays, ids = self._arrays(camera, state, None), self._padded(np.zeros(1, np.int32))
+            jax.block_until_ready(self._parts[fast](state.params, state.grid, arrays, ids))
+            jax.block_until_ready(self._may_hit(state.grid, arrays, ids))
+
+    def render(
+        self,
+        state: SceneState,
+        camera: FrameCamera,
+        *,
+        fast: bool = False,
+        crop: np.ndarray | None = None,
+        abandoned: Callable[[], bool] = lambda: False,
+    ) -> Frame | None:
+        """Renders a frame.
+
+        Rays begin at the camera and end where the box of the scene does, whatever near and far the training views
+        have; where space is contracted, they end as far away as those views may see.
+
+        Args:
+            state: what to render.
+            camera: FrameCamera.
+            fast: whether to render with fewer samples.
+            crop: [2, 3] corners in the run's world; what is outside is not shown.
+            abandoned: called between chunks; where it returns True, the frame is not finished.
+
+        Returns:
+            The Frame; None if it was abandoned.
+
+        Raises:
+            ValueError: if the camera is larger than MAX_SIDE or has no pixel.
+        """
+        if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
+            raise ValueError(f"a frame has {camera.width} x {camera.height} px, expected sides of 1 to {MAX_SIDE}")
+        count = camera.width * camera.height
+        arrays = self._arrays(camera, state, crop)
+        hits, pixels = [], np.arange(count, dtype=np.int32)
+        for start in range(0, count, self._chunk):
+            if abandoned():
+                return None
+            ids = pixels[start : start + self._chunk]
+            hits.append(np.asarray(self._may_hit(state.grid, arrays, self._padded(ids)))[: len(ids)])
+        hit, planes = np.flatnonzero(np.concatenate(hits)).astype(np.int32), None
+        for start in range(0, max(len(hit), 1), self._chunk):
+            if abandoned():
+                return None
+            ids = hit[start : start + self._chunk]
+            part = np.asarray(self._parts[fast](state.params, state.grid, arrays, self._padded(ids)))
+            if planes is None:  # the row after the chunk's is that of a ray that hits nothing
+                planes = np.repeat(part[-1:], count, axis=0)
+            planes[ids] = part[: len(ids)]
+        planes = planes.reshape(camera.height, camera.width, 5)
+        return Frame(camera, planes[..., :3], planes[..., 3], planes[..., 4])
+
+    def _padded(self, ids):
+        """Returns ids [chunk + 1]; -1, a ray of length 0, where there are none."""
+        return np.pad(ids, (0, self._chunk + 1 - len(ids)), constant_values=-1)
+
+    def _arrays(self, camera, state, crop):
+        """Returns what a frame's rays depend on, as arrays."""
+        near, far = 0.0, _FARTHEST
+        if not (self._ndc or np.isfinite(state.box).all()):
+            near, far = self._bounds
+            far += float(np.linalg.norm(camera.to_world[:, 3] - self._middle))
+        everything = np.float32([[-np.inf] * 3, [np.inf] * 3])
+        return {
+            "to_world": np.asarray(camera.to_world, np.float32),
+            "focal": np.float32([camera.focal, camera.focal]),
+            "center": np.float32([camera.width / 2, camera.height / 2]),
+            "width": np.int32(camera.width),
+            "bounds": np.float32([near, far]),
+            "crop": everything if crop is None else np.float32(crop),
+            "box": state.box,
+        }
+
+    def _rays(self, arrays, ids):
+        """Returns the rays [N] of pixels in the world, and those that the model renders; of length 0 for ids < 0."""
+        pixels = jnp.stack([ids % arrays["width"], ids // arrays["width"]], axis=-1) + self._offset
+        camera = Camera(**{name: arrays[name] for name in ("to_world", "focal", "center")})
+        near, far = arrays["bounds"]
+        world = rays_from_pixels(camera, pixels, near=near, far=far)
+        world = rays = clip_rays(world, *arrays["crop"])
+        if self._ndc:
+            rays = ndc_rays(world, self._lens)
+            near, far = (_t_in_ndc(world, t) for t in (world.near, world.far))
+            near = jnp.clip(near, rays.near, rays.far)
+            rays = dataclasses.replace(rays, near=near, far=jnp.clip(far, near, rays.far))
+        rays = clip_rays(rays, *arrays["box"])
+        return world, dataclasses.replace(rays, far=jnp.where(ids < 0, rays.near, rays.far))
+
+    def _culled(self, grid, arrays, ids):
+        """Returns [N] bool, which pixels to render."""
+        rays = self._rays(arrays, ids)[1]
+        return (rays.far > rays.near) if self._cull is None else self._cull(grid, rays)[0]
+
+    def _planes(self, view, params, grid, arrays, ids):
+        """Returns [N, 5], the colour, the opacity and the distance of pixels."""
+        world, rays = self._rays(arrays, ids)
+        image = view(params, grid, rays)
+        seen = image.opacity >= _SEEN
+        beyond = jnp.where(image.opacity < 1, (1 - image.opacity) * rays.far, 0)  # of the light that is left
+        t = (image.depth - beyond) / jnp.where(seen, image.opacity, 1)
+        t = ndc_to_t(t, world) if self._ndc else t
+        distance = jnp.where(seen, t * norm(world.directions), jnp.inf)
+        return jnp.concatenate([image.rgb, image.opacity[:, None], distance[:, None]], axis=-1)
+
+
+def _t_in_ndc(rays, t):
+    """Returns t of the NDC rays at the points t of world rays, the inverse of `ndc_to_t`; the near plane is at 1."""
+    return 1 - 1 / jnp.maximum(-rays.origins[..., 2] - t * rays.directions[..., 2], 1)
+
+
+def frame_image(frame: Frame, mode: str) -> UInt8[np.ndarray, "H W 3"]:
+    """Returns an image of a frame: its colour, its depth (near is white), its opacity, or its normals.
+
+    Normals are those of the surface through the points that neighbouring pixels see, in the world's axes: red, green
+    and blue are x, y and z from -1 to 1. What is not opaque is black.
+
+    Raises:
+        ValueError: on another mode.
+    """
+    if mode == "colour":
+        return output_images.to_8_bits(frame.rgb)
+    if mode == "normals":
+        return output_images.to_8_bits(np.where(np.isfinite(frame.distance)[..., None], (_normals(frame) + 1) / 2, 0))
+    if mode == "depth":
+        plane = output_images.depth_image(frame.distance, *output_images.depth_range([frame.distance]))
+    elif mode == "opacity":
+        plane = output_images.to_8_bits(frame.opacity)
+    else:
+        raise ValueError(f"mode is {mode!r}, expected one of {', '.join(MODES)}")
+    return np.repeat(plane[..., None], 3, axis=-1)
+
+
+def _normals(frame):
+    """Returns unit normals [H, W, 3] in the world that face the camera; 0 where they are not defined."""
+    camera, (height, width) = frame.camera, frame.distance.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    local = np.stack([x, -y, np.full_like(x, -camera.focal)], axis=-1)
+    away = local / np.linalg.norm(local, axis=-1, keepdims=True) @ np.asarray(camera.to_world)[:, :3].T
+    points = np.where(np.isfinite(frame.distance)[..., None], frame.distance[..., None] * away, 0)
+    if min(height, width) < 2:
+        return np.zeros_like(points)
+    normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = normals / np.where(length > 0, length, 1)
+    return normals * -np.sign((normals * away).sum(axis=-1, keepdims=True))
