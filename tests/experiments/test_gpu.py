@@ -1,0 +1,64 @@
+"""The studies of accelerators: what the runbook does without one, its page, the counts of a step, and the packing."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from studies import study
+
+pack, roofline, runbook = (study(f"gpu/{name}") for name in ("pack", "roofline", "run"))
+
+
+def test_counts_of_products_rows_and_loops():
+    def function(table, rows, kernel):
+        def body(total, _):
+            return total + table[rows] @ kernel, None
+
+        total = jax.lax.scan(body, jnp.zeros((8, 5)), length=3)[0]
+        return table.at[rows].add(1.0), jax.lax.cond(total.sum() > 0, lambda: total @ kernel.T, lambda: total[:, :4])
+
+    arguments = jnp.ones((100, 4)), jnp.zeros(8, int), jnp.ones((4, 5))
+    counts = roofline.count(jax.make_jaxpr(function)(*arguments).jaxpr)
+    assert counts.flops == {"float32": 2 * 8 * 4 * 5 * (3 + 1)}
+    assert (counts.gathered, counts.scattered, counts.conditionals) == (3 * 8, 8, 1)
+    # A row has 16 bytes, and a sector 32. What is gathered is written once, and an addition reads and writes.
+    assert counts.row_bytes == 3 * (8 * 32 + 8 * 16) + 2 * 8 * 32
+
+
+def test_page_has_a_section_for_each_finished_piece():
+    origin = {"seconds": 3.2, "commit": "abc", "command": "run.py"}
+    kept = {
+        "about": {"device": "a device", "jax": "1.0"},
+        "pieces": {"frame": {**origin, "workdir": "lego-30", "rows": [{"chunk": 256, "ms per frame": 12.345}]}},
+    }
+    text = "\n".join(runbook.page(kept))
+    assert "| 256 | 12.35 |" in text or "| 256 | 12.34 |" in text
+    assert text.count("## ") == 1 and "commit abc, 3 s" in text
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A scene of 10 training images of 100 bytes and a test image."""
+    folder = tmp_path / "scenes" / "toy"
+    (folder / "train").mkdir(parents=True)
+    frames = [{"file_path": f"./train/r_{index}"} for index in range(10)]
+    for index in range(10):
+        (folder / "train" / f"r_{index}.png").write_bytes(bytes(100))
+    (folder / "test.png").write_bytes(bytes(50))
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    return folder
+
+
+def test_a_scene_that_does_not_fit_keeps_evenly_spread_views(scene, tmp_path, capsys):
+    rest = 50 + (scene / "transforms_train.json").stat().st_size
+    pack.pack(scene, tmp_path / "whole", rest + 1000)
+    assert len(list((tmp_path / "whole").rglob("*"))) == 13
+    pack.pack(scene, tmp_path / "part", rest + 450)
+    frames = json.loads((tmp_path / "part" / "transforms_train.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"./train/r_{index}" for index in (0, 3, 6, 9)]
+    assert sorted(path.stem for path in (tmp_path / "part" / "train").iterdir()) == ["r_0", "r_3", "r_6", "r_9"]
+    assert capsys.readouterr().out.splitlines()[-1].endswith("4 of 10 training views")
+    with pytest.raises(ValueError, match="toy: has .* MiB, and .* name fewer --scenes"):
+        pack.pack(scene, tmp_path / "none", 60)
