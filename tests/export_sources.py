@@ -56,7 +56,7 @@ def source_of(scene=ball, *, say=lambda line: None, **settings):
     render = functools.partial(render_rays, None, num_samples=96, median_depth=True)
     compiled = jax.jit(lambda rays: render(scene, rays))
     experiment = SimpleNamespace(
-        view_rays=ray_batches.view_rays,
+        view_rays=functools.partial(ray_batches.view_rays, ndc=False),
         world_depth=ray_batches.world_depth,
         pixel_offset=0.5,
         model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid)),

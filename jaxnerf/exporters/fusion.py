@@ -57,7 +57,8 @@ def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution
     the ray: that is exact for a plane, however obliquely it is seen. A view counts by the cosine between its ray and
     the normal and by the light that the surface absorbs within the truncation: views along a surface and those
     into glass or fog are least accurate. Vertices well in front of a surface, and those before empty space, count as
-    outside; those behind a surface are not seen. Pixels at the edges of surfaces are not used.
+    outside; those behind a surface are not seen. Pixels at the edges of surfaces are not used. What no
+    image at the pose of a training view sees, at whatever angle, is unknown: the field is arbitrary there.
 
     Args:
         images: all of one size.
@@ -73,18 +74,19 @@ def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution
     index = _vertices_near([points[cosine > 0] for points, _, cosine in surfaces], box[0], voxel, shape)
     x = np.float32(box[0] + voxel * np.stack(np.unravel_index(index, shape), axis=-1))
     x = jnp.asarray(np.resize(x, (-(-max(len(x), 1) // _CHUNK), _CHUNK, 3)))  # padded with copies of the first
-    total = jnp.zeros((*x.shape[:2], 6), jnp.float32)
+    total = jnp.zeros((*x.shape[:2], 7), jnp.float32)
     for image, (points, normal, cosine) in zip(images, surfaces, strict=True):
         absorbed = -np.expm1(-np.maximum(image.extinction, 0) * truncation)
         weight = np.where(np.isinf(image.depth), _EMPTY_WEIGHT, cosine * absorbed)
-        planes = [np.stack([image.depth, weight], axis=-1), points, normal, image.rgb]
+        trained = np.full_like(image.depth, image.name is not None) * (image.depth > 0)
+        planes = [np.stack([image.depth, weight, trained], axis=-1), points, normal, image.rgb]
         planes = np.concatenate(planes, axis=-1).astype(np.float32)
         total = _integrate(total, image.camera, planes, x, np.float32(truncation))
-    total = np.asarray(total).reshape(-1, 6)[: len(index)]
-    weight, distance, rgb_weight = total[:, 0], total[:, 1], total[:, 2:3]
-    seen = weight > _MIN_WEIGHT
+    total = np.asarray(total).reshape(-1, 7)[: len(index)]
+    weight, distance, views, rgb_weight = total[:, 0], total[:, 1], total[:, 2], total[:, 3:4]
+    seen = (weight > _MIN_WEIGHT) & (views > 0)
     distance = np.where(seen, distance / np.where(seen, weight, 1), np.nan)
-    return Fused(box[0], voxel, shape, index, distance, total[:, 3:] / np.maximum(rgb_weight, 1e-6))
+    return Fused(box[0], voxel, shape, index, distance, total[:, 4:] / np.maximum(rgb_weight, 1e-6))
 
 
 def level_set(fused: Fused) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -131,7 +133,8 @@ def _vertices_near(parts, lower, voxel, shape):
 def _integrate(total, camera, planes, x, truncation):
     """Returns total [C, N, 6] with what one view sees of vertices x [C, N, 3].
 
-    The sums are those of weights, of weights times distances, of the weights of colours, and of those times colours.
+    The sums are those of weights, of weights times distances, of training views, of the weights of colours, and of
+    those times colours.
     """
     height, width = planes.shape[:2]
     rows = planes.reshape(height * width, -1)
@@ -142,13 +145,15 @@ def _integrate(total, camera, planes, x, truncation):
         column, line = (jnp.floor(jnp.clip(pixels[:, axis], -1, 1e6)).astype(jnp.int32) for axis in range(2))
         visible = (depth > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
         row = rows[jnp.where(visible, line * width + column, 0)]
-        surface, weight, points, normal, rgb = row[:, 0], row[:, 1], row[:, 2:5], row[:, 5:8], row[:, 8:11]
+        surface, weight, trained = row[:, 0], row[:, 1], row[:, 2]
+        points, normal, rgb = row[:, 3:6], row[:, 6:9], row[:, 9:12]
         ahead = (surface - depth) / truncation
         distance = jnp.clip(((x - points) * normal).sum(axis=-1) / truncation, -1, 1)
         distance = jnp.where(ahead > _FREE, 1, distance)
-        weight = jnp.where(visible & (ahead > -1), weight, 0)
+        visible &= ahead > -1
+        weight, trained = jnp.where(visible, weight, 0), jnp.where(visible, trained, 0)
         colored = jnp.where(ahead > _FREE, 0, weight * (1 - jnp.abs(distance)))[:, None]
-        weight = weight[:, None]
-        return total + jnp.concatenate([weight, weight * distance[:, None], colored, colored * rgb], axis=-1)
+        sums = jnp.stack([weight, weight * distance, trained], axis=-1)
+        return total + jnp.concatenate([sums, colored, colored * rgb], axis=-1)
 
     return jax.lax.map(add, (total, x))

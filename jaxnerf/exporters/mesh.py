@@ -24,7 +24,8 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
         ValueError: if no surface is in the box, or the field does not fit into memory.
     """
     settings = source.settings
-    images = render_depth_images(source, settings.size or round(_PIXELS_PER_VOXEL * settings.resolution))
+    size = settings.size or round(_PIXELS_PER_VOXEL * settings.resolution)
+    images = render_depth_images(source, size, all_around=True)
     box = export_box(source, images)
     _, shape = grid_shape(box, settings.resolution)
     check_memory(_BYTES_PER_VOXEL * float(np.prod(shape)), memory.available(), "give a smaller --resolution or --box")

@@ -16,7 +16,7 @@ from jaxnerf.evaluation.restore import refined_views
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.gaussians import Gaussians, harmonics, rasterize, write_gaussians
 from jaxnerf.exporters.points import surface_points, thinned
-from jaxnerf.exporters.surfaces import export_box, in_file, render_depth_images
+from jaxnerf.exporters.surfaces import export_box, in_file, render_depth_images, sphere_directions
 
 _PIXELS_PER_VOXEL = 1.25
 _NUM_DIRECTIONS = 32  # from which the colour of a point is evaluated
@@ -78,10 +78,7 @@ def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) ->
     The fit is linear least squares over directions, weighted by the cosine at which they meet the normals.
     """
     rotation = in_file(np.eye(3, 4)[None], source.views.to_file)[0, :, :3]
-    steps = np.arange(_NUM_DIRECTIONS) + 0.5
-    height, angle = 1 - 2 * steps / _NUM_DIRECTIONS, np.pi * (1 + np.sqrt(5)) * steps
-    around = np.sqrt(1 - height**2)
-    directions = np.float32(np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1))
+    directions = np.float32(sphere_directions(_NUM_DIRECTIONS))
     basis, in_world = harmonics(directions), jnp.float32(directions @ rotation)
     ridge = _RIDGE * jnp.diag(jnp.float32([1e-3, *[1.0] * 8]))
     params, grid = source.variables

@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float, Num, UInt8
 
 from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.core.poses import look_at
 from jaxnerf.core.rendering import points_on_rays
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera
+from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.evaluation.output_images import to_8_bits
 from jaxnerf.evaluation.paths.camera_path import CameraPath, path_pixels, posed_views, resize
 from jaxnerf.exporters.base import ExportSource
@@ -29,7 +31,7 @@ class DepthImage(NamedTuple):
     """A pinhole's view of the surfaces.
 
     Attributes:
-        name: of the training view whose pose it has.
+        name: of the training view whose pose it has; None at another pose.
         camera: the pinhole.
         depth: [H, W] float32, the median depth along the camera's axis; inf where the pixel shows empty space, 0
             where it shows neither that nor a surface.
@@ -40,7 +42,7 @@ class DepthImage(NamedTuple):
             coordinates, such as NDC.
     """
 
-    name: str
+    name: str | None
     camera: Camera
     depth: Float[np.ndarray, "H W"]
     rgb: UInt8[np.ndarray, "H W 3"]
@@ -80,7 +82,7 @@ class DepthImage(NamedTuple):
         return np.stack([x, -y, -np.ones_like(x)], axis=-1).astype(np.float32)
 
 
-def render_depth_images(source: ExportSource, size: int | None) -> list[DepthImage]:
+def render_depth_images(source: ExportSource, size: int | None, *, all_around: bool = False) -> list[DepthImage]:
     """Renders the DepthImages of a run at the poses of its training views, or of as many as the settings allow.
 
     They have the pinhole of the first view, without a lens.
@@ -88,18 +90,21 @@ def render_depth_images(source: ExportSource, size: int | None) -> list[DepthIma
     Args:
         source: the run.
         size: px, the longer side; None: that of the first view.
+        all_around: whether half as many poses all around the scene follow, unless its space is unbounded. They show
+            at a steep angle what the training views see at a grazing one.
 
     Raises:
         ValueError: if the run's sampler renders no median depth, or no surface is found.
     """
     run, views = source.run, source.views
-    path = _poses_of(source, size)
+    path = _poses_of(source, size, all_around)
     posed, images, progress = posed_views(views, path), [], Progress(len(path.poses))
     names = views.names or tuple(f"{index:04d}" for index in range(len(views.size)))
-    chosen = _chosen(len(views.size), source.settings.num_views)
+    names = [names[index] for index in _chosen(len(views.size), source.settings.num_views)]
+    names += [None] * (len(path.poses) - len(names))
     poses = in_file(path.poses, views.to_file)
     surface = _surface_function(source, posed)
-    for index, view in enumerate(chosen):
+    for index, name in enumerate(names):
         pixels = path_pixels(posed, path, index, offset=0.5)
         rays = run.experiment.view_rays(posed, index, pixels)
         seen = run.render_image(source.variables, rays, median_depth=True)
@@ -111,7 +116,7 @@ def render_depth_images(source: ExportSource, size: int | None) -> list[DepthIma
             height=path.height,
             width=path.width,
         )
-        image = DepthImage(names[view], camera, distance, to_8_bits(seen.rgb), extinction, x)
+        image = DepthImage(name, camera, distance, to_8_bits(seen.rgb), extinction, x)
         depth = distance / np.linalg.norm(image._local(), axis=-1)
         opacity = np.asarray(seen.opacity)
         there = (opacity > _MIN_OPACITY) & (np.asarray(seen.median_depth) < np.asarray(rays.far)) & np.isfinite(depth)
@@ -175,11 +180,15 @@ def _chosen(count, number):
     return np.arange(min(number, count)) * count // min(number, count)
 
 
-def _poses_of(source, size):
-    """Returns the CameraPath through the poses of the chosen training views."""
+def _poses_of(source, size, all_around):
+    """Returns the CameraPath through the poses of the chosen training views, and then through those all around."""
     views = source.views
     chosen = _chosen(len(views.size), source.settings.num_views)
     poses = np.asarray(views.cameras.to_world)[chosen]
+    # The rays of NDC are no world rays: they begin elsewhere.
+    bounded = not source.variables[1].contracted and not source.run.experiment.view_rays.keywords.get("ndc")
+    if all_around and bounded and not look_one_way(poses):
+        poses = np.concatenate([poses, _around(poses, max(len(poses) // 2, 1))])
     height, width = (int(side) for side in views.size[0])
     focal, center = (
         np.tile(np.float64(each)[:1], (len(poses), 1)) for each in (views.cameras.focal, views.cameras.center)
@@ -188,6 +197,22 @@ def _poses_of(source, size):
     if size is None:
         return path
     return resize(path, width=size) if width >= height else resize(path, height=size)
+
+
+def _around(poses, count):
+    """Returns poses [N, 3, 4] on a sphere around what cameras look at, as far away as they are."""
+    center, up = gaze_center(poses), up_of(np.float64(poses))
+    radius = np.median(np.linalg.norm(poses[:, :, 3] - center, axis=1))
+    eyes = np.float32(center + radius * sphere_directions(count))
+    return np.asarray(jax.vmap(look_at, in_axes=(0, None, None))(eyes, np.float32(center), np.float32(up)))
+
+
+def sphere_directions(count: int) -> np.ndarray:
+    """Returns unit vectors [N, 3] on a golden spiral over the sphere."""
+    steps = np.arange(count) + 0.5
+    height, angle = 1 - 2 * steps / count, np.pi * (1 + np.sqrt(5)) * steps
+    around = np.sqrt(1 - height**2)
+    return np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1)
 
 
 def _surface_function(source, posed):

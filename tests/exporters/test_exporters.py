@@ -27,7 +27,7 @@ def images():
     with pytest.MonkeyPatch.context() as patch:
         for name in ("mesh", "points", "splats", "depth"):
             module = __import__(f"jaxnerf.exporters.{name}", fromlist=["render_depth_images"])
-            patch.setattr(module, "render_depth_images", lambda source, size: rendered)
+            patch.setattr(module, "render_depth_images", lambda source, size, all_around=False: rendered)
         yield rendered
 
 
