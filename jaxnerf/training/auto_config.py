@@ -18,6 +18,7 @@ from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.runtime import devices
 from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.build import build_model
+from jaxnerf.training.config_ranges import check_ranges
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, where space is not contracted
@@ -61,6 +62,7 @@ def resolve(config: ConfigDict, views: Views | None = None) -> Resolved:
     Raises:
         ValueError: names the field or file, what was found and what is expected.
     """
+    check_ranges(config)
     config = copy.deepcopy(config)
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
@@ -77,7 +79,11 @@ def resolve_for_device(config: ConfigDict) -> tuple[ConfigDict, list[str]]:
 
     Returns:
         A copy of the config, and one line per inferred value.
+
+    Raises:
+        ValueError: on a value that no run can have, see `check_ranges`; config.json may have been edited.
     """
+    check_ranges(config)
     config, lines = copy.deepcopy(config), []
     infer = _inferring(lines)
     cpu = jax.default_backend() == "cpu"
