@@ -18,6 +18,7 @@ from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.runtime import devices, processes
 from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.build import build_model
+from jaxnerf.training.config_ranges import check_ranges
 from jaxnerf.training.dead_networks import CHECK_EVERY
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
@@ -70,6 +71,7 @@ def resolve(config: ConfigDict, views: Views | None = None, *, platform: str | N
     Raises:
         ValueError: names the field or file, what was found and what is expected.
     """
+    check_ranges(config)
     config = copy.deepcopy(config)
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
@@ -91,7 +93,11 @@ def resolve_for_device(config: ConfigDict, platform: str | None = None) -> tuple
 
     Returns:
         A copy of the config, and one line per inferred value.
+
+    Raises:
+        ValueError: on a value that no run can have, see `check_ranges`; config.json may have been edited.
     """
+    check_ranges(config)
     config, lines = copy.deepcopy(config), []
     infer = _inferring(lines)
     profile = devices.profile_of(platform or jax.default_backend())

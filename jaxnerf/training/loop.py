@@ -20,7 +20,6 @@ from jaxnerf.runtime import devices, memory, processes, signals
 from jaxnerf.training import build, metric_log, workdir
 from jaxnerf.training.auto_config import host_intervals, resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.config_ranges import check_ranges
 from jaxnerf.training.dead_networks import make_reinitializer
 from jaxnerf.training.state import TrainState, create_state
 from jaxnerf.training.step import make_train_step, repeat_step
@@ -52,7 +51,6 @@ def train(
             were not finite.
     """
     started = time.perf_counter()
-    check_ranges(config)
     config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves no trace
     on_device, device_lines = resolve_for_device(config)
     build.check_views(on_device, views)

@@ -3,12 +3,14 @@
 import math
 
 import pytest
+from ml_collections import ConfigDict
 
 from jaxnerf.configs import default
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training import config_ranges
-from runs import ROOT, smoke_config
+from jaxnerf.training.auto_config import resolve_for_device
+from runs import PACKED, ROOT, smoke_config
 
 
 @pytest.mark.parametrize(
@@ -20,6 +22,9 @@ from runs import ROOT, smoke_config
         ("data.factor", -2, "expected at least 1"),
         ("train.lr_init", 0.0, "expected more than 0"),
         ("train.beta2", 1.0, "expected at least 0 and below 1"),
+        ("fine.width", 0, "expected at least 1"),
+        ("fine.depth", 0, "expected from 1 to 64"),
+        ("coarse.depth", 1_000_000, "expected from 1 to 64"),
     ],
 )
 def test_a_number_outside_its_range_makes_no_workdir(tmp_path, field, value, expected):
@@ -28,6 +33,60 @@ def test_a_number_outside_its_range_makes_no_workdir(tmp_path, field, value, exp
     with pytest.raises(ValueError, match=rf"--config.{field} is {value}, {expected}; correct it"):
         train_and_evaluate(config, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "field, value, expected",
+    [
+        ("fine.width", 100_000_000, "needs .* GB .* are free; reduce it"),
+        ("fine.compute_dtype", "float33", "expected one of"),
+        ("fine.compute_dtype", "float64", "JAX_ENABLE_X64=1"),
+        ("coarse.density_activation", 3, "expected str"),
+        ("fine.num_freqs", 65, "expected from 0 to 64"),
+        ("fine.depth", "8", "expected int"),
+        ("fine.depth", 2.5, "expected int"),
+        ("fine.use_viewdirs", "yes", "expected bool"),
+        ("fine.surprise", 1, "is no field"),
+        ("sampling.rule", "simpson", "expected one of"),
+        ("sampling.stratified", None, "expected bool"),
+        ("train.batch_size", 0, "expected at least 1"),
+        ("train.batch_size", True, "expected int"),
+        ("train.lr_init", math.inf, "expected a finite number"),
+        ("train.lr_init", [1], "expected float"),
+        ("hash_grid.resolutions", (), "expected 1 to 64 whole numbers"),
+        ("hash_grid.resolutions", (16, "a"), "expected 1 to 64 whole numbers"),
+        ("hash_grid.view_depth", 1000, "expected from 0 to 64"),
+        ("occupancy.lower", (0.0, 1.0), "expected 3 finite numbers"),
+        ("occupancy.upper", (0.0, 1.0, math.nan), "expected 3 finite numbers"),
+        ("losses.mse", "much", "expected schedule"),
+        ("seed", "first", "expected int"),
+        ("train", 3, "expected a section"),
+        ("train", None, "is missing"),
+        ("eval.chunk", None, "is missing"),
+    ],
+)
+def test_an_edited_config_is_rejected_with_its_field(field, value, expected):
+    """config.json holds no types, and anyone may edit it. A value of None here: the field or section is removed."""
+    content = smoke_config().to_dict()
+    *section, name = field.split(".")
+    place = content[section[0]] if section else content
+    if value is None and expected == "is missing":
+        del place[name]
+    else:
+        place[name] = value
+    with pytest.raises(ValueError, match=rf"--config.{field} (is .*)?{expected}"):
+        resolve_for_device(ConfigDict(content, type_safe=False))
+
+
+@pytest.mark.parametrize(
+    "field, value",
+    [("hash_grid.table_size", 10**12), ("hash_grid.view_width", 10**7), ("occupancy.resolution", 10**6)],
+)
+def test_what_does_not_fit_into_memory_is_rejected(field, value):
+    config = smoke_config()
+    config.update_from_flattened_dict(PACKED | {"hash_grid.resolutions": (2**20,), field: value})
+    with pytest.raises(ValueError, match=rf"--config.{field} is {value}, which needs .* GB"):
+        config_ranges.check_ranges(config)
 
 
 def test_every_range_is_one_of_a_number():
