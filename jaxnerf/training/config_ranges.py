@@ -24,8 +24,8 @@ _RANGES = (
             "data.factor data.width data.size sampling.num_coarse hash_grid.features_per_level hash_grid.table_size "
             "hash_grid.width hash_grid.view_width occupancy.resolution occupancy.update_every "
             "occupancy.cells_per_update occupancy.update_chunk train.batch_size train.cpu_batch_size "
-            "train.microbatch_size train.steps_per_dispatch train.max_steps train.lr_steps train.log_every train.save_every "
-            "train.max_to_keep train.max_nonfinite eval.chunk eval.max_samples"
+            "train.microbatch_size train.steps_per_dispatch train.max_steps train.lr_steps train.log_every "
+            "train.save_every train.max_to_keep train.max_nonfinite eval.chunk eval.max_samples"
         ),
     ),
     (f"from 1 to {_MAX_LAYERS}", lambda value: 1 <= value <= _MAX_LAYERS, "coarse.depth fine.depth"),
@@ -61,7 +61,7 @@ _RANGES = (
 )
 
 _CHOICES = {
-    "coarse.compute_dtype fine.compute_dtype": ("float32", "bfloat16", "float16", "float64"),
+    "coarse.compute_dtype fine.compute_dtype hash_grid.compute_dtype": ("float32", "bfloat16", "float16", "float64"),
     "coarse.density_activation fine.density_activation": ("relu", "softplus"),
     "sampling.rule": ("segments", "gauss", "points"),
 }
@@ -71,7 +71,8 @@ _CHOICES = {
 _OPTIONAL = (
     "cameras occupancy.uniform_fraction occupancy.near_gradient_distance occupancy.min_views train.log_every "
     "train.save_every train.preview_every train.max_to_keep train.max_nonfinite train.max_reinits train.max_seconds "
-    "eval.at_end eval.summary_seconds"
+    "eval.at_end eval.summary_seconds occupancy.update_chunk hash_grid.compute_dtype train.steps_per_dispatch "
+    "train.cpu_batch_size"
 ).split()
 
 # Sections that become the arguments of one function, which takes no others.
