@@ -96,7 +96,7 @@ def check_ranges(config: ConfigDict) -> None:
                 raise ValueError(f"--config.{name} is {value}, expected {expected}; correct it")
     for names, choices in _CHOICES.items():
         for name in names.split():
-            if name in fields and fields[name] not in choices:
+            if name in fields and not is_auto(fields[name]) and fields[name] not in choices:
                 raise ValueError(f"--config.{name} is {fields[name]!r}, expected one of {choices}; correct it")
             if fields.get(name) == "float64" and not jax.config.jax_enable_x64:
                 raise ValueError(f"--config.{name} is 'float64', which requires the environment's JAX_ENABLE_X64=1")
