@@ -47,7 +47,7 @@ TESTS = {
     "sampling": "core/test_sampling core/test_stepped_edges",
     "cameras": "core/test_cameras core/test_lens_and_ndc",
     "volume_rendering": "core/test_volume_rendering core/test_quadrature core/occupancy/test_packed",
-    "rendering": "core/test_rendering core/occupancy/test_special_values",
+    "rendering": "core/test_rendering core/test_quadrature core/occupancy/test_special_values",
     "contraction": "core/test_contraction",
     "occupancy/grid": "core/occupancy/test_grid core/test_contraction core/occupancy/test_special_values",
     "occupancy/packed": "core/occupancy/test_packed core/occupancy/test_special_values",

@@ -1,21 +1,19 @@
 """The embedded dataset: views of `fields.still_life`, rendered on first use, so that nothing is downloaded."""
 
-import functools
 import inspect
 import math
 import os
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt16
 
-from jaxnerf.core import cameras, poses, rendering, sampling, types, volume_rendering
-from jaxnerf.core.poses import look_at
-from jaxnerf.core.types import Camera, Rays, SceneFn, Views
+from jaxnerf.core import cameras
+from jaxnerf.core.types import Camera, Rays, Views
+from jaxnerf.data import exact_rendering
 from jaxnerf.data.images import image_files
-from jaxnerf.fields import still_life
+from jaxnerf.fields import portable_math, still_life
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
@@ -24,7 +22,8 @@ _DISTANCE = 4.0  # of every camera from the origin, world units
 _DEPTH = 1.4  # of the scene in front of and behind the origin, along any axis: the plinth's edge is at 1.27
 _CYLINDER = {"radius": 1.14, "ends": (-0.97, 1.1)}  # around the z axis; contains all density; world units
 _WHITE = (1.0, 1.0, 1.0)
-FINISHES = {"usual": still_life.still_life, "matt": still_life.matt_still_life, "shiny": still_life.shiny_still_life}
+# SHA-256 of two test views of 24 px in each finish, in the order usual, matt, shiny.
+CHECKSUM = "5a3d1cf5978d6ef65d76665f47b7bbb7179ec1ff20037f2519f67f347a3e4266"
 
 
 def load_synthetic(
@@ -32,8 +31,8 @@ def load_synthetic(
 ) -> Views:
     """Returns views of the embedded still life, with alpha and a white background.
 
-    This package's renderer computes them from a closed-form field. Each pixel is a single ray through its
-    center, as the pixels of a trained model are, so a model's error contains no difference between filters.
+    They are computed from a closed-form field, with the same bits on every machine. Each pixel is a single ray through
+    its center, as the pixels of a trained model are, so a model's error contains no difference between filters.
 
     Args:
         split: "train" (60 views), "val" (8) or "test" (8). All 76 poses are different.
@@ -53,15 +52,15 @@ def load_synthetic(
         raise ValueError(f"split is {split!r}, expected one of {', '.join(_COUNT)}; choose one of these")
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= 4096:
         raise ValueError(f"size is {size!r}, expected a whole number of pixels from 1 to 4096; 100 is the default")
-    if finish not in FINISHES:
-        raise ValueError(f"finish is {finish!r}, expected one of {sorted(FINISHES)}; correct data.finish")
+    if finish not in still_life.FINISHES:
+        raise ValueError(f"finish is {finish!r}, expected one of {sorted(still_life.FINISHES)}; correct data.finish")
     count, size = _COUNT[split], int(size)
     stack = _cameras(split, size)
     form = (count * size * size, 4), np.uint16
     kept = load_or_make(
         cache,
         f"still_life_{finish}_{split}_{size}_{_fingerprint()}",
-        lambda: {"pixels": render_views(stack, FINISHES[finish])},
+        lambda: {"pixels": render_views(stack, finish)},
         is_valid=lambda arrays: [(each.shape, each.dtype) for each in arrays.values()] == [form],
     )
     return Views(
@@ -77,13 +76,13 @@ def load_synthetic(
 
 
 def render_views(
-    stack: Camera, scene: SceneFn = still_life.still_life, *, num_segments: int = 384, chunk: int = 1024
+    stack: Camera, finish: str = "usual", *, num_segments: int = 384, chunk: int = 1024
 ) -> UInt16[np.ndarray, "P 4"]:
     """Renders the pixels of a stack of V cameras: P = V * H * W, with straight alpha.
 
     Args:
         stack: [V], with one height and width.
-        scene: to render.
+        finish: see `load_synthetic`.
         num_segments: even, of the midpoint rule on the longest ray segment inside the scene's cylinder. Rays
             with at most half that length have half as many, which saves a quarter of the work.
         chunk: number of rays at once; it has no effect on the pixels.
@@ -93,13 +92,10 @@ def render_views(
     rgba = np.zeros((length.size, 4))
     longest = max(length.max(), 0.0)
     for divisor, chosen in ((2, (length > 0) & (length <= longest / 2)), (1, length > longest / 2)):
-        indices, parts = np.flatnonzero(chosen), []
-        for start in range(0, indices.size, chunk):
-            index = indices[np.minimum(np.arange(start, start + chunk), indices.size - 1)]  # a single compiled shape
-            part = jax.tree.map(lambda leaf, index=index: leaf[index], rays)
-            parts.append(_render(part, scene, num_segments // divisor))  # asynchronous: the device stays busy
-        if parts:
-            rgba[indices] = np.concatenate(parts)[: indices.size]
+        part = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], rays)
+        rgba[chosen, :3], rgba[chosen, 3] = exact_rendering.render_rays(
+            part, finish, num_segments=num_segments // divisor, chunk=chunk
+        )
     return image_files.to_straight(rgba[:, :3], rgba[:, 3], background=_WHITE)
 
 
@@ -110,42 +106,52 @@ def scene_rays(stack: Camera) -> Rays:
         stack: [V], with one height and width.
 
     Returns:
-        Rays [V * H * W] of numpy arrays. near >= far if a ray misses the cylinder, or if the lens has no ray
-        for the pixel.
+        Rays [V * H * W] of numpy arrays, float64. near >= far if a ray misses the cylinder, or if the lens has no ray
+        for the pixel. The bits of a pinhole's rays are the same on every machine.
     """
-    rays = _all_rays(stack)
-    origins, directions, viewdirs = (
-        np.asarray(leaf).reshape(-1, 3) for leaf in (rays.origins, rays.directions, rays.viewdirs)
-    )
+    origins, directions, exists = _pinhole_rays(stack) if stack.distortion is None else _lens_rays(stack)
     # The intersections with the lateral surface are the roots of a quadratic in t.
-    start, slope = origins[:, :2], directions[:, :2]
-    square = np.maximum((slope**2).sum(axis=-1), 1e-12)  # a ray parallel to the axis has none
-    middle = -(start * slope).sum(axis=-1) / square
-    closest = ((start + middle[:, None] * slope) ** 2).sum(axis=-1)
-    half = np.sqrt(np.maximum(_CYLINDER["radius"] ** 2 - closest, 0) / square)
-    with np.errstate(divide="ignore"):  # a horizontal ray meets the ends at infinity
-        ends = np.sort((np.float32([_CYLINDER["ends"]]) - origins[:, 2:]) / directions[:, 2:], axis=-1)
-    near = np.maximum(middle - half, ends[:, 0])
-    through = np.asarray(rays.far).reshape(-1) > 0
+    (x, y, z), (a, b, c) = origins.T, directions.T
+    square = np.maximum(a * a + b * b, 1e-12)  # a ray parallel to the axis has none
+    middle = -(x * a + y * b) / square
+    aside, beside = x + middle * a, y + middle * b
+    half = np.sqrt(np.maximum(_CYLINDER["radius"] ** 2 - (aside * aside + beside * beside), 0) / square)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a horizontal ray meets the ends at infinity
+        ends = np.sort([(end - z) / c for end in _CYLINDER["ends"]], axis=0)
+    near = np.maximum(middle - half, ends[0])
     return Rays(
         origins=origins,
         directions=directions,
-        viewdirs=viewdirs,
+        viewdirs=directions / np.sqrt(a * a + b * b + c * c)[:, None],
         near=near,
-        far=np.where(through, np.minimum(middle + half, ends[:, 1]), near),
+        far=np.where(exists, np.minimum(middle + half, ends[1]), near),
     )
 
 
+def _pinhole_rays(stack):
+    """Returns origins and directions [P, 3] through all pixels, and whether such a ray exists [P]."""
+    count = stack.height * stack.width
+    row, column = np.divmod(np.arange(count), stack.width)
+    to_world, focal, center = (np.asarray(leaf, np.float64) for leaf in (stack.to_world, stack.focal, stack.center))
+    right = (column + 0.5 - center[:, :1]) / focal[:, :1]
+    up = -(row + 0.5 - center[:, 1:]) / focal[:, 1:]
+    axes = to_world[:, None, :, :]
+    directions = right[..., None] * axes[..., 0] + up[..., None] * axes[..., 1] - axes[..., 2]
+    origins = np.broadcast_to(to_world[:, None, :, 3], directions.shape)
+    return origins.reshape(-1, 3), directions.reshape(-1, 3), np.ones(len(to_world) * count, bool)
+
+
+def _lens_rays(stack):
+    """As _pinhole_rays, in float32: only JAX inverts a lens."""
+    rays = jax.tree.map(np.asarray, _undistorted_rays(stack))
+    origins, directions = (leaf.reshape(-1, 3).astype(np.float64) for leaf in (rays.origins, rays.directions))
+    return origins, directions, rays.far.reshape(-1) > 0
+
+
 @jax.jit  # otherwise each operation of a lens is compiled separately
-def _all_rays(stack):
+def _undistorted_rays(stack):
     grid = cameras.pixel_grid(stack.height, stack.width).reshape(-1, 2)
     return jax.vmap(lambda camera: cameras.rays_from_pixels(camera, grid, near=0.0, far=1.0))(stack)
-
-
-@functools.partial(jax.jit, static_argnums=(1, 2))
-def _render(rays, scene, num_segments):
-    result = rendering.render_rays(None, scene, rays, num_samples=num_segments)
-    return jnp.concatenate([result.rgb, result.opacity[:, None]], axis=-1)
 
 
 def _cameras(split, size):
@@ -156,10 +162,12 @@ def _cameras(split, size):
     golden = math.pi * (3 - math.sqrt(5))
     azimuth = golden * steps + list(_COUNT).index(split)  # one radian between splits, so that all poses differ
     around = np.sqrt(1 - height**2)
-    eyes = _DISTANCE * np.stack([around * np.cos(azimuth), around * np.sin(azimuth), height], axis=-1)
-    to_world = jax.vmap(lambda eye: look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))(eyes)
+    # In numpy, whose bits no flag of XLA changes.
+    back = np.stack([around * np.cos(azimuth), around * np.sin(azimuth), height], axis=-1)
+    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(count)], axis=-1)
+    to_world = np.stack([right, np.cross(back, right), back, _DISTANCE * back], axis=-1)
     return Camera(
-        to_world=np.asarray(to_world),
+        to_world=to_world.astype(np.float32),
         focal=np.full((count, 2), 1.36 * size, np.float32),  # the whole plinth is visible
         center=np.full((count, 2), size / 2, np.float32),
         height=size,
@@ -170,5 +178,5 @@ def _cameras(split, size):
 def _fingerprint():
     """Returns a hash of the source code that the pixels depend on."""
     own = sys.modules[__name__]
-    modules = (still_life, cameras, volume_rendering, poses, rendering, sampling, types, image_files, own)
+    modules = (still_life, portable_math, exact_rendering, image_files, own)
     return fingerprint(*(inspect.getsource(module) for module in modules))

@@ -6,21 +6,53 @@ no colour does, in shiny_still_life those of the pillar, the ring and the lamp's
 
 A body is a signed distance d (negative inside), a peak density and a colour. Its density is
 peak * sigmoid(-d / width), thin enough for a crisp outline and smooth enough for a quadrature to converge.
-All arithmetic is on the components of x, [..., S] each, where no small constant has to be broadcast.
+All arithmetic is on the components of x, [..., S] each, where no small constant has to be broadcast. The bodies take
+arrays of JAX or of numpy; those of numpy, in float64, give the same bits on every machine.
 """
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.types import check_shapes
+from jaxnerf.fields import portable_math
 
 _POLISH, _SHEEN = 24, 6  # exponents of highlights: small and wide ones
+_OPAQUE = 10.0  # 1 / world unit; bodies of a higher density hide what is behind them
+WIDTH = 0.015  # world units, over which a body's density falls at its outline
+FINISHES = {"usual": ("ball",), "matt": (), "shiny": ("ball", "pillar", "ring", "lamp core")}  # what has highlights
 
 
 Positions = Float[ArrayLike, "*batch samples 3"]
 Directions = Float[ArrayLike, "*batch #samples 3"]
 Output = tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]
+
+
+class Body(NamedTuple):
+    """A body of the still life.
+
+    Attributes:
+        name: of the body.
+        peak: density inside, 1 / world unit.
+        lower, upper: [3] corners of a box that contains it.
+        distance: (x, y, z) -> signed distance [...] from its outline, or a lower bound outside.
+        colour: (x, y, z, direction) -> three channels [...]; direction is None without a highlight.
+    """
+
+    name: str
+    peak: float
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    distance: Callable[..., Array]
+    colour: Callable[..., tuple[Array, Array, Array]]
+
+    def density(self, distance: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
+        """Returns the density at signed distances [...] from the outline."""
+        return self.peak * _sigmoid(-distance / WIDTH)
 
 
 def still_life(x: Positions, viewdirs: Directions) -> Output:
@@ -37,25 +69,25 @@ def still_life(x: Positions, viewdirs: Directions) -> Output:
     Raises:
         ValueError: on other shapes.
     """
-    return _still_life(x, viewdirs, ball=True)
+    return _still_life(x, viewdirs, "usual")
 
 
 def matt_still_life(x: Positions, viewdirs: Directions) -> Output:
     """Returns the density and the colour of the still life with a matt ball: no colour depends on viewdirs."""
-    return _still_life(x, viewdirs)
+    return _still_life(x, viewdirs, "matt")
 
 
 def shiny_still_life(x: Positions, viewdirs: Directions) -> Output:
     """Returns the density and the colour of the still life with highlights on all round opaque bodies."""
-    return _still_life(x, viewdirs, ball=True, others=True)
+    return _still_life(x, viewdirs, "shiny")
 
 
 def opaque_distance(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
     """Returns the signed distance [...] of x [..., 3] from the nearest opaque body, negative inside one.
 
-    It is exact outside the bodies; their density is half its peak where it is 0.
+    Outside the plinth it may be less than the distance; the density of a body is half its peak where it is 0.
     """
-    return _nearest(x, (_plinth, _pillar, _ring, _lamp_core, _ball))
+    return _nearest(x, [body for body in BODIES if body.peak >= _OPAQUE])
 
 
 def glass_distance(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
@@ -63,36 +95,25 @@ def glass_distance(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
 
     That from the brick is approximate, and 0 where it should be.
     """
-    return _nearest(x, (_brick, _lamp_glass))
+    return _nearest(x, [body for body in BODIES if body.peak < _OPAQUE])
 
 
 def _nearest(x, bodies):
     x = jnp.asarray(x)
     place = x[..., 0], x[..., 1], x[..., 2]
-    distances = [body(*place, *(None,) * (body in (_pillar, _ring, _lamp_core, _ball)))[0] for body in bodies]
-    return jnp.min(jnp.stack(distances), axis=0)
+    return jnp.min(jnp.stack([body.distance(*place) for body in bodies]), axis=0)
 
 
-def _still_life(x, viewdirs, *, ball=False, others=False):
-    """Returns the density and the colour; ball, others: whether these bodies have highlights."""
+def _still_life(x, viewdirs, finish):
     pattern = "... 1 3" if jnp.shape(viewdirs)[-2:-1] == (1,) else "... S 3"
     check_shapes("still_life", x=(x, "... S 3"), viewdirs=(viewdirs, pattern))
+    x, viewdirs = jnp.asarray(x), jnp.asarray(viewdirs)
     place = x[..., 0], x[..., 1], x[..., 2]
     direction = viewdirs[..., 0], viewdirs[..., 1], viewdirs[..., 2]
-    on_others, on_ball = direction if others else None, direction if ball else None
-    bodies = (
-        _plinth(*place),
-        _pillar(*place, on_others),
-        _ring(*place, on_others),
-        _brick(*place),
-        _lamp_core(*place, on_others),
-        _lamp_glass(*place),
-        _ball(*place, on_ball),
-    )
-    width = 0.015
     density, total_part, rgb = 0.0, 0.0, (0.0, 0.0, 0.0)
-    for distance, peak, colour in bodies:
-        own = peak * jax.nn.sigmoid(-distance / width)
+    for body in BODIES:
+        own = body.density(body.distance(*place))
+        colour = body.colour(*place, direction if body.name in FINISHES[finish] else None)
         # Far from all bodies the densities are 0 in float32. The tiny part keeps the colour from being 0 / 0,
         # and its square, which the gradient divides by, from being 0.
         part = own + 1e-12
@@ -103,59 +124,110 @@ def _still_life(x, viewdirs, *, ball=False, others=False):
     return density, jnp.stack(rgb, axis=-1)
 
 
-def _plinth(x, y, z):
+def _plinth_place(x, y, z):
+    """Returns z from its middle, and the distances from its side and from its faces."""
     z = z + 0.71
-    side, face = _norm(x, y) - 0.98, jnp.abs(z) - 0.10
+    return z, _norm(x, y) - 0.98, abs(z) - 0.10
+
+
+def _plinth(x, y, z):
+    _, side, face = _plinth_place(x, y, z)
+    return _namespace(side).maximum(side, face)
+
+
+def _plinth_colour(x, y, z, direction):
+    z, side, face = _plinth_place(x, y, z)
     checks = _step(_wave(x / 0.68) * _wave(y / 0.68), 0.08)
     on_face = _step(face - side, 0.02)
     top = _mix((0.07, 0.13, 0.30), (0.98, 0.62, 0.18), checks)
-    rim = _mix((0.16, 0.10, 0.09), (0.85, 0.16, 0.10), _step(0.035 - jnp.abs(z), 0.008))
+    rim = _mix((0.16, 0.10, 0.09), (0.85, 0.16, 0.10), _step(0.035 - abs(z), 0.008))
     shade = 0.55 + 0.45 * _step(z, 0.03)
-    return jnp.maximum(side, face), 50.0, _scale(_mix(rim, top, on_face), shade)
+    return _scale(_mix(rim, top, on_face), shade)
 
 
-def _pillar(x, y, z, direction):
+def _pillar_place(x, y, z):
+    """Returns x, y and z from its middle, and z from the nearest point of its axis."""
     x, y, z = x + 0.40, y - 0.46, z + 0.02
-    radius = _norm(x, y)
-    cap = z - jnp.clip(z, -0.4, 0.64)
+    return x, y, z, z - _namespace(z).clip(z, -0.4, 0.64)
+
+
+def _pillar(x, y, z):
+    x, y, _, cap = _pillar_place(x, y, z)
+    return _norm(x, y, cap) - 0.24
+
+
+def _pillar_colour(x, y, z, direction):
+    x, y, z, cap = _pillar_place(x, y, z)
     turn = z / 0.60  # one stripe winds round once in 0.6 units
-    stripes = _step((x * _wave(turn + 0.25) + y * _wave(turn)) / radius, 0.12)
+    stripes = _step((x * _wave(turn + 0.25) + y * _wave(turn)) / _norm(x, y), 0.12)
     colour = _mix((0.02, 0.36, 0.25), (0.95, 0.86, 0.25), stripes)
-    return _norm(x, y, cap) - 0.24, 50.0, _shaded(colour, (x, y, cap), direction, _SHEEN)
+    return _shaded(colour, (x, y, cap), direction, _SHEEN)
 
 
-def _ring(x, y, z, direction):
+def _ring_place(x, y, z):
+    """Returns positions along the ring's plane, across it and upwards, and the distance from its axis."""
     x, y, z = x - 0.48, y - 0.36, z + 0.04
     along, across = 0.8 * x - 0.6 * y, 0.6 * x + 0.8 * y  # its axis is horizontal: across
-    spoke = _norm(along, z)
-    tube = spoke - 0.42
-    double = 2 * jnp.square(along / spoke) - 1  # cos 2a, and cos 6a = 4 cos^3 2a - 3 cos 2a: six bands
-    bands = _step(4 * double**3 - 3 * double, 0.2)
+    return along, across, z, _norm(along, z)
+
+
+def _ring(x, y, z):
+    _, across, _, spoke = _ring_place(x, y, z)
+    return _norm(spoke - 0.42, across) - 0.16
+
+
+def _ring_colour(x, y, z, direction):
+    along, across, z, spoke = _ring_place(x, y, z)
+    ratio, tube = along / spoke, spoke - 0.42
+    double = 2 * ratio * ratio - 1  # cos 2a, and cos 6a = 4 cos^3 2a - 3 cos 2a: six bands
+    bands = _step((4 * double * double - 3) * double, 0.2)
     colour = _mix((0.32, 0.05, 0.42), (0.25, 0.78, 0.85), bands)
     outward = tube / spoke * along
     normal = 0.8 * outward + 0.6 * across, 0.8 * across - 0.6 * outward, tube / spoke * z
-    return _norm(tube, across) - 0.16, 50.0, _shaded(colour, normal, direction, _SHEEN)
+    return _shaded(colour, normal, direction, _SHEEN)
 
 
 def _brick(x, y, z):
-    x, y, z = x - 0.42, y + 0.42, z + 0.29
-    rounded = jnp.sqrt(jnp.sqrt(x**4 + y**4 + z**4 + 1e-12))  # the norm whose unit ball is a rounded cube
-    return rounded - 0.33, 3.5, (0.05, 0.25, 0.80)
+    squares = [value * value for value in (x - 0.42, y + 0.42, z + 0.29)]
+    sqrt = _namespace(x).sqrt
+    # The norm whose unit ball is a rounded cube.
+    return sqrt(sqrt(sum(square * square for square in squares) + 1e-12)) - 0.33
 
 
-def _lamp_core(x, y, z, direction):
-    x, y, z = x - 0.22, y + 0.10, z - 0.62
-    return _norm(x, y, z) - 0.15, 50.0, _shaded((0.45, 0.02, 0.10), (x, y, z), direction, _SHEEN)
+def _brick_colour(x, y, z, direction):
+    return 0.05, 0.25, 0.80
+
+
+def _lamp_place(x, y, z):
+    return x - 0.22, y + 0.10, z - 0.62
+
+
+def _lamp_core(x, y, z):
+    return _norm(*_lamp_place(x, y, z)) - 0.15
+
+
+def _lamp_core_colour(x, y, z, direction):
+    return _shaded((0.45, 0.02, 0.10), _lamp_place(x, y, z), direction, _SHEEN)
 
 
 def _lamp_glass(x, y, z):
-    x, y, z = x - 0.22, y + 0.10, z - 0.62
-    return _norm(x, y, z) - 0.36, 2.5, (0.98, 0.50, 0.05)
+    return _norm(*_lamp_place(x, y, z)) - 0.36
 
 
-def _ball(x, y, z, direction):
-    x, y, z = x + 0.38, y + 0.38, z + 0.18
-    return _norm(x, y, z) - 0.44, 50.0, _shaded((0.70, 0.05, 0.08), (x, y, z), direction, _POLISH)
+def _lamp_glass_colour(x, y, z, direction):
+    return 0.98, 0.50, 0.05
+
+
+def _ball_place(x, y, z):
+    return x + 0.38, y + 0.38, z + 0.18
+
+
+def _ball(x, y, z):
+    return _norm(*_ball_place(x, y, z)) - 0.44
+
+
+def _ball_colour(x, y, z, direction):
+    return _shaded((0.70, 0.05, 0.08), _ball_place(x, y, z), direction, _POLISH)
 
 
 def _shaded(colour, normal, direction, exponent):
@@ -166,7 +238,7 @@ def _shaded(colour, normal, direction, exponent):
     # Brightest where the normal halves the angle between light and camera.
     halfway = tuple(towards - away for towards, away in zip(_light(), direction, strict=True))
     aligned = sum(a * b for a, b in zip(normal, halfway, strict=True)) / (_norm(*normal) * _norm(*halfway))
-    highlight = 0.9 * jnp.maximum(aligned, 0.0) ** exponent
+    highlight = 0.9 * _power(_namespace(aligned).maximum(aligned, 0.0), exponent)
     return tuple(value + highlight * (1 - value) for value in base)
 
 
@@ -178,22 +250,23 @@ def _lambert(x, y, z):
     """Returns the brightness of a matt surface with its normal along (x, y, z), softened on the dark side."""
     light = _light()
     facing = (x * light[0] + y * light[1] + z * light[2]) / _norm(x, y, z)
-    return 0.35 + 0.65 * jnp.square(0.5 + 0.5 * facing)
+    softened = 0.5 + 0.5 * facing
+    return 0.35 + 0.65 * softened * softened
 
 
 def _norm(*components):
     # 1e-12 keeps the gradient finite on an axis; 1e-6 units are far below a pixel.
-    return jnp.sqrt(sum(jnp.square(component) for component in components) + 1e-12)
+    return _namespace(components[0]).sqrt(sum(component * component for component in components) + 1e-12)
 
 
 def _wave(turns):
     """Returns a sine of turns made of parabolas: the same zeros and peaks, several times faster."""
-    part = turns - jnp.round(turns)
-    return 8 * part * (1 - 2 * jnp.abs(part))
+    part = turns - _namespace(turns).round(turns)
+    return 8 * part * (1 - 2 * abs(part))
 
 
 def _step(value, softness):
-    return jax.nn.sigmoid(value / softness)
+    return _sigmoid(value / softness)
 
 
 def _mix(first, second, fraction):
@@ -202,3 +275,33 @@ def _mix(first, second, fraction):
 
 def _scale(colour, factor):
     return tuple(value * factor for value in colour)
+
+
+def _namespace(x):
+    return np if isinstance(x, np.ndarray) else jnp
+
+
+def _sigmoid(x):
+    return portable_math.sigmoid(x) if isinstance(x, np.ndarray) else jax.nn.sigmoid(x)
+
+
+def _power(x, exponent):
+    """Computes x^exponent by products, whose bits are defined."""
+    result = None
+    while exponent:
+        if exponent & 1:
+            result = x if result is None else result * x
+        exponent >>= 1
+        x = x * x if exponent else x
+    return result
+
+
+BODIES = (
+    Body("plinth", 50.0, (-0.98, -0.98, -0.81), (0.98, 0.98, -0.61), _plinth, _plinth_colour),
+    Body("pillar", 50.0, (-0.64, 0.22, -0.66), (-0.16, 0.70, 0.86), _pillar, _pillar_colour),
+    Body("ring", 50.0, (-0.02, -0.06, -0.62), (0.98, 0.78, 0.54), _ring, _ring_colour),
+    Body("brick", 3.5, (0.09, -0.75, -0.62), (0.75, -0.09, 0.04), _brick, _brick_colour),
+    Body("lamp core", 50.0, (0.07, -0.25, 0.47), (0.37, 0.05, 0.77), _lamp_core, _lamp_core_colour),
+    Body("lamp glass", 2.5, (-0.14, -0.46, 0.26), (0.58, 0.26, 0.98), _lamp_glass, _lamp_glass_colour),
+    Body("ball", 50.0, (-0.82, -0.82, -0.62), (0.06, 0.06, 0.26), _ball, _ball_colour),
+)

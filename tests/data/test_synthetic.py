@@ -1,5 +1,8 @@
 """The embedded dataset: its difficulty, its accuracy and its cache."""
 
+import dataclasses
+import hashlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +11,7 @@ from PIL import Image
 
 from jaxnerf.core import cameras, rendering
 from jaxnerf.data import synthetic
-from jaxnerf.fields import still_life
+from jaxnerf.fields import portable_math, still_life
 
 
 @pytest.fixture(scope="session")
@@ -44,6 +47,37 @@ def test_images_upscaled_from_a_quarter_score_at_most_26_db(test_images, method)
 
     large = np.stack([np.stack([enlarge(view[..., k]) for k in range(3)], -1) for view in small])
     assert _mean_psnr(test_images, np.clip(large, 0, 1)) <= 26
+
+
+def test_the_pixels_are_the_same_on_every_machine():
+    """Whatever XLA's flags, the processor and the number of rays at once: only arithmetic that IEEE 754 defines."""
+    digest = hashlib.sha256()
+    for finish in ("usual", "matt", "shiny"):
+        stack = jax.tree.map(lambda leaf: leaf[::4], synthetic._cameras("test", 24))
+        pixels = synthetic.render_views(stack, finish)
+        np.testing.assert_array_equal(synthetic.render_views(stack, finish, chunk=100), pixels)
+        digest.update(pixels.tobytes())
+    assert digest.hexdigest() == synthetic.CHECKSUM
+
+
+@pytest.mark.parametrize("finish", ["usual", "shiny"])
+def test_the_pixels_are_those_of_the_scene(finish):
+    """As the renderer of this package renders the scene that code outside sees."""
+    stack = jax.tree.map(lambda leaf: leaf[:2], synthetic._cameras("val", 20))
+    rays = jax.tree.map(np.float32, synthetic.scene_rays(stack))
+    rays = dataclasses.replace(rays, far=np.maximum(rays.near, rays.far))
+    scene = {"usual": still_life.still_life, "shiny": still_life.shiny_still_life}[finish]
+    seen = jax.jit(lambda rays: rendering.render_rays(None, scene, rays, num_samples=384, background=jnp.ones(3)))(rays)
+    np.testing.assert_allclose(_over_white(synthetic.render_views(stack, finish)), seen.rgb, atol=5e-4)
+
+
+def test_exponentials_have_their_digits():
+    x = np.linspace(-86, 86, 20001, dtype=np.float32)
+    np.testing.assert_allclose(portable_math.exp(x), np.exp(np.float64(x)), rtol=3e-7)
+    np.testing.assert_allclose(portable_math.sigmoid(x), 1 / (1 + np.exp(-np.float64(x))), rtol=5e-7)
+    np.testing.assert_array_equal(portable_math.exp(np.float32([-np.inf, -1e30])), portable_math.exp(x[:1] * 2)[0])
+    with np.errstate(invalid="ignore"):  # its power of two is no integer
+        assert np.isnan(portable_math.exp(np.float32([np.nan]))).all()
 
 
 def test_doubling_the_segments_changes_less_than_a_thousandth():
@@ -92,7 +126,7 @@ def test_the_cache_returns_the_same_bits_without_rendering(tmp_path, monkeypatch
     monkeypatch.setattr(synthetic, "render_views", lambda *_: pytest.fail("rendered again"))
     np.testing.assert_array_equal(synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels, first)
     # Source code, size, split and finish are part of the file's name.
-    monkeypatch.setattr(synthetic, "render_views", lambda stack, scene: np.zeros((8 * stack.height**2, 4), np.uint16))
+    monkeypatch.setattr(synthetic, "render_views", lambda stack, finish: np.zeros((8 * stack.height**2, 4), np.uint16))
     for change in ({"size": 9}, {"split": "test"}, {"finish": "matt"}):
         synthetic.load_synthetic(**{"split": "val", "size": 8, **change}, cache=tmp_path)
     monkeypatch.setattr(synthetic, "_fingerprint", lambda: "changed")

@@ -188,6 +188,21 @@ def test_early_termination_evaluates_no_samples_behind_a_wall():
     assert len(evaluated) == 3 and min(evaluated) > 0.4  # 12 of 200 samples: 10 before the wall, 2 in it
 
 
+def test_thin_fog_keeps_its_digits(rays, samples):
+    """1 - exp(-x) and 1 - transmittance would have none left at an optical depth of 1e-9."""
+
+    @compiled
+    def render(rays, samples):
+        fog = lambda x, viewdirs: (jnp.full(x.shape[:-1], 1e-9), jnp.full_like(x, 0.5))  # noqa: E731
+        options = {"max_samples": RAYS * SEGMENTS}
+        return [jaxnerf.render_packed(fog, None, rays, samples, early_stop_eps=eps, **options) for eps in (0.0, 1e-30)]
+
+    want = 1e-9 * (rays.far - rays.near) * np.linalg.norm(rays.directions, axis=-1)
+    for got in render(rays, samples):
+        np.testing.assert_allclose(got.opacity, want, rtol=1e-5)
+        np.testing.assert_allclose(got.rgb, np.tile(want[:, None] / 2, 3), rtol=1e-5)
+
+
 def test_packed_weights_are_those_of_each_ray():
     rng = np.random.default_rng(3)
     density = np.float32(rng.exponential(size=(5, 7)) * (rng.uniform(size=(5, 7)) < 0.7))
