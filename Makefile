@@ -12,7 +12,7 @@ $(BIN)/.installed: setup.cfg pyproject.toml
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
-	$(BIN)/pip install --quiet --editable '.[dev,check,tensorboard]'
+	$(BIN)/pip install --quiet --editable '.[dev,check,tensorboard,viewer]'
 	touch $@
 
 demo: $(BIN)/.installed
@@ -27,12 +27,14 @@ test: $(BIN)/.dev
 test-slow: $(BIN)/.dev
 	$(PYTEST) -m slow
 
-# These take longer, or need root to mount small disks; .ci/run does not call them.
+# These take longer, need root to mount small disks, or need Chromium; .ci/run does not call them.
 test-extra: $(BIN)/.dev
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/device_matrix.py runs/extra/device_matrix
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/kill_many.py --kills=20 --seed=1 --out=runs/extra/kill_many
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/cameras_from_images.py runs/extra/cameras
+	$(BIN)/pip install --quiet playwright
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/viewer_in_browser.py runs/extra/viewer
 
 lint: $(BIN)/.dev
 	$(BIN)/ruff check .

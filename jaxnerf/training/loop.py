@@ -33,6 +33,7 @@ def train(
     views: Views | None = None,
     preview: Callable[[TrainState, Views], str] | None = None,
     at_end: Callable[[Views], bool] | None = None,
+    observe: Callable[[TrainState, Views], None] | None = None,
 ) -> bool:
     """Trains as a config says, from the last checkpoint in a workdir if there is one.
 
@@ -43,6 +44,8 @@ def train(
         preview: called with the state and the Views of the split "train" about every `train.preview_every` seconds;
             returns a line to print. Its time does not count.
         at_end: called with these Views when training is complete; returns whether it has completed.
+        observe: called with the state and these Views after each step, as a viewer needs. The next step destroys the
+            state, so what is kept must be copied.
 
     Returns:
         Whether training, and at_end, have completed. False: stopped by a signal and saved.
@@ -71,7 +74,7 @@ def train(
 
         processes.run_on_first(claim, pathlib.Path(folder) / "config.json")
         processes.print_once(*lines, *device_lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
-        finished = run_training(experiment, views, folder, preview=preview)
+        finished = run_training(experiment, views, folder, preview=preview, observe=observe)
         return finished and (at_end is None or at_end(views))
 
 
@@ -81,6 +84,7 @@ def run_training(
     folder: str | os.PathLike,
     *,
     preview: Callable[[TrainState, Views], str] | None = None,
+    observe: Callable[[TrainState, Views], None] | None = None,
 ) -> bool:
     """Runs the loop of `train` on the Views of the split "train"; returns whether it has completed."""
     options = experiment.train
@@ -101,6 +105,8 @@ def run_training(
     with signals.Interrupt() as interrupt:
         for step in range(first + 1, first + 1 if done else options.max_steps + 1):
             state, metrics = reinitialize_dead(step, *run(state, pace.data_of(step)))
+            if observe is not None:
+                observe(state, views)
             recent.append(metrics)
             jax.block_until_ready(recent[-2:][0])  # at most one step in flight, so that stopping is prompt
             out_of_time = 0 < options.max_seconds <= clock.seconds()
