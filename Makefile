@@ -13,7 +13,7 @@ $(BIN)/.installed: setup.cfg pyproject.toml
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
-	$(BIN)/pip install --quiet --editable '.[dev,check,docs,export,tensorboard]'
+	$(BIN)/pip install --quiet --editable '.[dev,check,docs,export,tensorboard,viewer]'
 	touch $@
 
 demo: $(BIN)/.installed
@@ -28,7 +28,7 @@ test: $(BIN)/.dev
 test-slow: $(BIN)/.dev
 	$(PYTEST) -m slow
 
-# These take longer, or need root to mount small disks; .ci/run does not call them.
+# These take longer, need root to mount small disks, or need Chromium; .ci/run does not call them.
 test-extra: $(BIN)/.dev
 	$(BIN)/pip install --quiet --editable '.[notebooks]'
 	$(BIN)/python tests/slow/notebooks.py
@@ -39,6 +39,8 @@ test-extra: $(BIN)/.dev
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/cameras_from_images.py runs/extra/cameras
 	$(BIN)/python experiments/gpu/roofline.py --tiny
 	$(BIN)/python experiments/gpu/run.py --tiny --minutes=60 --out=runs/extra/gpu
+	$(BIN)/pip install --quiet playwright
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/viewer_in_browser.py runs/extra/viewer
 
 # zensical prints what griffe finds in docstrings, but does not fail.
 docs: $(BIN)/.dev

@@ -3,6 +3,7 @@
 `python -m jaxnerf.train` is the same program. --config.train.batch_size=2048 sets a field of the config.
 """
 
+import contextlib
 import os
 import sys
 
@@ -51,12 +52,17 @@ _BATCH = cli.define_count(
     "batch",
     "The rays of a microbatch, or auto: as many as fit into memory. It overrides config.train.microbatch_size.",
 )
+_VIEWER = flags.DEFINE_bool("viewer", False, "Whether to show the scene in a web browser while it trains.")
+_VIEWER_HOST = flags.DEFINE_string(
+    "viewer_host", "127.0.0.1", "The viewer's address. 0.0.0.0 lets other machines connect, without a password."
+)
+_VIEWER_PORT = flags.DEFINE_integer("viewer_port", 8080, "The viewer's port; 0: any.", lower_bound=0, upper_bound=65535)
 
 
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.evaluation.evaluate import train_and_evaluate
+    from jaxnerf.evaluation.evaluate import train_observed
     from jaxnerf.runtime import processes
 
     if _CONFIG.value is None:
@@ -75,9 +81,25 @@ def main(argv):
         seconds=_JOIN_SECONDS.value,
         heartbeat_seconds=_HEARTBEAT_SECONDS.value,
     ):
-        finished = train_and_evaluate(config, _WORKDIR.value)
+        with _viewer(processes.is_first()) as observe:
+            finished = train_observed(config, _WORKDIR.value, observe=observe)
     if not finished:
         sys.exit(_STOPPED_CODE.value)
+
+
+@contextlib.contextmanager
+def _viewer(is_first):
+    """Yields what the training loop calls after each step; None without a viewer."""
+    if not (_VIEWER.value and is_first):
+        yield None
+        return
+    from jaxnerf.viewer.live import LiveViewer
+
+    viewer = LiveViewer(_WORKDIR.value, host=_VIEWER_HOST.value, port=_VIEWER_PORT.value)
+    try:
+        yield viewer.observe
+    finally:
+        viewer.close()
 
 
 def run():

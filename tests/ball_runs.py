@@ -40,8 +40,8 @@ def make_ball(options, box):
 jaxnerf.register_field("ball", make_ball)
 
 
-def make_run(folder, kind, *, step=20, size=32):
-    """Makes a workdir of a kind with one checkpoint; its dataset, of noise, lies beside it."""
+def make_run(folder, kind, *, radii=((20, 0.7),), size=32):
+    """Makes a workdir of a kind with a checkpoint for each (step, radius); its dataset, of noise, lies beside it."""
     config = smoke_config()
     config.update_from_flattened_dict({**KINDS[kind], "field": "ball", "eval.early_stop_eps": 1e-3})
     shots = captures.noise(captures.front(4) if kind == "ndc" else captures.orbit(6, height=size, width=size))
@@ -56,18 +56,17 @@ def make_run(folder, kind, *, step=20, size=32):
     config.data.format, config.data.dir, config.data.background = "auto", str(data), "white"
     resolved = auto_config.resolve(config).config
     workdir.claim(folder, resolved)
-    save(folder, resolved, step)
+    _save(folder, resolved, radii)
     return folder
 
 
-def save(folder, config=None, step=20, radius=0.7):
-    """Adds a checkpoint with a ball of this radius to a workdir."""
-    config = workdir.read_config(folder) if config is None else config
+def _save(folder, config, radii):
+    """Adds a checkpoint for each (step, radius) of a ball to a workdir."""
     experiment = build.build(auto_config.resolve_for_device(config)[0])
-    state = create_state(experiment.model, experiment.optimizer, 0)
-    params = {name: {"radius": jnp.float32(radius)} for name in state.params}
-    checkpoints = Checkpoints(folder)
-    checkpoints.save(dataclasses.replace(state, params=params, step=jnp.int32(step)))
+    state, checkpoints = create_state(experiment.model, experiment.optimizer, 0), Checkpoints(folder)
+    for step, radius in radii:
+        params = {name: {"radius": jnp.float32(radius)} for name in state.params}
+        checkpoints.save(dataclasses.replace(state, params=params, step=jnp.int32(step)))
     checkpoints.close()
 
 

@@ -111,6 +111,7 @@ EXCEPTIONS = {
     "grad_ema": "a key in checkpoints of other projects",
     "macro_block_size": "an option of ffmpeg",
     "make_room": "the embedded scene fields/room.py",
+    "request_share_url": "a method of viser",
     "score_room": "the embedded scene fields/room.py",
     "test_room": "the embedded scene fields/room.py",
 }

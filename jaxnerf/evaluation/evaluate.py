@@ -10,6 +10,7 @@ import os
 import pathlib
 import shutil
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -26,6 +27,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.loop import train
+from jaxnerf.training.state import TrainState
 
 _REMEDY = "give --overwrite without --shard, or remove it"
 
@@ -46,6 +48,17 @@ def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views:
         ValueError: on bad input, when another process trains in the workdir, or when too many steps in a row
             were not finite.
     """
+    return train_observed(config, workdir, views=views)
+
+
+def train_observed(
+    config: ConfigDict,
+    workdir: str | os.PathLike,
+    *,
+    views: Views | None = None,
+    observe: Callable[[TrainState, Views], None] | None = None,
+) -> bool:
+    """Does what `train_and_evaluate` does, and calls a function after each step; see `loop.train`."""
     previews = Previews(workdir)
 
     def finish(views):
@@ -58,7 +71,7 @@ def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views:
             return False
         return True
 
-    return train(config, workdir, views=views, preview=previews.write, at_end=finish)
+    return train(config, workdir, views=views, preview=previews.write, at_end=finish, observe=observe)
 
 
 def _score_newest(workdir):

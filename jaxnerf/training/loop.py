@@ -32,6 +32,7 @@ def train(
     views: Views | None = None,
     preview: Callable[[TrainState, Views], str] | None = None,
     at_end: Callable[[Views], bool] | None = None,
+    observe: Callable[[TrainState, Views], None] | None = None,
 ) -> bool:
     """Trains as a config says, from the last checkpoint in a workdir if there is one.
 
@@ -42,6 +43,8 @@ def train(
         preview: called with the state and the Views of the split "train" about every `train.preview_every` seconds;
             returns a line to print. Its time does not count.
         at_end: called with these Views when training is complete; returns whether it has completed.
+        observe: called with the state and these Views after each step, as a viewer needs. The next step destroys the
+            state, so what is kept must be copied.
 
     Returns:
         Whether training, and at_end, have completed. False: stopped by a signal and saved.
@@ -69,7 +72,7 @@ def train(
 
         processes.run_on_first(claim, pathlib.Path(folder) / "config.json")
         processes.print_once(*lines, *device_lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
-        finished = run_training(experiment, views, folder, preview=preview)
+        finished = run_training(experiment, views, folder, preview=preview, observe=observe)
         return finished and (at_end is None or at_end(views))
 
 
@@ -79,6 +82,7 @@ def run_training(
     folder: str | os.PathLike,
     *,
     preview: Callable[[TrainState, Views], str] | None = None,
+    observe: Callable[[TrainState, Views], None] | None = None,
 ) -> bool:
     """Runs the loop of `train` on the Views of the split "train"; returns whether it has completed."""
     options = experiment.train
@@ -104,6 +108,8 @@ def run_training(
                 dispatch.compile(count)
             run, step = dispatch.runs[count], step + count
             state, metrics = reinitialize_dead(step, *run(state, pace.data_of(step - count + 1)))
+            if observe is not None:
+                observe(state, views)
             recent.append(metrics)
             jax.block_until_ready(recent[-2:][0])  # at most one dispatch in flight, so that stopping is prompt
             out_of_time = 0 < options.max_seconds <= clock.seconds()

@@ -23,7 +23,8 @@ from jaxnerf.evaluation.restore import TrainedRun
 
 MODES = ("colour", "depth", "opacity", "normals")
 MAX_SIDE = 4096  # px
-_CHUNK = 4096  # rays; more take longer to abandon, fewer use a CPU's core worse
+_CHUNK = {"cpu": 4096}  # rays; more take longer to abandon, fewer use the device worse
+_CHUNK_ELSEWHERE = 2**15
 _FAST_SAMPLES, _FAST_STOP = 0.5, 0.1  # of frames while the camera moves: factor of the samples, early_stop_eps
 _FARTHEST = 1e10  # in t; at infinity, the length of a ray would be NaN
 _SEEN = 0.5  # opacity from which a pixel has a depth and a normal
@@ -88,13 +89,13 @@ class Frame(NamedTuple):
 class FrameRenderer:
     """Renders frames of a run at two qualities: the run's own, and a faster one for cameras that move."""
 
-    def __init__(self, run: TrainedRun, views: Views, *, chunk: int = _CHUNK):
+    def __init__(self, run: TrainedRun, views: Views, *, chunk: int | None = None):
         """Makes the renderer; nothing is compiled yet.
 
         Args:
             run: see `restore_with_grid`.
             views: of the split "train", for NDC and, where space is contracted, for near and far.
-            chunk: rays rendered at once.
+            chunk: rays rendered at once; None: as many as suit the device.
         """
         own = run.experiment.eval
         fast = {
@@ -103,7 +104,8 @@ class FrameRenderer:
         }
         models = {False: run.model_with({}), True: run.model_with(fast)}
         self._baked, self._cull = models[False].grid_schedule is None, models[False].cull
-        self._chunk, self._ndc, self._offset = chunk, run.experiment.ndc, run.experiment.pixel_offset
+        self._chunk = chunk or _CHUNK.get(jax.default_backend(), _CHUNK_ELSEWHERE)
+        self._ndc, self._offset = run.experiment.ndc, run.experiment.pixel_offset
         self._middle = np.asarray(views.cameras.to_world)[:, :, 3].mean(axis=0)
         self._bounds = float(np.min(views.near)), float(np.max(views.far))
         height, width = (int(side) for side in views.size[0])
