@@ -21,6 +21,7 @@ from jaxnerf.training import metric_log
 ORIGIN = "origin.json"
 _AGAIN = "remove it, and the same command scores that view again"
 _KEPT, _WORKING = ("color", "gt-color", "depth"), ("rows", "contact_sheet")
+_MEANS = ("psnr", "ssim", "psnr_float", "psnr_truncated", "psnr_aligned", "ssim_aligned")  # over the images
 FOLDERS = _KEPT + _WORKING
 
 
@@ -59,10 +60,21 @@ def view_files(folder: pathlib.Path, index: int, *, count: int) -> list[pathlib.
     return [*output_images.view_files(folder, f"{index:03d}"), *sheet, _row_file(folder, index)]
 
 
+def is_finished(content: Any) -> bool:
+    """Returns whether what a row's file holds is what `finish` writes: all metrics are numbers."""
+    row = content.get("row") if isinstance(content, dict) else None
+    values = [row.get(key) for key in (*_MEANS, "seconds")] + [content.get("rays")] if isinstance(row, dict) else [None]
+    named = isinstance(row, dict) and isinstance(row.get("name"), str) and isinstance(content.get("first"), bool)
+    return named and all(type(value) in (int, float) for value in values) and row["seconds"] > 0
+
+
 def read(target: pathlib.Path, origin: Mapping[str, Any], remedy: str) -> dict[str, Any]:
-    """Reads the results.json of a finished evaluation; raises ValueError if it has another origin."""
+    """Reads the results.json of a finished evaluation; raises ValueError if it is damaged or has another origin."""
     shards.check_origin(target, origin, file=ORIGIN, remedy=remedy)
-    return atomic_files.read_json(target / "results.json", remedy)
+    results = atomic_files.read_json(target / "results.json", remedy)
+    if not isinstance(results, dict) or not all(type(results.get(key)) in (int, float) for key in (*_MEANS, "views")):
+        raise ValueError(f"{target / 'results.json'}: lacks metrics, expected the result of an evaluation; {remedy}")
+    return results
 
 
 def merge(
@@ -130,8 +142,7 @@ def _results(run, workdir, views, variables, finished, origin):
 
 def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Returns the mean over the images of each metric."""
-    keys = ("psnr", "ssim", "psnr_float", "psnr_truncated", "psnr_aligned", "ssim_aligned")
-    return {key: float(np.mean([row[key] for row in rows])) for key in keys}
+    return {key: float(np.mean([row[key] for row in rows])) for key in _MEANS}
 
 
 def _on_contact_sheet(count):

@@ -199,7 +199,8 @@ def _score_views(run, render, views, folder, shard):
     """Renders and scores those views of a shard that are not finished."""
     count = len(views.names)
     frames = shards.own(range(count), shard)
-    readable = output_images.readable([aggregate.view_files(folder, index, count=count) for index in frames])
+    files = [aggregate.view_files(folder, index, count=count) for index in frames]
+    readable = output_images.readable(files, is_valid=aggregate.is_finished)
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     progress, first = metric_log.Progress(len(frames), show=processes.is_first()), True
     for done, index in enumerate(todo, len(frames) - len(todo) + 1):

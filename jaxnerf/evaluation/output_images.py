@@ -2,8 +2,9 @@
 
 import pathlib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -35,13 +36,23 @@ def view_files(folder: pathlib.Path, name: str) -> list[pathlib.Path]:
     return [pathlib.Path(folder) / kind / f"{name}.{suffix}" for kind, suffix in _VIEW_FILES.items()]
 
 
-def readable(groups: Sequence[Sequence[pathlib.Path]]) -> list[bool]:
-    """Returns for each group of image and JSON files whether all exist and are whole; prints those that are not."""
+def readable(
+    groups: Sequence[Sequence[pathlib.Path]], *, is_valid: Callable[[Any], bool] = lambda content: True
+) -> list[bool]:
+    """Returns for each group of image and JSON files whether all exist and are whole; prints those that are not.
+
+    Args:
+        groups: of paths.
+        is_valid: returns whether the content of a JSON file is as expected.
+    """
 
     def check(files):
         for file in files if all(file.is_file() for file in files) else ():
             try:
-                atomic_files.read_json(file, "") if file.suffix == ".json" else read_stored(file)
+                if file.suffix != ".json":
+                    read_stored(file)
+                elif not is_valid(atomic_files.read_json(file, "")):
+                    raise ValueError("unexpected content")
             except (ValueError, OSError):
                 if file.is_file():  # otherwise another process has finished and moved the folder
                     print(f"{file}: is damaged; its view is rendered again", file=sys.stderr)

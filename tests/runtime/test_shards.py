@@ -109,6 +109,23 @@ def test_damaged_files_are_named_and_their_views_rendered_again(fresh, whole, re
     assert "rows/006.json: is damaged" in said
 
 
+def test_only_complete_rows_and_results_are_believed(whole, tmp_path):
+    results, folder = whole
+    row = {**results["images"][0], "seconds": 1.0}
+    good = {"row": row, "first": True, "rays": 9}
+    assert aggregate.is_finished(good)
+    wrong = [{}, [], 5, None, {**good, "row": []}, {**good, "rays": None}, {**good, "first": 1}]
+    wrong += [{**good, "row": {**row, name: value}} for name in ("psnr", "seconds") for value in (None, "1", True)]
+    wrong += [{**good, "row": {**row, "name": 3}}, {**good, "row": {**row, "seconds": 0.0}}]
+    assert not any(map(aggregate.is_finished, wrong))
+    origin = {"split": "test"}
+    for content in ("[]", "{}", json.dumps({**results, "psnr": "high"})):
+        (tmp_path / aggregate.ORIGIN).write_text(json.dumps(origin))
+        (tmp_path / "results.json").write_text(content)
+        with pytest.raises(ValueError, match="results.json: lacks metrics, .*remove it"):
+            aggregate.read(tmp_path, origin, "remove it")
+
+
 def test_two_shards_that_finish_together_both_return_the_result(fresh, monkeypatch):
     """The second one finishes between the first one's check and its move; a third one follows."""
     score, folder = fresh
