@@ -37,6 +37,9 @@ _FORMAT = flags.DEFINE_string("format", "ply", "mesh: ply, glb or obj.")
 _MAX_FACES = flags.DEFINE_integer(
     "max_faces", 0, "mesh: the number of triangles to which it is decimated; 0: it is not."
 )
+_CLOSED = flags.DEFINE_bool(
+    "closed", False, "mesh: whether space that no training view sees counts as solid, so that the mesh has no holes."
+)
 _MIN_PIECE = flags.DEFINE_float(
     "min_piece", 0.005, "mesh: connected pieces with fewer triangles than this fraction of all are dropped."
 )
@@ -50,7 +53,7 @@ def main(argv):
     from jaxnerf.exporters.base import ExportSettings, export_run
 
     names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
-    names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE}
+    names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED}
     try:
         box = None if _BOX.value is None else tuple(map(float, _BOX.value))
     except ValueError:

@@ -29,6 +29,7 @@ class ExportSettings(NamedTuple):
         num_views: the largest number of training views whose poses are rendered, spread evenly over all.
         num_points: the largest number of points or Gaussians.
         format: of a mesh, "ply", "glb" or "obj".
+        closed: whether space that no training view sees counts as solid, so that a mesh has no holes.
         max_faces: the number of triangles to which a mesh is decimated; 0: it is not.
         min_piece: connected pieces of a mesh with fewer triangles than this fraction of all are dropped.
     """
@@ -39,6 +40,7 @@ class ExportSettings(NamedTuple):
     num_views: int = 100
     num_points: int = 200_000
     format: str = "ply"
+    closed: bool = False
     max_faces: int = 0
     min_piece: float = 0.005
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from skimage import measure
 
 from jaxnerf.core.cameras import project
@@ -89,17 +90,52 @@ def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution
     return Fused(box[0], voxel, shape, index, distance, total[:, 4:] / np.maximum(rgb_weight, 1e-6))
 
 
-def level_set(fused: Fused) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray, "X Y Z"]:
+    """Computes a field for `level_set` in which all space is solid that no training view sees to be free.
+
+    The boundary between the two closes the holes of the surface (Curless and Levoy 1996, Section 4). It is found at
+    every second vertex.
+
+    Args:
+        images: the DepthImages that were fused.
+        fused: for its grid.
+
+    Returns:
+        [X, Y, Z] from -1, solid, to 1, free; linear in between.
+    """
+    coarse = tuple(size // 2 + 1 for size in fused.shape)
+    x = np.float32(fused.lower + 2 * fused.voxel * np.stack(np.indices(coarse), axis=-1))
+    free = jnp.zeros(coarse, bool)
+    for image in images:
+        if image.name is not None:
+            free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
+    field = 2 * np.asarray(free, np.float32) - 1.01  # nowhere 0 below, which would make degenerate triangles
+    for axis, size in enumerate(fused.shape):
+        place = np.arange(size)
+        field = (field.take(place // 2, axis) + field.take((place + 1) // 2, axis)) / 2
+    return field
+
+
+def level_set(
+    fused: Fused, solid: Float[np.ndarray, "X Y Z"] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Extracts the surface at distance 0 by marching cubes (Lorensen and Cline 1987, in scikit-image).
+
+    Args:
+        fused: the field.
+        solid: the field where no view sees a vertex, see `solid_field`. The surface is then closed, also where it
+            meets the border of the grid. None: no face is in a voxel with a corner that no view sees.
 
     Returns:
         vertices [V, 3] in units of the dataset's files; faces [F, 3], counterclockwise seen from outside; and rgb
-        [V, 3] uint8. No face is in a voxel with a corner that no view sees. All are empty where there is no surface.
+        [V, 3] uint8, where no view sees a surface that of the nearest one. All are empty where there is no surface.
     """
     known = ~np.isnan(fused.distance)
-    field, row = np.ones(fused.shape, np.float32), np.full(fused.shape, -1, np.int32)
-    field.reshape(-1)[fused.index] = np.where(known, fused.distance, 1)
+    field, row = np.ones(fused.shape, np.float32) if solid is None else solid, np.full(fused.shape, -1, np.int32)
+    field.reshape(-1)[fused.index[known]] = fused.distance[known]
     row.reshape(-1)[fused.index[known]] = np.flatnonzero(known)
+    if solid is not None:
+        return _closed(fused, field, row)
     cubes = row >= 0
     for axis in range(3):  # scikit-image marches the cube below each vertex that is in the mask
         lower = np.roll(cubes, 1, axis=axis)
@@ -109,11 +145,29 @@ def level_set(fused: Fused) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         vertices, faces, _, _ = measure.marching_cubes(field, 0.0, mask=cubes, allow_degenerate=False)
     except (ValueError, RuntimeError):  # the level is outside the field's range, or no cube has a surface
         return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
+    return fused.lower + fused.voxel * vertices, faces, _colors(fused, row, vertices)[0]
+
+
+def _closed(fused, field, row):
+    """Returns what level_set does for a field [X, Y, Z] that is known everywhere; row: of each stored vertex, or -1."""
+    field = np.pad(field, 1, constant_values=1)  # free space around it closes the surface
+    if field.min() > 0 or not len(fused.index):
+        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
+    vertices, faces, _, _ = measure.marching_cubes(field, 0.0, allow_degenerate=False)
+    rgb, seen = _colors(fused, row, np.clip(vertices - 1, 0, np.subtract(fused.shape, 1)))
+    if seen.any():
+        rgb[~seen] = rgb[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
+    return fused.lower + fused.voxel * (vertices - 1), faces, rgb
+
+
+def _colors(fused, row, vertices):
+    """Returns rgb [V, 3] uint8 of vertices in voxels, and [V], whether both voxel corners around each are stored."""
     low, high = np.floor(vertices).astype(int), np.ceil(vertices).astype(int)
     fraction = (vertices - low).max(axis=1, keepdims=True)  # a vertex is on an edge, between two voxels' corners
-    first, second = (fused.rgb[row[tuple(ends.T)]] for ends in (low, high))
+    rows = [row[tuple(ends.T)] for ends in (low, high)]
+    first, second = (fused.rgb[each] for each in rows)
     rgb = np.rint(np.clip((1 - fraction) * first + fraction * second, 0, 255)).astype(np.uint8)
-    return fused.lower + fused.voxel * vertices, faces, rgb
+    return rgb, (rows[0] >= 0) & (rows[1] >= 0)
 
 
 def _vertices_near(parts, lower, voxel, shape):
@@ -130,6 +184,23 @@ def _vertices_near(parts, lower, voxel, shape):
 
 
 @jax.jit
+def _mark_free(free, camera, surface, x, truncation):
+    """Returns free [X, Y, Z], also True where a view sees that x [X, Y, Z, 3] is in front of what it shows."""
+    pixel, depth, visible = _pixels_of(camera, x, surface.shape)
+    ahead = surface.reshape(-1)[pixel] - depth
+    return free | (visible & (ahead > truncation) & (surface.reshape(-1)[pixel] > 0))
+
+
+def _pixels_of(camera, x, shape):
+    """Returns the flat indices [...] of the pixels that see x [..., 3], its depth, and whether there is one."""
+    height, width = shape
+    pixels, depth = project(camera, x)
+    column, line = (jnp.floor(jnp.clip(pixels[..., axis], -1, 1e6)).astype(jnp.int32) for axis in range(2))
+    visible = (depth > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
+    return jnp.where(visible, line * width + column, 0), depth, visible
+
+
+@jax.jit
 def _integrate(total, camera, planes, x, truncation):
     """Returns total [C, N, 6] with what one view sees of vertices x [C, N, 3].
 
@@ -141,10 +212,8 @@ def _integrate(total, camera, planes, x, truncation):
 
     def add(part):
         total, x = part
-        pixels, depth = project(camera, x)
-        column, line = (jnp.floor(jnp.clip(pixels[:, axis], -1, 1e6)).astype(jnp.int32) for axis in range(2))
-        visible = (depth > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
-        row = rows[jnp.where(visible, line * width + column, 0)]
+        pixel, depth, visible = _pixels_of(camera, x, (height, width))
+        row = rows[pixel]
         surface, weight, trained = row[:, 0], row[:, 1], row[:, 2]
         points, normal, rgb = row[:, 3:6], row[:, 6:9], row[:, 9:12]
         ahead = (surface - depth) / truncation

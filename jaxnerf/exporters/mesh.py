@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from jaxnerf.exporters.base import ExportSource, check_memory
-from jaxnerf.exporters.fusion import fuse, grid_shape, level_set
+from jaxnerf.exporters.fusion import fuse, grid_shape, level_set, solid_field
 from jaxnerf.exporters.surfaces import export_box, render_depth_images
 from jaxnerf.runtime import atomic_files, memory
 
@@ -29,7 +29,8 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     box = export_box(source, images)
     _, shape = grid_shape(box, settings.resolution)
     check_memory(_BYTES_PER_VOXEL * float(np.prod(shape)), memory.available(), "give a smaller --resolution or --box")
-    vertices, faces, rgb = level_set(fuse(images, box, settings.resolution))
+    fused = fuse(images, box, settings.resolution)
+    vertices, faces, rgb = level_set(fused, solid_field(images, fused) if settings.closed else None)
     if not len(faces):
         raise ValueError(f"no surface is in the box {np.round(box, 4).tolist()}; give another --box")
     kept = keep_large_pieces(faces, settings.min_piece)

@@ -91,6 +91,9 @@ def test_surfaces_that_no_view_sees_are_absent(images):
     box = np.stack([CENTER - 1.2, CENTER + 1.2])
     vertices, faces, _ = fusion.level_set(fusion.fuse(front, box, 32))
     assert len(faces) and vertices[:, 2].min() > CENTER[2] - 0.8
+    fused = fusion.fuse(front, box, 32)
+    closed = trimesh.Trimesh(*fusion.level_set(fused, fusion.solid_field(front, fused))[:2])
+    assert closed.is_watertight and closed.volume > 4 / 3 * np.pi * IN_FILE**3  # with what the ball hides
 
 
 def test_pieces_and_an_empty_box(tmp_path):
