@@ -47,7 +47,11 @@ def main(argv):
     del argv
     if _CLIENT.value:
         return _act_as_browser(_CLIENT.value)
-    parts = [_HEAD.format(command=" ".join(sys.argv), commit=_commit(), machine=common.describe_machine())]
+    parts = [
+        _HEAD.format(
+            command=" ".join(sys.argv), commit=_commit(), machine=common.describe_machine(), load=os.getloadavg()[0]
+        )
+    ]
     parts += [_view(workdir) for workdir in _WORKDIRS.value]
     if _TRAIN.value:
         parts += [_idle_cost(_TRAIN.value), _busy_cost(_TRAIN.value)]
@@ -59,7 +63,8 @@ def main(argv):
 
 _HEAD = """# The viewer in figures
 
-Written by `python {command}` at commit {commit} on {machine}.
+Written by `python {command}` at commit {commit} on {machine}, load average {load:.1f}: above the number of
+cores other programs slowed the wall-clock times, and CPU times are the better guide.
 
 Latency is the time from a camera message to the encoded image (JPEG), without network and browser, while a camera is
 dragged (20 messages a second) in a window of this size. The viewer selects the size of its frames so that it keeps ten
@@ -82,8 +87,8 @@ def _view(workdir):
     aspect = float(views.size[0, 1]) / float(views.size[0, 0])
     lines = [
         f"## {pathlib.Path(workdir).name}, step {step:,}\n",
-        "| longer side | frames per second while moving, at this size | full quality | latency, median (90 %) | frames "
-        "per second and their size while dragged |",
+        "| longer side | frames per second while moving, at this size (of CPU time) | full quality (CPU time) "
+        "| latency, median (90 %) | frames per second and their size while dragged |",
         "|---|---|---|---|---|",
     ]
     for side in SIDES:
@@ -92,24 +97,28 @@ def _view(workdir):
         fast, own = (_seconds_per_frame(renderer, state, cameras, fast=fast) for fast in (True, False))
         latencies, rate, size = _dragged(renderer, state, cameras)
         middle, most = statistics.median(latencies), np.quantile(latencies, 0.9)
-        lines.append(
-            f"| {side} px | {1 / fast:.1f} | {own:.2f} s | {1000 * middle:.0f} ms ({1000 * most:.0f} ms) "
-            f"| {rate:.1f} at {size[0]} x {size[1]} px |"
-        )
+        cells = [
+            f"{side} px",
+            f"{1 / fast[0]:.1f} ({1 / fast[1]:.1f})",
+            f"{own[0]:.2f} s ({own[1]:.2f} s)",
+            f"{1000 * middle:.0f} ms ({1000 * most:.0f} ms)",
+            f"{rate:.1f} at {size[0]} x {size[1]} px",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
 
 
 def _seconds_per_frame(renderer, state, cameras, *, fast):
-    """Returns the median seconds of rendering and encoding a frame along the path."""
+    """Returns the median seconds of rendering and encoding a frame along the path, and those of CPU time."""
     chosen = cameras[:: len(cameras) // _FRAMES][:_FRAMES]
     call = functools.partial(_rendered, renderer, state, fast)
     call(chosen[0])
     seconds = []
     for camera in chosen:
-        started = time.perf_counter()
+        started = time.perf_counter(), time.process_time()
         call(camera)
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds)
+        seconds.append((time.perf_counter() - started[0], time.process_time() - started[1]))
+    return np.median(seconds, axis=0)
 
 
 def _rendered(renderer, state, fast, camera):

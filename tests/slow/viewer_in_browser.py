@@ -30,7 +30,7 @@ TRAIN = ("--config=quickstart", "--config.train.save_every=200", "--config.train
 STEPS, MORE_STEPS = 400, 200  # of the first training, and of that which continues it
 SECONDS = 180  # that anything may take on a busy core
 RESOLUTION = "200"  # px
-MIDDLE = {"x": 150, "y": 150, "width": 300, "height": 300}  # px of the page, beside the controls
+MIDDLE = {"x": 150, "y": 190, "width": 480, "height": 400}  # px of the page, beside the controls
 
 
 def main(out):
