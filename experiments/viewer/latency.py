@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import viser
 import websockets.sync.client
-from absl import app, flags
+from absl import flags
 from viser._image_encoding import cv2_imencode_with_fallback
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
@@ -26,6 +26,7 @@ import common
 
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
+from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.training import metric_log
 from jaxnerf.viewer.frame_renderer import FrameCamera, FrameRenderer, frame_image
@@ -159,7 +160,11 @@ def _idle_cost(config):
     for _ in range(2):
         for viewer in spent:
             with tempfile.TemporaryDirectory() as folder:
-                flags = [f"--config.train.max_steps={_STEPS.value}", "--config.train.preview_every=0"]
+                flags = [
+                    f"--config.train.max_steps={_STEPS.value}",
+                    "--config.train.preview_every=0",
+                    "--config.train.log_every=20",
+                ]
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
                 process = _train(config, folder, *flags, *(["--viewer", "--viewer_port=0"] if viewer else []))
                 process.communicate()
@@ -284,4 +289,4 @@ def _commit():
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)
