@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import viser
 import websockets.sync.client
-from absl import app, flags
+from absl import flags
 from viser._image_encoding import cv2_imencode_with_fallback
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
@@ -26,6 +26,7 @@ import common
 
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
+from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.training import metric_log
 from jaxnerf.viewer.frame_renderer import FrameCamera, FrameRenderer, frame_image
@@ -47,7 +48,11 @@ def main(argv):
     del argv
     if _CLIENT.value:
         return _act_as_browser(_CLIENT.value)
-    parts = [_HEAD.format(command=" ".join(sys.argv), commit=_commit(), machine=common.describe_machine())]
+    parts = [
+        _HEAD.format(
+            command=" ".join(sys.argv), commit=_commit(), machine=common.describe_machine(), load=os.getloadavg()[0]
+        )
+    ]
     parts += [_view(workdir) for workdir in _WORKDIRS.value]
     if _TRAIN.value:
         parts += [_idle_cost(_TRAIN.value), _busy_cost(_TRAIN.value)]
@@ -59,7 +64,8 @@ def main(argv):
 
 _HEAD = """# The viewer in figures
 
-Written by `python {command}` at commit {commit} on {machine}.
+Written by `python {command}` at commit {commit} on {machine}, load average {load:.1f}: above the number of
+cores other programs slowed the wall-clock times, and CPU times are the better guide.
 
 Latency is the time from a camera message to the encoded image (JPEG), without network and browser, while a camera is
 dragged (20 messages a second) in a window of this size. The viewer selects the size of its frames so that it keeps ten
@@ -82,8 +88,8 @@ def _view(workdir):
     aspect = float(views.size[0, 1]) / float(views.size[0, 0])
     lines = [
         f"## {pathlib.Path(workdir).name}, step {step:,}\n",
-        "| longer side | frames per second while moving, at this size | full quality | latency, median (90 %) | frames "
-        "per second and their size while dragged |",
+        "| longer side | frames per second while moving, at this size (of CPU time) | full quality (CPU time) "
+        "| latency, median (90 %) | frames per second and their size while dragged |",
         "|---|---|---|---|---|",
     ]
     for side in SIDES:
@@ -92,24 +98,28 @@ def _view(workdir):
         fast, own = (_seconds_per_frame(renderer, state, cameras, fast=fast) for fast in (True, False))
         latencies, rate, size = _dragged(renderer, state, cameras)
         middle, most = statistics.median(latencies), np.quantile(latencies, 0.9)
-        lines.append(
-            f"| {side} px | {1 / fast:.1f} | {own:.2f} s | {1000 * middle:.0f} ms ({1000 * most:.0f} ms) "
-            f"| {rate:.1f} at {size[0]} x {size[1]} px |"
-        )
+        cells = [
+            f"{side} px",
+            f"{1 / fast[0]:.1f} ({1 / fast[1]:.1f})",
+            f"{own[0]:.2f} s ({own[1]:.2f} s)",
+            f"{1000 * middle:.0f} ms ({1000 * most:.0f} ms)",
+            f"{rate:.1f} at {size[0]} x {size[1]} px",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
 
 
 def _seconds_per_frame(renderer, state, cameras, *, fast):
-    """Returns the median seconds of rendering and encoding a frame along the path."""
+    """Returns the median seconds of rendering and encoding a frame along the path, and those of CPU time."""
     chosen = cameras[:: len(cameras) // _FRAMES][:_FRAMES]
     call = functools.partial(_rendered, renderer, state, fast)
     call(chosen[0])
     seconds = []
     for camera in chosen:
-        started = time.perf_counter()
+        started = time.perf_counter(), time.process_time()
         call(camera)
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds)
+        seconds.append((time.perf_counter() - started[0], time.process_time() - started[1]))
+    return np.median(seconds, axis=0)
 
 
 def _rendered(renderer, state, fast, camera):
@@ -150,7 +160,11 @@ def _idle_cost(config):
     for _ in range(2):
         for viewer in spent:
             with tempfile.TemporaryDirectory() as folder:
-                flags = [f"--config.train.max_steps={_STEPS.value}", "--config.train.preview_every=0"]
+                flags = [
+                    f"--config.train.max_steps={_STEPS.value}",
+                    "--config.train.preview_every=0",
+                    "--config.train.log_every=20",
+                ]
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
                 process = _train(config, folder, *flags, *(["--viewer", "--viewer_port=0"] if viewer else []))
                 process.communicate()
@@ -275,4 +289,4 @@ def _commit():
 
 
 if __name__ == "__main__":
-    app.run(main)
+    cli.run(main)

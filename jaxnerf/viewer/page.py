@@ -46,13 +46,13 @@ class Page:
         self._closed, self._playing = threading.Event(), threading.Event()
         self._delivery, self._reported, self._kind = None, 0.0, None
         self._lock = threading.RLock()  # of what callbacks change
+        self._status = client.gui.add_markdown("waiting for the first image")  # other threads may report at once
 
     # The page as a whole
 
     def open(self) -> None:
         """Adds the controls, sets the first view and requests the first frame."""
         gui = self._client.gui
-        self._status = gui.add_markdown("waiting for the first picture")
         with gui.add_folder("Rendering"):
             self._mode = self._add(gui.add_dropdown("Show", MODES), lambda: self._redraw())
             self._resolution = self._add(gui.add_dropdown("Resolution (px)", RESOLUTIONS, initial_value="800"))

@@ -13,6 +13,7 @@ from jaxnerf.viewer.frame_renderer import Frame, FrameCamera, FrameRenderer, Sce
 
 FRAMES_PER_SECOND = 10.0  # while the camera moves
 _MIN_PIXELS = 32 * 32  # of a frame while the camera moves
+_PATIENCE = 3.0  # times as long as planned, after which an outdated frame of a moving camera is abandoned, too
 _MOVING = 0.5  # s after its last message in which a camera counts as moving
 _SMOOTHING = 0.3  # weight of the newest frame in the measured speed
 _FIRST_SPEED = 1e5  # px/s, before any frame has been measured
@@ -69,7 +70,9 @@ class RenderLoop:
 
     A frame is first rendered at a size that keeps FRAMES_PER_SECOND, then at twice that width and height, and so on up
     to the full size, and last with the run's own quality. A newer request of the same client, or one of a client whose
-    camera has just moved, abandons a frame between two chunks. A new scene replaces finished frames at full quality.
+    camera has just moved, abandons a larger frame between two chunks. The small frame of a moving camera is finished
+    unless it takes far too long: if each message of a drag abandoned it, there would be no image before the drag ends.
+    A new scene replaces finished frames at full quality.
     """
 
     def __init__(
@@ -165,12 +168,19 @@ class RenderLoop:
             with self._lock:
                 clients = self._clients.values()
                 others = not moving and any(other.scale == 0 and other.pending(self._state) for other in clients)
-                return self._closed or self._clients.get(key) is not client or client.version != version or others
+                outdated = client.version != version and (not moving or late())
+                return self._closed or self._clients.get(key) is not client or outdated or others
+
+        def late():
+            large = camera.width * camera.height > 2 * _MIN_PIXELS
+            return large and time.perf_counter() - started > _PATIENCE / FRAMES_PER_SECOND
 
         frame = self._renderer.render(state, camera, fast=not final, crop=request.crop, abandoned=abandoned)
         now = time.perf_counter()
         with self._lock:
             client.served = now
+            if frame is None and moving and client.version != version:
+                self._speed = 0.5 * min(self._speed, camera.width * camera.height / (now - started))
             if frame is None or self._clients.get(key) is not client:
                 return
             if not final:

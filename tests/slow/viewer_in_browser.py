@@ -30,7 +30,7 @@ TRAIN = ("--config=quickstart", "--config.train.save_every=200", "--config.train
 STEPS, MORE_STEPS = 400, 200  # of the first training, and of that which continues it
 SECONDS = 180  # that anything may take on a busy core
 RESOLUTION = "200"  # px
-MIDDLE = {"x": 150, "y": 150, "width": 300, "height": 300}  # px of the page, beside the controls
+MIDDLE = {"x": 150, "y": 190, "width": 480, "height": 400}  # px of the page, beside the controls
 
 
 def main(out):
@@ -124,11 +124,11 @@ def a_path_is_saved_and_rendered(page, run, out):
     number(page, "Seconds", "0.5")
     number(page, "Frames per second", "8")
     number(page, "Height (px)", "60")
-    page.get_by_label("Name", exact=True).fill("../escape")
+    page.locator('input[value="path"]').fill("../escape")
     page.get_by_role("button", name="Save", exact=True).click()
     page.get_by_text("expected up to 64 letters").wait_for(timeout=SECONDS * 1000)
     check(not list(run.parent.rglob("escape*")), "a name that leads out of the workdir is refused")
-    page.get_by_label("Name", exact=True).fill("mine")
+    page.locator('input[value="../escape"]').fill("mine")
     page.get_by_role("button", name="Save", exact=True).click()
     page.get_by_text("frames saved to").wait_for(timeout=SECONDS * 1000)
     page.screenshot(path=out / "path.png")

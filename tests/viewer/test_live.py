@@ -26,7 +26,7 @@ def test_a_training_is_shown_and_not_changed(trained, tmp_path):
 
     def observe(state, views):
         viewer.observe(state, views)
-        if int(state.step) in (5, 15):
+        if int(state.step) == 10:
             end = time.monotonic() + 120
             while viewer.port is None:
                 assert time.monotonic() < end
@@ -40,11 +40,13 @@ def test_a_training_is_shown_and_not_changed(trained, tmp_path):
             shown.append(page.image)
             page.close()
 
+    config = smoke_config()
+    config.occupancy.resolution, config.occupancy.step_size = 16, 0.1  # of the grid that the viewer extracts
     try:
-        assert train_observed(smoke_config(), tmp_path / "run", observe=observe)
+        assert train_observed(config, tmp_path / "run", observe=observe)
     finally:
         viewer.close()
-    assert len(shown) == 2 and None not in shown
+    assert len(shown) == 1 and shown[0]
     same, without = (restore_run(folder).variables(20) for folder in (tmp_path / "run", trained))
     assert jax.tree.all(jax.tree.map(np.array_equal, same, without)), "training does not depend on its viewer"
 

@@ -100,21 +100,47 @@ def test_a_moving_camera_keeps_ten_frames_a_second(watched):
     assert all(4 < delivery.frames_per_second < 30 for delivery in moving)
 
 
+def test_a_drag_shows_images_while_it_lasts(watched):
+    """Although messages come faster than frames are rendered."""
+    it = watched()
+    it.renderer.seconds = 0.02
+    end = time.monotonic() + 1.5
+    while time.monotonic() < end:
+        it.submit(x=time.monotonic(), width=800, height=400)
+        time.sleep(0.01)
+    assert len(it.got) >= 5
+    late = time.monotonic() - it.got[-1][1].frame.camera.to_world[0, 3]
+    assert late < 0.6, "the latest camera is shown, not one of a queue"
+
+
 def test_an_outdated_frame_is_abandoned_within_a_chunk_and_the_latest_camera_wins(watched):
     it = watched()
     it.submit(x=1)
     it.wait()
     it.renderer.hold.clear()
-    it.submit(x=2)
-    time.sleep(0.05)  # the thread waits in a chunk of x = 2
+    it.loop.set_scene(SimpleNamespace(step=2))
+    time.sleep(0.05)  # the thread waits in the first chunk of a frame of full size
     it.submit(x=3)
     it.submit(x=4)
     it.renderer.hold.set()
     it.wait()
     found = [(call.camera.to_world[0, 3], call.abandoned, call.chunks) for call in it.renderer.calls]
-    assert (2.0, True, 0) in found
+    assert (1.0, True, 0) in found
     assert 3.0 not in [x for x, _, _ in found]
     assert it.got[-1][1].final and it.got[-1][1].frame.camera.to_world[0, 3] == 4
+
+
+def test_a_frame_of_a_moving_camera_that_takes_far_too_long_is_abandoned(watched):
+    it = watched()
+    it.renderer.seconds = 0.05  # a fifth of the speed that is assumed at first
+    it.submit(x=1)
+    time.sleep(0.05)
+    it.submit(x=2)
+    while len(it.got) < 1:
+        time.sleep(0.01)
+    first, second = it.renderer.calls[:2]
+    assert first.abandoned and first.chunks < 10
+    assert second.camera.width < 0.7 * first.camera.width
 
 
 def test_a_moving_camera_comes_before_the_refinement_of_another(watched):
