@@ -50,7 +50,7 @@ def test_a_number_outside_its_range_makes_no_workdir(tmp_path, field, value, exp
         ("sampling.rule", "simpson", "expected one of"),
         ("sampling.stratified", None, "expected bool"),
         ("train.batch_size", 0, "expected at least 1"),
-        ("train.batch_size", True, "expected int"),
+        ("train.cpu_batch_size", True, "expected int"),
         ("train.lr_init", math.inf, "expected a finite number"),
         ("train.lr_init", [1], "expected float"),
         ("hash_grid.resolutions", (), "expected 1 to 64 whole numbers"),
