@@ -72,6 +72,8 @@ def source_of(scene=ball, *, say=lambda line: None, **settings):
         render=None,
         identity="",
         render_image=lambda variables, rays, median_depth=False: compiled(rays),
+        variables_of=None,
+        model_with=None,
     )
     settings = {"resolution": 32, "size": SIZE, **settings}
     return ExportSource(run, 7, (None, grid), views, ExportSettings(**settings), say)

@@ -1,11 +1,10 @@
 """The mutation study: its mutants are valid programs that differ from the module by one expression."""
 
 import ast
-import pathlib
-import sys
 
-sys.path.append(str(pathlib.Path(__file__).resolve().parents[2] / "experiments" / "stability"))
-import mutation_study as study
+from studies import study as import_study
+
+study = import_study("stability/mutation_study")
 
 SOURCE = '''"""One 1."""
 def f(x: Float[Array, "1"], n=2) -> int:
