@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxnerf.capture_check.report import Report
 from jaxnerf.core.types import Camera
+from jaxnerf.data.geometry.poses import up_of
 from jaxnerf.data.images.image_files import open_image
 from jaxnerf.runtime.atomic_files import partial_file
 
@@ -72,7 +73,7 @@ def is_plot_of(path: str | os.PathLike, folder: str | os.PathLike) -> bool:
 
 def _axes(poses: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, "3 3"]:
     """Returns the signed world axes that point right, away and up in the plots, as rows."""
-    mean = poses[:, :, 1].sum(axis=0)
+    mean = up_of(poses)
     up = int(np.abs(mean).argmax())
     right, deep, up = np.roll(np.eye(3), -1 - up, axis=0)
     sign = -1.0 if mean @ up < 0 else 1.0

@@ -4,7 +4,9 @@ A track of matched corners fits the cameras if one point in space explains it to
 in twenty random matches does.
 """
 
+import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,6 +28,8 @@ from jaxnerf.capture_check.tracks import (
     subset,
     triangulate,
 )
+from jaxnerf.capture_check.view_evidence import find_alternative, support
+from jaxnerf.core.cameras import project
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import Capture
 
@@ -42,7 +46,13 @@ _RARE = 0.2  # median fraction of matches that fit, below which views share too 
 _MIN_CIRCLES = 15  # matches that close a circle
 _CLOSED = 0.5  # fraction of these that fits if poses are right; mostly above 0.8
 _NONE = 0.1  # the same if all poses are wrong; an object with two equal sides closes circles that fit to 0.2
-_TRUSTED = 0.33  # median fraction of matches that fit, above which one unusual image is an error
+_MIN_SUPPORT, _MIN_CAMERAS = 30, 3  # guided matches, beyond those by chance, and cameras that confirm another pose
+_OWN_FRACTION = 0.6  # of these, below which an image's own pose is wrong
+_OWN_FRACTION_IN_MODEL = 0.4  # the same where the dataset's own reconstruction confirms the pose
+_MIN_CONFIDENCE = 0.999
+_MIN_OBSERVATIONS = 30  # of the reconstruction in one image, to confirm it
+_GUIDED = 0.6  # guided matches per match, above which most poses are right; mostly 0.75, at random poses 0.4 or less
+_SAMPLE = 12  # views that tell whether all poses are wrong
 _PARALLAX = np.deg2rad(1.5)  # between the rays of a point whose depth counts
 
 
@@ -142,7 +152,10 @@ def judge_focal(capture: Capture, evidence: Evidence) -> tuple[list[Finding], Ev
 
 
 def judge_views(capture: Capture, evidence: Evidence) -> list[Finding]:
-    """Returns Findings about images that do not belong to their cameras: swapped, or with a wrong pose."""
+    """Returns Findings about images that do not belong to their cameras: swapped, or with a wrong pose.
+
+    An image is accused only if another pose explains several times as many guided matches, see `view_evidence`.
+    """
     views = range(len(capture.frames))
     fit, matches = np.array([_fits(evidence, view, view) for view in views]).T
     fraction = fit / np.maximum(matches, 1)
@@ -150,18 +163,15 @@ def judge_views(capture: Capture, evidence: Evidence) -> list[Finding]:
     if usual < _RARE:
         return _judge_all(capture, evidence)
     odd = [view for view in views if fraction[view] < _UNUSUAL * usual and len(evidence.keypoints[view].points)]
-    findings = []
-    for first, second in itertools.combinations(odd, 2):
-        if first not in odd or second not in odd:
-            continue
-        swapped = _fits(evidence, first, second), _fits(evidence, second, first)
-        if all(good >= 8 and good > 0.6 * usual * count for good, count in swapped):
-            one, two = capture.frames[first].image, capture.frames[second].image
-            found = f"{one} and {two} each show the view of the other's camera"
-            expected, change = "each image at its own camera", "rename the two files to each other"
-            findings.append(Finding("error", "swap", found, expected, change, (first, second)))
-            odd = [view for view in odd if view not in (first, second)]
-    return findings + [finding for view in odd for finding in _judge_view(capture, evidence, view, usual)]
+    found = {view: find_alternative(evidence, view, without=odd) for view in odd}
+    accused = {view: other for view, other in found.items() if other and _is_certain(capture, evidence, view, other)}
+    findings, left = [], set(accused)
+    for first, second in itertools.combinations(accused, 2):
+        if {first, second} <= left and _are_swapped(evidence.poses, first, second, accused):
+            findings.append(_swap(capture, first, second, accused))
+            left -= {first, second}
+    findings += [_wrong_pose(capture, evidence, view, accused[view]) for view in sorted(left)]
+    return findings + [_unknown(capture, view) for view in odd if matches[view] < _MIN_CIRCLES]
 
 
 def points_of(evidence: Evidence) -> tuple[Float[np.ndarray, "N 3"], Tracks]:
@@ -243,29 +253,84 @@ def _fitting(tracks, poses, scale):
     return float((errors(tracks, poses, scale) < INLIER).mean()) if len(tracks.shown) else 0.0
 
 
-def _judge_view(capture, evidence, view, usual):
-    """Returns Findings about an image that does not fit its neighbours."""
-    own = evidence.keypoints[view]
-    counts = [(match(own, other) >= 0).sum() if k != view else 0 for k, other in enumerate(evidence.keypoints)]
-    others = np.argsort(counts, kind="stable")[::-1][: evidence.near.shape[1]]  # by content, whatever the poses
-    confirmed, fraction = _closed_circles(evidence, [(view, others)])
-    if confirmed >= _MIN_CIRCLES and fraction > _CLOSED:
-        return []  # it fits other views: its neighbours are too far away or look in another direction
+def _is_certain(capture, evidence, view, other):
+    """Returns whether an Alternative is enough to accuse an image."""
+    limit = _OWN_FRACTION
+    if len(_track_errors(capture, evidence, view)) >= _MIN_OBSERVATIONS:
+        limit = _OWN_FRACTION_IN_MODEL if np.median(_track_errors(capture, evidence, view)) < INLIER else limit
+    enough = other.other.matches >= _MIN_SUPPORT and other.other.cameras >= _MIN_CAMERAS
+    enough &= _confidence(other) > _MIN_CONFIDENCE
+    return enough and other.own.matches < limit * other.other.matches
+
+
+def _track_errors(capture, evidence, view):
+    """Returns the reprojection errors of the points that the dataset's own model has in a view, px; none without."""
     frame = capture.frames[view]
+    if frame.seen is None or capture.points is None or not len(frame.seen):
+        return np.zeros(0)
+    camera = dataclasses.replace(frame.camera, to_world=evidence.poses[view])
+    shown, depth = project(camera, capture.points[frame.seen])
+    off = np.linalg.norm(np.asarray(shown) - frame.seen_at, axis=1)
+    scale = evidence.scale[view] / np.mean(camera.focal)
+    return np.where(np.asarray(depth) > 0, np.nan_to_num(off, nan=np.inf) * scale, np.inf)
+
+
+def _are_swapped(poses, first, second, accused):
+    """Returns whether each of two images was taken from about the place of the other's camera."""
+    eyes = poses[:, :, 3]
+    apart = np.linalg.norm(eyes[first] - eyes[second])
+    off = [
+        np.linalg.norm(accused[image].pose[:, 3] - eyes[camera]) for image, camera in ((first, second), (second, first))
+    ]
+    return max(off) < 0.3 * apart
+
+
+def _numbers(other):
+    return (
+        f"{other.other.matches:.0f} matches with {other.other.cameras} cameras, beyond those by chance, fit another "
+        f"place, {max(other.own.matches, 0):.0f} fit its own (confidence {percent(_confidence(other), 1)})"
+    )
+
+
+def _confidence(other):
+    """Returns the probability that the other pose is better: the counts are sums of many rare events."""
+    spread = np.sqrt(other.other.matches + max(other.own.matches, 0) + 1)
+    return 0.5 + 0.5 * math.erf((other.other.matches - other.own.matches) / spread / math.sqrt(2))
+
+
+def _swap(capture, first, second, accused):
+    one, two = capture.frames[first].image, capture.frames[second].image
+    found = f"{one} and {two} each show the view of the other's camera: of the first, {_numbers(accused[first])}"
+    expected, change = "each image at its own camera", "rename the two files to each other"
+    return Finding("error", "swap", found, expected, change, (first, second))
+
+
+def _wrong_pose(capture, evidence, view, other):
+    frame, pose = capture.frames[view], evidence.poses[view]
+    cosine = (np.trace(pose[:, :3].T @ other.pose[:, :3]) - 1) / 2
+    angle, away = np.degrees(np.arccos(np.clip(cosine, -1, 1))), np.linalg.norm(pose[:, 3] - other.pose[:, 3])
+    found = f"{frame.image} does not show the view of its camera: {_numbers(other)}"
+    found += f"; the other place is {away:.3g} world units away and turned by {angle:.0f} degrees"
     change = f"{frame.name} in {capture.source}: correct its pose or its file, or remove it"
-    if confirmed >= _MIN_CIRCLES:
-        found = (
-            f"{frame.image} does not show the view of its camera: {percent(fraction)} of {confirmed} matches "
-            "confirmed by a third image fit"
-        )
-        severity = "error" if usual > _TRUSTED else "warning"
-        return [Finding(severity, "pose", found, "nearly all", change, (view,))]
-    found = f"{frame.image} has no corner that its neighbours show"
-    return [Finding("warning", "pose", found, "overlap", change, (view,))]
+    return Finding("error", "pose", found, "its own place", change, (view,))
+
+
+def _unknown(capture, view):
+    found = f"{capture.frames[view].image} cannot be judged, as it has hardly a corner that its neighbours show"
+    return Finding("warning", "overlap", found, "overlap", "nothing, or look at that image", (view,))
 
 
 def _judge_all(capture, evidence):
     """Returns Findings if hardly any match fits, because all poses are wrong or views are too far apart."""
+    views = range(0, len(evidence.poses), -(-len(evidence.poses) // _SAMPLE))
+    guided = sum(support(evidence, view, evidence.poses[view], evidence.near[view]).matches for view in views)
+    free = sum(
+        (match(evidence.keypoints[view], evidence.keypoints[k]) >= 0).sum()
+        for view in views
+        for k in evidence.near[view]
+    )
+    if guided > _GUIDED * free:
+        return []  # the texture repeats itself: matches that know nothing of the cameras are wrong
     confirmed, fraction = _closed_circles(evidence, list(enumerate(evidence.near)))
     if confirmed < _MIN_CIRCLES:
         found = f"{capture.source}: the images have too little in common to judge the poses"

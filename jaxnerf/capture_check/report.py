@@ -12,7 +12,7 @@ from jaxnerf.capture_check import images as images_module
 from jaxnerf.capture_check.findings import Finding, percent
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.path_poses import coverage
-from jaxnerf.data.geometry.poses import gaze_center
+from jaxnerf.data.geometry.poses import gaze_center, up_of
 from jaxnerf.data.geometry.world import looks_forward, poses_of
 from jaxnerf.data.images.load_images import split_indices
 from jaxnerf.data.readers import base
@@ -70,7 +70,7 @@ def inspect(
     """
     available = base.detect_formats(folder)
     whole = base.read_capture(folder, format)
-    capture = _subset(whole)
+    capture = subset(whole)
     images, findings = images_module.read(capture)
     near_views = tracks.neighbours(poses_of(capture))
     findings += images_module.compare(capture, images, near_views)
@@ -99,7 +99,7 @@ def inspect(
     return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path)
 
 
-def _subset(capture):
+def subset(capture: Capture) -> Capture:
     """Returns the capture with every n-th frame if there are very many."""
     step = -(-len(capture.frames) // _MAX_IMAGES)
     return capture if step == 1 else capture._replace(frames=capture.frames[::step], splits=None)
@@ -129,6 +129,9 @@ def _camera_facts(capture, evidence):
     angle = 2 * np.degrees(np.arctan(0.5 * size / focal))
     off = np.asarray(first.center) - size / 2
     lenses = _counted(Counter(camera.lens for camera in stack))
+    each = sorted({float(np.mean(camera.focal)) for camera in stack})
+    if len(each) > 1:
+        lenses += f"; {len(each)} different cameras, with focal lengths of {each[0]:.5g} to {each[-1]:.5g} px"
     middle = gaze_center(poses)
     distance = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
     up, tilt = _up_axis(poses)
@@ -186,14 +189,9 @@ def _view_direction(capture):
     return "inwards" if inwards > 0.9 else "outwards" if inwards < 0.1 else "along a path"
 
 
-def _mean_up(poses):
-    up = poses[:, :, 1].sum(axis=0)
-    return up / max(np.linalg.norm(up), 1e-12)
-
-
 def _up_axis(poses):
-    """Returns (the world axis nearest to the cameras' mean up, degrees between the two)."""
-    up = _mean_up(poses)
+    """Returns (the world axis nearest to up, by which jaxnerf-render turns its paths; degrees between the two)."""
+    up = up_of(poses)
     axis = int(np.abs(up).argmax())
     angle = np.degrees(np.arccos(np.clip(abs(up[axis]), 0, 1)))
     return f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}", float(angle)

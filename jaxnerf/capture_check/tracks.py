@@ -99,10 +99,21 @@ def match(first: Keypoints, second: Keypoints) -> Int[np.ndarray, " N"]:
     return result
 
 
-def follow(keypoints: Sequence[Keypoints], near: Int[np.ndarray, "V K"]) -> Tracks:
-    """Returns the Tracks of the corners of all views through their neighbours."""
+def follow(
+    keypoints: Sequence[Keypoints],
+    near: Int[np.ndarray, "V K"] | Sequence[Sequence[int]],
+    *,
+    first: Sequence[int] | None = None,
+) -> Tracks:
+    """Returns the Tracks of the corners of views through their neighbours.
+
+    Args:
+        keypoints: of all views.
+        near: the neighbours of each of the views that tracks begin in.
+        first: these views; None: all.
+    """
     parts = []
-    for view, others in enumerate(near):
+    for view, others in zip(range(len(near)) if first is None else first, near, strict=True):
         matches = [match(keypoints[view], keypoints[other]) for other in others]
         indices = np.stack([np.arange(len(keypoints[view].points)), *matches], axis=1)
         parts.append(_tracks(keypoints, (view, *others), indices[(indices >= 0).sum(axis=1) > 1]))

@@ -95,6 +95,7 @@ def write_capture(
     white_balance: float = 0.0,
     pose_noise: float = 0.0,
     num_points: int = 4000,
+    repetition: float = 0.0,
     image_format: str = "png",
     seed: int = 0,
 ) -> GroundTruth:
@@ -117,6 +118,8 @@ def write_capture(
         pose_noise: standard deviation about each axis of the errors of the training views' poses in the file, in
             degrees; positions have errors of 0.01 world units per degree.
         num_points: sparse points on textured surfaces that three training views see; 0: none.
+        repetition: period of equal dots that replace the colours of all surfaces, world units; 0: the room's own
+            colours. Matches between such images are ambiguous.
         image_format: "png", or "jpg" with quality 95.
         seed: of everything random.
 
@@ -135,6 +138,9 @@ def write_capture(
     far = _far_poses(num_far, lens, *train, seed)
     far_rgb, far_depth = _render_all(lens, far)
     poses, rgb, depth = (np.concatenate(pair) for pair in ((path, far), (rgb, far_rgb), (depth, far_depth)))
+    if repetition:
+        surfaces = (_surface(lens, *view) for view in zip(poses, depth, strict=True))
+        rgb = np.stack([_dots(x, repetition) for x in surfaces]).reshape(rgb.shape)
     num_seen = np.zeros(depth.shape, np.uint16)
     for index in range(num_views, len(poses)):
         seen = _sightings(_surface(lens, poses[index], depth[index]), lens, *train)
@@ -224,6 +230,13 @@ def _render_all(lens, poses):
 def _surface(lens, pose, depth):
     """Returns the surface points [H * W, 3] of a depth map."""
     return (pose[:, 3] + depth[..., None] * (lens.slopes @ pose[:, :3].T)).reshape(-1, 3)
+
+
+def _dots(x, period):
+    """Returns the colour [..., 3] of surface points [..., 3]: equal blurred dots on a lattice."""
+    phase = np.cos(2 * np.pi * x / period).sum(axis=-1, keepdims=True)
+    shade = 1 / (1 + np.exp(-4 * (phase - 1)))
+    return np.array([0.85, 0.8, 0.7]) + shade * (np.array([0.25, 0.2, 0.35]) - [0.85, 0.8, 0.7])
 
 
 def _sightings(x, lens, poses, depths):
