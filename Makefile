@@ -23,7 +23,7 @@ demo: $(BIN)/.installed
 	$(BIN)/python experiments/results/table.py $(DEMO)
 
 test: $(BIN)/.dev
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not extra"
 
 test-slow: $(BIN)/.dev
 	$(PYTEST) -m slow
@@ -31,6 +31,7 @@ test-slow: $(BIN)/.dev
 # These take longer, need root to mount small disks, or need Chromium; .ci/run does not call them.
 test-extra: $(BIN)/.dev
 	$(BIN)/pip install --quiet --editable '.[notebooks]'
+	$(PYTEST) -m extra
 	$(BIN)/python tests/slow/notebooks.py
 	$(BIN)/python tests/slow/minimal_nerf.py
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/device_matrix.py runs/extra/device_matrix

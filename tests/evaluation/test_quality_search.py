@@ -43,7 +43,7 @@ def test_a_budget_that_no_setting_meets_is_an_error():
         quality_search._fastest(candidates, 0.1, "runs/a")
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_a_baked_grid_removes_nothing_visible(trained, monkeypatch):
     """The baked grid changes colours by less than five steps of 8 bits against the full grid of its box."""
 

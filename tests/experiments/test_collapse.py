@@ -28,7 +28,7 @@ def test_painted_backgrounds_count_runs_hardly_better_than_the_background():
     assert collapse.painted_summary(rows) == cells
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_captures_with_painted_backgrounds_train():
     """With a plain sigmoid, both seeds in front of black and one of two in front of white collapse."""
     collapse = study("stability/collapse")

@@ -32,7 +32,7 @@ def ball(x, viewdirs):
     return 40 * jax.nn.sigmoid(20 * inside), 0.5 + 0.4 * jnp.sin(5 * x) + 0.1 * viewdirs
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_cameras_are_recovered():
     renders = refine_pose.through(ball, 192), refine_pose.through(ball, 64)
     for seed in range(3):

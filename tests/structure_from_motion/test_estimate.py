@@ -211,7 +211,7 @@ def test_a_stage_that_fails_names_the_log(tmp_path, stage, reason):
     assert stage is killed_stage or "no such thing" in log.read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 @pytest.mark.scenes("can")
 def test_cameras_of_a_few_images_agree_with_the_given_ones_and_an_interrupted_call_continues(scenes_dir, tmp_path):
     pytest.importorskip("pycolmap")

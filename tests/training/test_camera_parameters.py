@@ -138,7 +138,7 @@ def recover(views, num_steps, *, exposure=False, refine=False):
     return parameters, state.params
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_a_drift_of_exposure_is_recovered():
     drift = np.float32(np.random.default_rng(1).normal(size=(COUNT, 3)) * 0.15)
     gains = exposure_gains(drift)
@@ -146,7 +146,7 @@ def test_a_drift_of_exposure_is_recovered():
     np.testing.assert_allclose(exposure_gains(found[CAMERAS]["log_gains"]), gains, rtol=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_pose_noise_and_focal_length_are_recovered():
     truth = cameras()
     noisy = corrected(truth, random_twists(2, 0.01))

@@ -228,7 +228,7 @@ def test_dead_run_is_reinitialized_and_learns(reinitialized):
     assert len(set(scores[:4])) == 1 and scores[5:] == sorted(set(scores[5:]))
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_reinitialized_network_learns():
     model, start, _ = network()
     dead = with_biases(start, density=EMPTY)

@@ -149,7 +149,7 @@ def test_empty_cells_hold_no_matter(tiny):
     assert abs(tiny.score(everywhere) - tiny.score(state)) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_early_occlusion_costs_little_as_occluded_rays_do_not_show_the_background(tiny):
     """An estimate that hides matter which has not formed yet must not prevent it from forming.
 
@@ -164,7 +164,7 @@ def test_early_occlusion_costs_little_as_occluded_rays_do_not_show_the_backgroun
     assert (ours - untreated > 0.8).all()
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_no_seed_collapses(tiny):
     scores = tiny.scores(SEEDS, EARLY)
     assert scores.min() > 20.5 and np.ptp(scores) < 3, scores
