@@ -38,7 +38,10 @@ _MAX_FACES = flags.DEFINE_integer(
     "max_faces", 0, "mesh: the number of triangles to which it is decimated; 0: it is not."
 )
 _CLOSED = flags.DEFINE_bool(
-    "closed", False, "mesh: whether space that no training view sees counts as solid, so that the mesh has no holes."
+    "closed",
+    False,
+    "mesh: whether to close holes: with the surfaces that the field happens to hold where no training view looks, and "
+    "else as if what is not seen were solid.",
 )
 _MIN_PIECE = flags.DEFINE_float(
     "min_piece", 0.005, "mesh: connected pieces with fewer triangles than this fraction of all are dropped."

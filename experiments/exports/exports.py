@@ -40,7 +40,7 @@ _KINDS = {
     "points": ("points", {}),
     "splats": ("splats", {}),
 }
-_SAMPLES = 400_000  # points on each surface
+_SAMPLES = 150_000  # points on each surface
 _EXTENT = 1.2  # half the side of the box that holds the scene
 
 _opaque, _glass = jax.jit(opaque_distance), jax.jit(glass_distance)

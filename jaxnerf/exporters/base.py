@@ -29,7 +29,8 @@ class ExportSettings(NamedTuple):
         num_views: the largest number of training views whose poses are rendered, spread evenly over all.
         num_points: the largest number of points or Gaussians.
         format: of a mesh, "ply", "glb" or "obj".
-        closed: whether space that no training view sees counts as solid, so that a mesh has no holes.
+        closed: whether a mesh has no holes: where no training view looks, it has the surfaces of the field, which was
+            not trained there, and what nothing shows to be free is solid.
         max_faces: the number of triangles to which a mesh is decimated; 0: it is not.
         min_piece: connected pieces of a mesh with fewer triangles than this fraction of all are dropped.
     """

@@ -51,7 +51,9 @@ def grid_shape(box: Float[np.ndarray, "2 3"], resolution: int) -> tuple[float, t
     return voxel, tuple(int(count) for count in np.ceil(sides / voxel - 1e-9).astype(int) + 1)
 
 
-def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution: int) -> Fused:
+def fuse(
+    images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution: int, *, closed: bool = False
+) -> Fused:
     """Fuses depth images.
 
     The distance of a vertex from a surface is measured along the normal at the pixel that sees the vertex, not along
@@ -59,12 +61,14 @@ def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution
     the normal and by the light that the surface absorbs within the truncation: views along a surface and those
     into glass or fog are least accurate. Vertices well in front of a surface, and those before empty space, count as
     outside; those behind a surface are not seen. Pixels at the edges of surfaces are not used. What no
-    image at the pose of a training view sees, at whatever angle, is unknown: the field is arbitrary there.
+    image at the pose of a training view sees, at whatever angle, is unknown unless the surface is to be closed: the
+    field was not trained there, but it often continues what it was trained on.
 
     Args:
         images: all of one size.
         box: what is fused.
         resolution: voxels along its longest side.
+        closed: whether all images count, see above.
 
     Returns:
         Fused, without a vertex if no surface is in the box.
@@ -79,7 +83,7 @@ def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution
     for image, (points, normal, cosine) in zip(images, surfaces, strict=True):
         absorbed = -np.expm1(-np.maximum(image.extinction, 0) * truncation)
         weight = np.where(np.isinf(image.depth), _EMPTY_WEIGHT, cosine * absorbed)
-        trained = np.full_like(image.depth, image.name is not None) * (image.depth > 0)
+        trained = np.float32((image.depth > 0) & (closed or image.name is not None))
         planes = [np.stack([image.depth, weight, trained], axis=-1), points, normal, image.rgb]
         planes = np.concatenate(planes, axis=-1).astype(np.float32)
         total = _integrate(total, image.camera, planes, x, np.float32(truncation))
@@ -91,7 +95,7 @@ def fuse(images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution
 
 
 def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray, "X Y Z"]:
-    """Computes a field for `level_set` in which all space is solid that no training view sees to be free.
+    """Computes a field for `level_set` in which all space is solid that no image sees to be free.
 
     The boundary between the two closes the holes of the surface (Curless and Levoy 1996, Section 4). It is found at
     every second vertex.
@@ -107,8 +111,7 @@ def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray,
     x = np.float32(fused.lower + 2 * fused.voxel * np.stack(np.indices(coarse), axis=-1))
     free = jnp.zeros(coarse, bool)
     for image in images:
-        if image.name is not None:
-            free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
+        free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
     field = 2 * np.asarray(free, np.float32) - 1.01  # nowhere 0 below, which would make degenerate triangles
     for axis, size in enumerate(fused.shape):
         place = np.arange(size)

@@ -29,7 +29,7 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     box = export_box(source, images)
     _, shape = grid_shape(box, settings.resolution)
     check_memory(_BYTES_PER_VOXEL * float(np.prod(shape)), memory.available(), "give a smaller --resolution or --box")
-    fused = fuse(images, box, settings.resolution)
+    fused = fuse(images, box, settings.resolution, closed=settings.closed)
     vertices, faces, rgb = level_set(fused, solid_field(images, fused) if settings.closed else None)
     if not len(faces):
         raise ValueError(f"no surface is in the box {np.round(box, 4).tolist()}; give another --box")
