@@ -175,8 +175,10 @@ def median_depth(
     "gauss" it is exact within 0.08 delta.
 
     Args:
-        density, length: [..., S], as in weights_from_density.
-        t, delta: [..., S] in t, the fields of Samples.
+        density: [..., S], as in weights_from_density.
+        length: as density.
+        t: [..., S] in t, the fields of Samples.
+        delta: as t.
         far: [...] in t.
         rule: the rule of the samples. With "points", a segment begins at its sample.
 
