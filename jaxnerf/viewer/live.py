@@ -160,7 +160,7 @@ class LiveViewer:
 
 
 def score_of(workdir: str | os.PathLike, step: int) -> str:
-    """Returns what a workdir tells of a checkpoint's quality: its evaluation, or the loss of training; "" for none."""
+    """Returns the evaluation of a checkpoint as text, or else its training loss; "" without either."""
     workdir = pathlib.Path(workdir)
     try:
         found = atomic_files.read_json(workdir / "eval" / str(step) / "results.json", "score it again")
