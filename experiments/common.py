@@ -226,6 +226,14 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(cells) + " |" for cells in (heads, ["---"] * len(heads), *rows)]
 
 
+def provenance() -> list[str]:
+    """Returns the lines of a table with this program's command line, the commit, today's date and the machine."""
+    program = pathlib.Path(sys.argv[0]).resolve().relative_to(ROOT)
+    command = " ".join(["python", str(program), *sys.argv[1:]])
+    row = (f"`{command}`", f"{commit()}, {time.strftime('%F')}", describe_machine())
+    return markdown(("command", "commit", "machine"), [row])
+
+
 def publish(lines: Sequence[str], name: str) -> None:
     """Prints the lines of a study; with --page replaces the table of that name in the file, too."""
     print("\n".join(lines))

@@ -11,7 +11,6 @@ there. Seconds include compilation. The PSNR of splats is that of held-out views
 """
 
 import pathlib
-import subprocess
 import sys
 import time
 
@@ -74,14 +73,8 @@ def main(argv: list[str]) -> None:
     lines += common.markdown(("export", "seconds", "MB", "what the program says"), rows)
     print("\n".join(lines))
     if _OUT.value:
-        write_text(_OUT.value, "\n".join([*_head(), *lines, ""]))
-
-
-def _head():
-    command = " ".join(["python", "experiments/exports/exports.py", *sys.argv[1:]])
-    row = [f"`{command}`", f"{commit()}, {time.strftime('%F')}", common.describe_machine()]
-    table = common.markdown(("command", "commit", "machine"), [row])
-    return ["# Exports", "", *table, "", *__doc__.strip().split("\n\n", 2)[2].splitlines(), ""]
+        head = ["# Exports", "", *common.provenance(), "", *__doc__.strip().split("\n\n", 2)[2].splitlines(), ""]
+        write_text(_OUT.value, "\n".join([*head, *lines, ""]))
 
 
 def chamfer(mesh: trimesh.Trimesh) -> dict[str, float]:
@@ -115,12 +108,6 @@ def _on_surface(x):
     for _ in range(3):
         x = x - opaque_distance(x)[:, None] * jax.vmap(jax.grad(opaque_distance))(x)
     return x
-
-
-def commit() -> str:
-    """Returns the commit of the working tree, with a plus sign if files differ from it."""
-    call = ["git", "-C", str(common.ROOT), "describe", "--always", "--dirty=+", "--exclude=*"]
-    return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measures rays/s, memory, collective bytes and compile time against devices and processes, and models many more.
 
-    python experiments/scaling/scaling.py --config=quickstart --out=DIR [--devices=1,2,4,8] [--processes=2]
+    python experiments/scaling/scaling.py --config=embedded_small --out=DIR [--devices=1,2,4,8] [--processes=2]
 
 Each row is a process of its own (or two) with so many virtual CPU devices, which share the cores that there are: more
 devices than cores cannot be faster, and show the cost of splitting. Writes DIR/scaling.json, DIR/scaling.md and, with
@@ -39,7 +39,7 @@ _DEVICES = flags.DEFINE_list("devices", ["1", "2", "4", "8"], "Numbers of device
 _PROCESSES = flags.DEFINE_integer("processes", 2, "Also measure so many processes with two devices each; 0: none.")
 _STEPS = flags.DEFINE_integer("steps", 20, "Number of steps that are timed.", lower_bound=2)
 _PROCESS = flags.DEFINE_string("process", None, "Internal: port,count,index of the process that measures here.")
-flags.FLAGS.set_default("config", "quickstart")
+flags.FLAGS.set_default("config", "embedded_small")
 _COUNTS = (1, 8, 16, 32, 64, 128)
 # The paper's two networks: 64 and 64 + 128 evaluations per ray, with batches of 4096 rays (arXiv:2003.08934).
 PAPER = {"parameters": (595_844, 595_844), "evaluations": (64, 192), "rays": 4096}

@@ -2,9 +2,9 @@
 
     python experiments/stability/reproducibility.py --out=DIR [--steps=600] [--seeds=0,1,2,3,4] [--page=FILE.md]
 
-Trains configs/quickstart.py (the embedded scene): each seed in a process of its own, the first twice, and the first
+Trains configs/embedded_small.py (the embedded scene): each seed in a process of its own, the first twice, and the first
 on four virtual CPU devices. Compares parameters bit for bit, gives the spread of PSNR over the seeds, and the drift of
-the parameters between one device and four after DRIFT steps, with the learning rate of quickstart.py and with the
+the parameters between one device and four after DRIFT steps, with the learning rate of embedded_small.py and with the
 paper's. Runs that DIR holds are not repeated. With --page the lines replace what lies between
 <!-- reproducibility --> and <!-- end of reproducibility --> in that file.
 """
@@ -27,7 +27,7 @@ from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime import cli
 
 DRIFT = 50  # steps
-# Taken from default.py, the paper's, for quickstart.py, whose learning rate is sixteen times as high.
+# Taken from default.py, the paper's, for embedded_small.py, whose learning rate is sixteen times as high.
 _PAPER_ADAM = ("lr_init", "lr_final", "lr_steps", "warmup_steps", "beta2")
 _DEVICES = "--xla_force_host_platform_device_count="
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs.", required=True)
@@ -103,7 +103,7 @@ def report(
         same = f"{again.differ:,} of {again.count:,} parameters differ, by up to {again.largest:.1e}"
     listed = ", ".join(f"{value:.2f}" for value in scores.values())
     return [
-        f"`quickstart.py` by Adam alone for {steps:,} steps:",
+        f"`embedded_small.py` by Adam alone for {steps:,} steps:",
         "",
         f"- the same seed in two processes: {same};",
         f"- {len(scores)} seeds: {mean:.2f} +- {deviation:.2f} dB ({listed});",
@@ -128,7 +128,7 @@ def train(folder: str, seed: int, steps: int, adam: str) -> None:
         changes |= {"train.max_steps": DRIFT, **{f"train.{name}": paper[name] for name in _PAPER_ADAM}}
     else:
         changes |= {"train.max_steps": steps, "train.lr_steps": steps}
-    if common.run(common.configuration("quickstart", changes, seed=seed), folder) is None:
+    if common.run(common.configuration("embedded_small", changes, seed=seed), folder) is None:
         raise ValueError(f"{folder}: stopped; the same command resumes")
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from jaxnerf.core.occupancy.grid import is_occupied
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import Views
-from jaxnerf.data.geometry.seen_cells import free_cells, seen_cells
+from jaxnerf.data.geometry.seen_cells import likely_empty_cells, seen_cells
 from jaxnerf.data.geometry.visual_hull import visual_hull
 from jaxnerf.data.ray_batches import PixelRuns, view_rays
 from jaxnerf.models.grid_schedule import GridSchedule, InitialCells
@@ -49,18 +49,21 @@ def active_region(
         active: the pixels to draw from, see `find_active_pixels`; None: all.
         indices: flat, of the valid cells, int32.
     """
+    if min_views and ndc:
+        raise ValueError(
+            f"occupancy.min_views is {min_views} with normalised device coordinates, which hold what the cameras see, "
+            "expected 0; correct --config.occupancy.min_views or --config.data.ndc"
+        )
     options = {"use_alpha": use_alpha, "ndc": ndc, "pixel_offset": pixel_offset}
     runs = {field.name for field in dataclasses.fields(PixelRuns)}
 
     def make():
         valid = valid_cells(views, schedule, use_alpha=use_alpha)
-        if min_views:
-            valid &= seen_cells(views, schedule, min_views=min_views, ndc=ndc, pixel_offset=pixel_offset)
         empty = np.zeros_like(valid)
-        if min_views and not ndc:
-            free, likely = free_cells(views, schedule, pixel_offset=pixel_offset)
-            valid &= ~free
-            empty = likely & valid & (views.sparse is not None)
+        if min_views:
+            seen, free = seen_cells(views, schedule, min_views=min_views)
+            valid &= seen & ~free
+            empty = valid & likely_empty_cells(views, schedule, pixel_offset=pixel_offset)
         active = find_active_pixels(views, schedule, valid, **options)
         return {"valid": valid, "empty": empty} | ({} if active is None else vars(active))
 

@@ -7,7 +7,7 @@ import pathlib
 
 import pytest
 
-from jaxnerf.configs import capture, lego_small, quickstart
+from jaxnerf.configs import capture, embedded_small, lego_small
 from studies import common, study
 
 scene_needs = study("scene_needs/scene_needs")
@@ -32,7 +32,7 @@ def made_up(complete, overrides, folder, seed):
 def found(monkeypatch, tmp_path):
     monkeypatch.setattr(scene_needs, "_run", made_up)
     names = ["view_dependence", "frequencies", "width", "depth", "precision"]
-    return scene_needs.search(quickstart.get_config(), True, tmp_path, seeds=[0, 1, 2], loss=0.2, names=names)
+    return scene_needs.search(embedded_small.get_config(), True, tmp_path, seeds=[0, 1, 2], loss=0.2, names=names)
 
 
 def test_what_costs_less_than_the_loss_is_left_off_together(found):
@@ -60,13 +60,13 @@ def test_what_is_written_can_be_trained_and_read(found, tmp_path, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()
     settings = {"loss": 0.2, "steps": 800, "seeds": [0, 1, 2]}
-    lines = scene_needs.write(out, quickstart.get_config(), found, settings)
+    lines = scene_needs.write(out, embedded_small.get_config(), found, settings)
     page = tmp_path / "page.md"
     page.write_text("a\n<!-- needs -->\n<!-- end of needs -->\nb\n")
     common.replace(page, lines, "needs")
     monkeypatch.syspath_prepend(str(out))
     config = importlib.import_module("needed").get_config()
-    expected = common.changed(quickstart.get_config(), found.overrides)
+    expected = common.changed(embedded_small.get_config(), found.overrides)
     assert config.to_dict() == expected.to_dict()
     assert "| frequencies:" in page.read_text() and page.read_text().endswith("b\n")
     assert json.loads((out / "needs.json").read_text())["overrides"] == found.overrides

@@ -1,4 +1,4 @@
-"""The cells of an occupancy grid that the training cameras see, and those that they see through."""
+"""The cells of an occupancy grid that the training cameras see, and those that they see through or past."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jaxnerf.core.occupancy.grid import OccupancyGrid, cells_along, create_grid, widen
+from jaxnerf.core import contraction
+from jaxnerf.core.cameras import project, undistort
+from jaxnerf.core.occupancy.grid import cells_along, create_grid, widen
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.sampling import samples_from_edges, uniform_edges
 from jaxnerf.core.types import Rays, Views
@@ -17,60 +19,54 @@ from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.models.grid_schedule import GridSchedule
 
 _CHUNK = 2**13  # rays
-_COARSE = 4  # cells of the grid along a side of a cell that is tested for being seen
-_FREE_SAMPLES = 16  # between a camera and the depth up to which the space in front of it is free
+_SLAB = 2**21  # corners of cells that are projected at once
+_SLOPES = 128  # directions along each side of an image that are looked up
+_STEEPEST = 10.0  # of these: 84 degrees from the axis
+_FREE_SAMPLES = 16  # between a camera and a surface
+_JUST_INSIDE = 2 * (1 - 1e-4)  # contracted space ends at 2, which is at infinity
 
 
 def seen_cells(
-    views: Views, schedule: GridSchedule, *, min_views: int, ndc: bool = False, pixel_offset: float = 0.5
-) -> Bool[np.ndarray, "X Y Z"]:
-    """Returns the cells that at least min_views views see between near and far; nothing is known about the others.
+    views: Views, schedule: GridSchedule, *, min_views: int
+) -> tuple[Bool[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
+    """Returns the cells that at least min_views views see, and those that are free.
 
-    Rays mark the cells of a grid that is a quarter as fine, and their neighbours count as seen, too. This is nerfacc's
-    `mark_invisible_cells` with lenses, masks and contracted space.
+    A view sees a cell if it sees one of its corners between near and far. A cell is free if it is in
+    front of `Views.free_until` for two of the views that see it, or for the only one: what a single camera shows close
+    to it has no parallax, so a field would put fog there that hides the scene from other cameras.
 
     Args:
-        views: of the split that is trained on.
+        views: of the split that is trained on; a masked pixel sees nothing.
         schedule: of the box.
         min_views: at least 1.
-        ndc, pixel_offset: see `draw_batch`.
     """
-    shape = tuple(-(-size // _COARSE) for size in schedule.shape)
-    grid = _grid(schedule, shape)
-    cell = tuple(size * fine / coarse for size, fine, coarse in zip(schedule.cell, schedule.shape, shape, strict=True))
-
-    @jax.jit
-    def cells_on_rays(rays):
-        return cells_along(grid, rays, march_rays(None, grid, rays, step_size=min(cell), cell=cell))
-
-    num_views = np.zeros(shape, np.int32)
-    for view in range(len(views.offset)):
-        marked = np.zeros(grid.valid.size + 1, bool)
-        for _, rays in _rays_of(views, view, 2 * max(shape), ndc, pixel_offset):
-            marked[np.asarray(cells_on_rays(rays))] = True
-        num_views += np.asarray(widen(marked[:-1].reshape(shape)))
-    seen = num_views >= min_views
-    for axis, (fine, coarse) in enumerate(zip(schedule.shape, shape, strict=True)):
-        seen = seen.take(np.arange(fine) * coarse // fine, axis=axis)
-    return seen
+    size = schedule.shape[0]
+    slabs = -(-size * (schedule.shape[1] + 1) * (schedule.shape[2] + 1) // _SLAB)
+    planes = -(-size // slabs)
+    count = _view_counter(views, schedule, planes)
+    parts = zip(*(map(np.asarray, count(first)) for first in range(0, size, planes)), strict=True)
+    num_seen, num_free = (np.concatenate(part)[:size] for part in parts)
+    return num_seen >= min_views, (num_free > 0) & (num_free >= np.minimum(num_seen, 2))
 
 
-def free_cells(
+def likely_empty_cells(
     views: Views, schedule: GridSchedule, *, min_views: int = 2, pixel_offset: float = 0.5
-) -> tuple[Bool[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
-    """Returns the cells that are free, and those that are likely to be empty.
+) -> Bool[np.ndarray, "X Y Z"]:
+    """Returns the cells in front of the surfaces that views see, or where no view sees a surface.
+
+    The surfaces are those of `surface_range`, so without sparse points no cell is likely to be empty.
 
     Args:
         views: of the split that is trained on.
         schedule: of the box.
-        min_views: number of views that must tell that a cell is in front of what they show.
+        min_views: number of views that must tell that a cell is in front of a surface.
         pixel_offset: see `draw_batch`.
-
-    Returns:
-        The cells in front of `Views.free_until` of min_views views; and those in front of the surfaces that min_views
-        views see, or where no view sees a surface, as far as `surface_range` tells.
     """
-    grid = _grid(schedule, schedule.shape)
+    if views.sparse is None:
+        return np.zeros(schedule.shape, bool)
+    lower, upper = (jnp.asarray(bound, jnp.float32) for bound in (schedule.lower, schedule.upper))
+    everywhere = np.ones(schedule.shape, bool)
+    grid = create_grid(lower, upper, everywhere, initial_density=0.0, contracted=schedule.contracted)
 
     @jax.jit
     def cells_between(rays, near, far):
@@ -79,31 +75,96 @@ def free_cells(
         samples = march_rays(None, grid, rays, step_size=min(schedule.cell), cell=schedule.cell)
         return cells_along(grid, rays, samples_from_edges(None, edges)), cells_along(grid, rays, samples)
 
-    surface = np.zeros(grid.valid.size + 1, bool)
-    num_free, num_in_front = np.zeros((2, surface.size), np.int32)
+    surface, num_in_front = np.zeros(grid.valid.size + 1, bool), np.zeros(grid.valid.size + 1, np.int32)
     for view in range(len(views.offset)):
-        free, in_front = np.zeros((2, surface.size), bool)
-        for pixels, rays in _rays_of(views, view, max(schedule.shape) // 2, False, pixel_offset):
-            near, far = surface_range(views, view, pixels)
-            before, between = cells_between(rays, near, far)
+        in_front = np.zeros_like(surface)
+        for pixels, rays in _rays_of(views, view, max(schedule.shape) // 2, pixel_offset):
+            before, between = cells_between(rays, *surface_range(views, view, pixels))
             in_front[np.asarray(before)] = surface[np.asarray(between)] = True
-            if views.free_until is not None:
-                near = np.full_like(near, views.free_until[view])
-                free[np.asarray(cells_between(rays, near, near)[0])] = True
-        num_free += free
         num_in_front += in_front
-    surface, free, in_front = (
-        cells[:-1].reshape(schedule.shape) for cells in (surface, num_free >= min_views, num_in_front >= min_views)
-    )
-    return free, ~np.asarray(widen(surface)) | in_front
+    surface, in_front = (cells[:-1].reshape(schedule.shape) for cells in (surface, num_in_front >= min_views))
+    return ~np.asarray(widen(surface)) | in_front
 
 
-def _grid(schedule: GridSchedule, shape: tuple[int, int, int]) -> OccupancyGrid:
-    lower, upper = (jnp.asarray(bound, jnp.float32) for bound in (schedule.lower, schedule.upper))
-    return create_grid(lower, upper, np.ones(shape, bool), initial_density=0.0, contracted=schedule.contracted)
+def _view_counter(views, schedule, planes):
+    """Returns a function of the first of some planes of cells: how many views see each, and how many see it free."""
+    shape, (lower, upper) = schedule.shape, np.float32([schedule.lower, schedule.upper]).reshape(2, 1, 1, 1, 3)
+    free_until = np.zeros(len(views.offset), np.float32) if views.free_until is None else views.free_until
+    known = views.cameras.to_world, views.near, views.far, free_until
+    stack = *(jnp.asarray(each, jnp.float32) for each in known), *_shown_slopes(views)
+
+    @jax.jit
+    def count(stack, first):
+        along = [jnp.arange(size + 1) + start for size, start in zip((planes, *shape[1:]), (first, 0, 0), strict=True)]
+        place = jnp.stack(jnp.meshgrid(*along, indexing="ij"), axis=-1) / np.reshape(shape, (1, 1, 1, 3))
+        if schedule.contracted:
+            place = (contraction.expand(jnp.clip(4 * place - 2, -_JUST_INSIDE, _JUST_INSIDE)) + 2) / 4
+        corners = jnp.moveaxis(lower + place * (upper - lower), -1, 0)
+
+        def add(view, counts):
+            seen, behind = map(_any_corner, _sees(*(leaf[view] for leaf in stack), corners))
+            return counts[0] + seen, counts[1] + (seen & ~behind)
+
+        none = jnp.zeros((planes, *shape[1:]), jnp.int32)
+        return jax.lax.fori_loop(0, len(free_until), add, (none, none))
+
+    return lambda first: count(stack, first)
 
 
-def _rays_of(views: Views, view: int, number: int, ndc: bool, pixel_offset: float) -> Iterator[tuple[np.ndarray, Rays]]:
+def _sees(to_world, near, far, free_until, least, scale, shown, x):
+    """Returns whether a view sees positions x [3, ...], and whether these are behind the space that is free."""
+    offset = [x[axis] - to_world[axis, 3] for axis in range(3)]
+    right, up, back = (sum(to_world[i, axis] * offset[i] for i in range(3)) for axis in range(3))
+    depth = -back
+    ahead = (depth >= near) & (depth <= far) & (depth > 0)
+    safe = jnp.where(ahead, depth, 1)
+    column, row = ((value / safe - least[i]) * scale[i] for i, value in enumerate((right, up)))
+    inside = (column >= 0) & (row >= 0) & (column < _SLOPES) & (row < _SLOPES)
+    column, row = (jnp.where(inside, value, 0).astype(jnp.int32) for value in (column, row))
+    seen = ahead & inside & shown[row, column]
+    return seen, seen & (depth >= free_until)
+
+
+def _shown_slopes(views):
+    """Returns which directions (x, y, -1) from its camera each view [V] shows, as a table; masked pixels show none.
+
+    A look into the table is much faster than a projection through a lens.
+
+    Returns:
+        The least x and y [V, 2], entries per unit of x and y [V, 2], and the table [V, _SLOPES, _SLOPES], y first.
+    """
+    least, scale, shown = [], [], []
+    pixels = np.stack(np.meshgrid(*[np.linspace(0, 1, _SLOPES // 4)] * 2), axis=-1)
+    for view, (height, width) in enumerate(np.asarray(views.size)):
+        camera = jax.tree.map(lambda leaf, view=view: np.asarray(leaf)[view], views.cameras)
+        camera = dataclasses.replace(camera, to_world=np.eye(3, 4, dtype=np.float32))
+        slopes, exists = map(np.asarray, _undistort(camera, pixels * [width, height]))
+        slopes = np.clip(slopes[exists] * [1, -1], -_STEEPEST, _STEEPEST)
+        lower, upper = slopes.min(axis=0), slopes.max(axis=0)
+        x, y = (lower + (upper - lower) * (np.arange(_SLOPES) + 0.5)[:, None] / _SLOPES).T
+        places = np.stack([*np.meshgrid(x, y), np.full([_SLOPES] * 2, -1.0)], axis=-1)
+        at = np.asarray(_project(camera, places)[0])
+        inside = ((at >= 0) & (at < [width, height])).all(axis=-1)
+        if views.mask is not None:
+            column, row = np.moveaxis(np.where(inside[..., None], at, 0).astype(int), -1, 0)
+            inside &= np.asarray(views.mask)[views.offset[view] + row * width + column]
+        least.append(lower), scale.append(_SLOPES / (upper - lower)), shown.append(inside)
+    return jnp.float32(least), jnp.float32(scale), jnp.array(shown)
+
+
+_undistort = jax.jit(undistort)
+_project = jax.jit(project)
+
+
+def _any_corner(flags):
+    """Returns for each cell whether any of its corners is flagged; flags are one longer along each axis."""
+    for axis in range(3):
+        size = flags.shape[axis]
+        flags = jax.lax.slice_in_dim(flags, 0, size - 1, axis=axis) | jax.lax.slice_in_dim(flags, 1, size, axis=axis)
+    return flags
+
+
+def _rays_of(views: Views, view: int, number: int, pixel_offset: float) -> Iterator[tuple[np.ndarray, Rays]]:
     """Yields pixels and Rays [_CHUNK], about number x number unmasked pixels of a view; the last are repeated."""
     cameras = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None, sparse=None)
     height, width = np.asarray(views.size)[view]
@@ -116,7 +177,7 @@ def _rays_of(views: Views, view: int, number: int, ndc: bool, pixel_offset: floa
     for start in range(0, y.size, _CHUNK):
         index = np.minimum(np.arange(start, start + _CHUNK), y.size - 1)  # a single compiled shape
         pixels = (np.stack([x[index], y[index]], axis=-1) + pixel_offset).astype(np.float32)
-        yield pixels, _view_rays(cameras, view, pixels, ndc)
+        yield pixels, _view_rays(cameras, view, pixels)
 
 
-_view_rays = jax.jit(lambda views, view, pixels, ndc: view_rays(views, view, pixels, ndc=ndc), static_argnums=3)
+_view_rays = jax.jit(view_rays)

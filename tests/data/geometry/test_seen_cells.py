@@ -2,13 +2,15 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 
+from jaxnerf.core.cameras import project
 from jaxnerf.core.types import Camera, SparsePoints, Views
 from jaxnerf.data.active_pixels import active_region
 from jaxnerf.data.geometry.free_space import surface_range
-from jaxnerf.data.geometry.seen_cells import free_cells, seen_cells
+from jaxnerf.data.geometry.seen_cells import likely_empty_cells, seen_cells
 from jaxnerf.models.grid_schedule import make_grid_schedule
 
 SIZE, FOCAL = 48, 48.0  # px: each view covers 53 degrees
@@ -80,8 +82,8 @@ def in_view(x, eye, slack):
 @pytest.mark.parametrize("min_views", [1, 2])
 def test_seen_cells_are_those_in_the_frusta(min_views):
     schedule, views = a_schedule(), some_views((-1.0, 1.0))
-    seen, x = seen_cells(views, schedule, min_views=min_views), centers(schedule)
-    counts = [sum(in_view(x, eye, slack).astype(int) for eye in (-1.0, 1.0)) for slack in (-0.3, 2.1)]
+    (seen, _), x = seen_cells(views, schedule, min_views=min_views), centers(schedule)
+    counts = [sum(in_view(x, eye, slack).astype(int) for eye in (-1.0, 1.0)) for slack in (-0.15, 0.3)]
     assert seen[counts[0] >= min_views].all()
     assert not seen[counts[1] < min_views].any()
 
@@ -90,23 +92,45 @@ def test_a_masked_pixel_sees_nothing():
     schedule, views = a_schedule(), some_views((0.0,))
     mask = np.zeros((SIZE, SIZE), bool)
     mask[:, : SIZE // 2] = True
-    seen = seen_cells(dataclasses.replace(views, mask=mask.reshape(-1)), schedule, min_views=1)
+    seen, _ = seen_cells(dataclasses.replace(views, mask=mask.reshape(-1)), schedule, min_views=1)
     x = centers(schedule)
-    assert seen[in_view(x, 0.0, -0.3) & (x[..., 0] < -0.3)].all() and not seen[x[..., 0] > 2.1].any()
+    assert seen[in_view(x, 0.0, -0.15) & (x[..., 0] < -0.15)].all() and not seen[x[..., 0] > 0.3].any()
+
+
+def test_cells_are_seen_through_the_lens():
+    """A lens that bends rays inwards shows less of the world at the same size."""
+    schedule, plain = a_schedule(), some_views((0.0,))
+    barrel = dataclasses.replace(plain.cameras, distortion=np.float32([[0.8, 0, 0, 0]]), lens="opencv")
+    seen, _ = seen_cells(plain, schedule, min_views=1)
+    through, _ = seen_cells(dataclasses.replace(plain, cameras=barrel), schedule, min_views=1)
+    assert through.any() and not (through & ~seen).any() and through.sum() < 0.8 * seen.sum()
+    x = centers(schedule)
+    pixels, depth = (np.asarray(value) for value in project(jax.tree.map(lambda leaf: leaf[0], barrel), x))
+    inside = (pixels > 3).all(axis=-1) & (pixels < SIZE - 3).all(axis=-1) & (depth > 0.3) & (depth < 3.8)
+    assert through[inside].all()
+    outside = (pixels < -12).any(axis=-1) | (pixels > SIZE + 12).any(axis=-1)
+    assert outside.any() and not through[outside & (depth > 2)].any()
 
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_the_space_in_front_of_the_stated_depth_is_free(contracted):
     schedule = a_schedule(contracted=contracted)
     views = some_views((0.0, 0.0), free_until=np.float32([1.9, 1.9]))
-    free, empty = free_cells(views, schedule)
+    _, free = seen_cells(views, schedule, min_views=1)
     depth = -centers(schedule)[..., 2]  # the same in the inner half of a contracted box
-    inside = in_view(centers(schedule), 0.0, -0.3)
-    assert free[inside & (depth > 0.3) & (depth < 1.7)].all() and not free[depth > 2.1].any()
-    assert contracted or not empty[inside & (depth > 2.2) & (depth < 3.7)].any()
-    assert not free_cells(some_views((0.0, 0.0)), schedule)[0].any()
-    alone = some_views((0.0,), free_until=np.float32([1.9]))
-    assert not free_cells(alone, schedule)[0].any()  # one view alone may be wrong
+    inside = in_view(centers(schedule), 0.0, -0.15)
+    assert free[inside & (depth > 0.3) & (depth < 1.6)].all() and not free[depth > 1.9].any()
+    assert not seen_cells(some_views((0.0, 0.0)), schedule, min_views=1)[1].any()
+
+
+def test_two_views_that_see_a_cell_must_agree_that_it_is_free():
+    schedule = a_schedule()
+    x, views = centers(schedule), some_views((0.0, 0.5), free_until=np.float32([1.9, 0.0]))
+    _, free = seen_cells(views, schedule, min_views=1)
+    near = (-x[..., 2] > 0.3) & (-x[..., 2] < 1.6)
+    both, alone = (in_view(x, 0.0, -0.15) & seen & near for seen in (in_view(x, 0.5, -0.15), ~in_view(x, 0.5, 0.3)))
+    assert both.any() and not free[both].any()  # the other view may show something there
+    assert alone.any() and free[alone].all()
 
 
 def test_surface_range_holds_the_wall_and_ignores_a_wrong_point():
@@ -128,7 +152,7 @@ def test_without_enough_points_nothing_is_known_of_surfaces():
 
 def test_cells_between_cameras_and_surfaces_are_likely_to_be_empty():
     views, schedule = with_wall(some_views(far=np.full(2, 9.0, np.float32))), a_schedule()
-    _, empty = free_cells(views, schedule)
+    empty = likely_empty_cells(views, schedule)
     x = centers(schedule)
     between = (np.abs(x[..., :2]) < 0.2).all(axis=-1) & (x[..., 2] < -0.8) & (x[..., 2] > 0.75 * WALL)
     at_wall = (np.abs(x[..., :2]) < 0.8).all(axis=-1) & (np.abs(x[..., 2] - WALL) < 0.4)
