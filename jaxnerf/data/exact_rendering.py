@@ -6,11 +6,14 @@ samples. Bodies are evaluated only in the intervals near them that the ray reach
 where the ray still has light.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Rays
+from jaxnerf.data.images.pixel_cache import num_workers
 from jaxnerf.fields.portable_math import exp
 from jaxnerf.fields.still_life import BODIES, FINISHES, WIDTH
 
@@ -23,7 +26,7 @@ _FAINT = 1e-9  # weight below which a sample's colour is not evaluated
 
 
 def render_rays(
-    rays: Rays, finish: str, *, num_segments: int, chunk: int = 1024
+    rays: Rays, finish: str, *, num_segments: int, chunk: int = 4096
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
     """Renders rays through the still life by the midpoint rule.
 
@@ -31,7 +34,7 @@ def render_rays(
         rays: Rays [N] of numpy arrays; they hit nothing where near >= far.
         finish: see `still_life.FINISHES`.
         num_segments: of each ray, a multiple of 8.
-        chunk: number of rays at once, which has no effect on the result.
+        chunk: number of rays that a thread renders at once, which has no effect on the result.
 
     Returns:
         The colour [N, 3] on black, and the opacity [N].
@@ -43,10 +46,14 @@ def render_rays(
         raise ValueError(f"render_rays: num_segments is {num_segments}, expected a multiple of {INTERVAL}")
     rgb, opacity = np.zeros((rays.near.size, 3)), np.zeros(rays.near.size)
     hits = np.flatnonzero(rays.far > rays.near)
-    for start in range(0, hits.size, chunk):
+
+    def render(start):
         chosen = hits[start : start + chunk]
-        part = jax.tree.map(lambda leaf, chosen=chosen: np.asarray(leaf, np.float32)[chosen], rays)
+        part = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[chosen], rays)
         rgb[chosen], opacity[chosen] = _render(part, finish, num_segments // INTERVAL)
+
+    with ThreadPoolExecutor(num_workers()) as pool:
+        list(pool.map(render, range(0, hits.size, chunk)))
     return rgb, opacity
 
 

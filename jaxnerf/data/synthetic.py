@@ -76,7 +76,7 @@ def load_synthetic(
 
 
 def render_views(
-    stack: Camera, finish: str = "usual", *, num_segments: int = 384, chunk: int = 1024
+    stack: Camera, finish: str = "usual", *, num_segments: int = 384, chunk: int = 4096
 ) -> UInt16[np.ndarray, "P 4"]:
     """Renders the pixels of a stack of V cameras: P = V * H * W, with straight alpha.
 
