@@ -1,11 +1,12 @@
-# make demo: trains and scores the embedded scene. make test: runs the fast tests. Both need only python3 with venv.
+# make demo: trains and scores the embedded scene; make view: shows it in a browser; make test: runs the fast tests.
+# All need only python3 with venv.
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
 # Compiled programs are kept in build/, so that tests compile each only once.
 PYTEST := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/build/compiled JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.3 $(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile
 
-.PHONY: demo test test-slow test-extra docs lint clean
+.PHONY: demo view test test-slow test-extra docs lint clean
 
 $(BIN)/.installed: setup.cfg pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -21,6 +22,11 @@ demo: $(BIN)/.installed
 	$(BIN)/jaxnerf-eval --workdir=$(DEMO) --overwrite
 	$(BIN)/jaxnerf-render --workdir=$(DEMO) --overwrite
 	$(BIN)/python experiments/results/table.py $(DEMO)
+	@echo "make view shows the scene in a browser; its image is in $(DEMO)/eval, a video in $(DEMO)/renders"
+
+view: $(BIN)/.installed
+	$(BIN)/pip install --quiet --editable '.[viewer]'
+	$(BIN)/jaxnerf-view --workdir=$(DEMO)
 
 test: $(BIN)/.dev
 	$(PYTEST) -m "not slow and not extra"

@@ -295,6 +295,7 @@ def run(*arguments, cwd, without=()):
     )
 
 
+@pytest.mark.slow
 def test_the_program_reports_and_does_not_touch_the_dataset(folders, tmp_path):
     before = sorted(folders.rglob("*"))
     done = run(f"--data_dir={folders / 'llff'}", cwd=tmp_path)

@@ -73,6 +73,7 @@ def test_random_images_have_the_scores_of_scikit_image_and_dm_pix():
     assert_psnr_is_theirs(*pair(8, 0.003))
 
 
+@pytest.mark.slow
 @pytest.mark.scenes("lego")
 def test_images_of_scenes_have_the_scores_of_scikit_image_and_dm_pix(scenes_dir):
     """200 x 200 px, mostly white; a pair, and one beside itself with noise of 40 dB in 8 bits."""

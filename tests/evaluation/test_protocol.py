@@ -97,6 +97,7 @@ def test_lego_at_100_pixels_is_comparable_with_no_table(scenes_dir):
     assert about["selection"].endswith("go up by 8")
 
 
+@pytest.mark.slow
 def test_truncation_keeps_8_bit_colours_and_otherwise_costs_what_the_protocol_says():
     levels = np.resize(np.arange(256) / 255, (16, 32, 3)).astype(np.float32)
     found = image_metrics(levels, 1 - levels)

@@ -47,6 +47,7 @@ def inside(shape, seed=2):
     return lower + np.random.default_rng(seed).uniform(size=(*shape, 3)).astype(np.float32) * (upper - lower)
 
 
+@pytest.mark.slow
 def test_bfloat16_concerns_the_layers_alone():
     options = {"resolutions": (4,), "features_per_level": 2, "view_width": 8, "view_depth": 1, "width": 16}
     exact, rough = (hash_grid_field(**BOX, **options, compute_dtype=dtype) for dtype in (None, jnp.bfloat16))

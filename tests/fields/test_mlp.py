@@ -151,6 +151,7 @@ def _jaxpr(key=None, density_noise=0.0):
     )
 
 
+@pytest.mark.slow
 def test_bfloat16_concerns_the_layers_alone():
     options = {"depth": 2, "width": 16, "num_freqs": 4}
     exact, rough = mlp_field(**options), mlp_field(**options, compute_dtype=jnp.bfloat16)

@@ -26,7 +26,10 @@ FLAGS = [
     *("--ignore-gpu-blocklist", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
 ]
-TRAIN = ("--config=quickstart", "--config.train.save_every=200", "--config.train.preview_every=0")
+TRAIN = (
+    "--config=quickstart",
+    *(f"--config.train.{setting}" for setting in ("save_every=200", "preview_every=0", "max_seconds=0")),
+)
 STEPS, MORE_STEPS = 400, 200  # of the first training, and of that which continues it
 SECONDS = 180  # that anything may take on a busy core
 RESOLUTION = "200"  # px

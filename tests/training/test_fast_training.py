@@ -139,6 +139,7 @@ def test_it_learns(tiny):
     assert rays_dropped.mean() < 0.05 * BATCH
 
 
+@pytest.mark.slow
 def test_empty_cells_hold_no_matter(tiny):
     """Images with all valid cells occupied are no better."""
     state, _ = tiny.run(0, NEVER)

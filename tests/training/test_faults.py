@@ -116,6 +116,7 @@ def test_if_no_checkpoint_can_be_read_none_is_renamed(folder):
     assert Checkpoints(folder).steps() == [10, 15, 20]
 
 
+@pytest.mark.slow
 def test_run_resumes_with_another_number_of_devices(folder, trained):
     """It was trained on four; only the order in which gradients are summed differs."""
     shutil.rmtree(folder / "checkpoints" / "20")

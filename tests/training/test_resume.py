@@ -109,6 +109,7 @@ def test_a_config_to_resume_has_the_types_of_its_fields(trained, tmp_path):
         config.train.max_steps = 1.5
 
 
+@pytest.mark.slow
 def test_resumed_run_does_not_exceed_its_limit_of_seconds(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
     for _ in range(2):

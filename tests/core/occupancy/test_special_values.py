@@ -67,6 +67,7 @@ def broken():
     return rays
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contracted", [False, True])
 def test_nan_in_a_ray_shows_and_stays_in_its_ray(broken, contracted):
     grid = dataclasses.replace(GRID, contracted=contracted)
