@@ -48,11 +48,7 @@ def main(argv):
     del argv
     if _CLIENT.value:
         return _act_as_browser(_CLIENT.value)
-    parts = [
-        _HEAD.format(
-            command=" ".join(sys.argv), commit=_commit(), machine=common.describe_machine(), load=os.getloadavg()[0]
-        )
-    ]
+    parts = ["\n".join(["# The viewer in figures", "", *common.provenance(), "", _ABOUT, ""])]
     parts += [_view(workdir) for workdir in _WORKDIRS.value]
     if _TRAIN.value:
         parts += [_idle_cost(_TRAIN.value), _busy_cost(_TRAIN.value)]
@@ -62,15 +58,12 @@ def main(argv):
         write_text(_REPORT.value, text)
 
 
-_HEAD = """# The viewer in figures
-
-Written by `python {command}` at commit {commit} on {machine}, load average {load:.1f}: above the number of
-cores other programs slowed the wall-clock times, and CPU times are the better guide.
+_ABOUT = f"""The load average at the start was {os.getloadavg()[0]:.1f}. Above the number of cores, other programs
+slowed the wall-clock times, and CPU times are the better guide.
 
 Latency is the time from a camera message to the encoded image (JPEG), without network and browser, while a camera is
 dragged (20 messages a second) in a window of this size. The viewer selects the size of its frames so that it keeps ten
-a second.
-"""
+a second."""
 
 
 def _view(workdir):
@@ -281,12 +274,8 @@ def _product(a, b):
 
 def _train(config, folder, *flags):
     command = [sys.executable, "-m", "jaxnerf.train", f"--config={config}", f"--workdir={folder}", *flags]
+    command.append("--config.train.max_seconds=0")
     return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=common.ROOT)
-
-
-def _commit():
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, cwd=os.path.dirname(__file__)).stdout.strip()
 
 
 if __name__ == "__main__":

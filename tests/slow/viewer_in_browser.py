@@ -301,6 +301,7 @@ def number(page, label, value):
     field = page.get_by_label(label, exact=True)
     field.fill(value)
     field.press("Enter")
+    page.wait_for_timeout(300)  # viser drops changes that follow each other faster than a hand can make them
 
 
 # Processes
