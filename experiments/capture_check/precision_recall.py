@@ -1,6 +1,7 @@
 """Measures how many planted images jaxnerf-check accuses, and how many good ones: docs/results/capture_check.md.
 
-    JAXNERF_SCENES=... python experiments/capture_check/precision_recall.py [--images=10] [--out=FILE]
+    JAXNERF_SCENES=... python experiments/capture_check/precision_recall.py [--images=10] [--seed=0] \
+        [--out=FILE]
 
 Each check has one planted defect, in one random image (a swap concerns two). Images are read once for each scene, and
 each pair of images is matched once, so that only the judgement of the views is repeated.
@@ -9,24 +10,27 @@ each pair of images is matched once, so that only the judgement of the views is 
 import argparse
 import functools
 import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+import common
+
 from jaxnerf.capture_check import cameras, images, report, tracks, view_evidence
 from jaxnerf.data import synthetic_capture
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import read_capture
+from jaxnerf.runtime.atomic_files import write_text
 
 SCENES = ("fern", "fox", "can", "lego")
 PERIODS = (0.12, 0.3)  # of the dots in the embedded room, world units
 DEFECTS = ("swapped with the next image", "swapped with a far image", "camera turned by 30 degrees", "camera displaced")
 
 
-def main(count: int, out: str) -> None:
+def main(count: int, seed: int, out: str) -> None:
     """Measures all scenes and writes the table."""
     cached = functools.cache(lambda first, second: tracks_match(*(_KEPT[key] for key in (first, second))))
     tracks_match = tracks.match
@@ -41,16 +45,16 @@ def main(count: int, out: str) -> None:
             options = {"num_views": 40, "num_held_out": 2, "num_far": 2, "width": 320, "height": 240}
             synthetic_capture.write_capture(folders[name], repetition=period, num_points=500, **options)
         for name, folder in folders.items():
-            rows += list(_measure(name, folder, count if name in SCENES else 0))
+            rows += list(_measure(name, folder, count if name in SCENES else 0, seed))
             cached.cache_clear()
-            Path(out).write_text(_document(rows, count))
+            write_text(out, _document(rows))
 
 
-def _measure(name, folder, count):
+def _measure(name, folder, count, seed):
     """Yields (scene, defect, planted, found, false accusations, checks)."""
     capture = report.subset(read_capture(folder))
     summaries, _ = images.read(capture)
-    keypoints, rng = tracks.keypoints_of(capture, summaries), np.random.default_rng(0)
+    keypoints, rng = tracks.keypoints_of(capture, summaries), np.random.default_rng(seed)
     scale = cameras.gather(capture, summaries, np.zeros((len(summaries), 0), int)).scale
     chosen = rng.permutation(len(keypoints))[:count]
     clean = len(_accused(capture, keypoints, poses_of(capture), scale))
@@ -113,14 +117,13 @@ def _keep(keypoints):
     return id(keypoints)
 
 
-def _document(rows, count):
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+def _document(rows):
     planted, found, false, checks = (sum(row[index] for row in rows) for index in (2, 3, 4, 5))
     precision = found / max(found + false, 1)
     lines = [
         "# What jaxnerf-check accuses",
         "",
-        f"`python experiments/capture_check/precision_recall.py --images={count}`, commit {commit}.",
+        *common.provenance(),
         "",
         "Each check has one planted defect in one random image; a swap concerns two. An accusation is an error that",
         "names an image. A displaced camera is moved by half the median distance of the cameras from their middle.",
@@ -142,6 +145,7 @@ def _document(rows, count):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--images", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0, help="of the images and the defects")
     parser.add_argument("--out", default="docs/results/capture_check.md")
     known = parser.parse_args()
-    main(known.images, known.out)
+    main(known.images, known.seed, known.out)

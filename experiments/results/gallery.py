@@ -33,7 +33,7 @@ _QUALITY = {"webp": 70, "jpg": 90}
 
 def main(argv: list[str]) -> None:
     """Writes the page of the workdirs named on the command line."""
-    folders, out = [pathlib.Path(folder).resolve() for folder in argv[1:]], pathlib.Path(_OUT.value)
+    folders, out = [pathlib.Path(folder) for folder in argv[1:]], pathlib.Path(_OUT.value)
     if not folders:
         raise ValueError("no workdir is given; name those of runs that were scored and rendered")
     out.mkdir(parents=True, exist_ok=True)
