@@ -196,7 +196,11 @@ class Page:
 
     def _crop_range(self):
         """Returns the corners [3] between which the crop box lies."""
-        box = None if self._viewer.state is None else self._viewer.state.box
+        schedule, box = self._viewer.run.experiment.model.grid_schedule, None
+        if self._viewer.state is not None:
+            box = self._viewer.state.box
+        elif schedule is not None and not schedule.contracted:  # a training has made no state yet
+            box = np.array([schedule.lower, schedule.upper])
         if box is None or not np.isfinite(box).all() or self._viewer.run.experiment.ndc:
             reach = 2 * self._size
             middle = self._target
