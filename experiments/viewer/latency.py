@@ -234,7 +234,7 @@ class _browser:
         self._command = [sys.executable, __file__, f"--client={port}", f"--seconds={moves}"]
 
     def __enter__(self):
-        self._process = subprocess.Popen(self._command)
+        self._process = subprocess.Popen(self._command, stderr=subprocess.DEVNULL)  # it says that it was stopped
 
     def __exit__(self, *_):
         self._process.terminate()
