@@ -134,7 +134,14 @@ def _plot(runs, path):
 
 def _page(runs, unread, plotted):
     """Returns the lines of the page."""
-    lines = ["# Runs side by side", "", *common.provenance(), "", *common.markdown(table.HEADS, [row for run in runs for row in run.rows]), ""]
+    lines = [
+        "# Runs side by side",
+        "",
+        *common.provenance(),
+        "",
+        *common.markdown(table.HEADS, [row for run in runs for row in run.rows]),
+        "",
+    ]
     lines += ["![PSNR over time](psnr.png)" if plotted else "No plot, which needs matplotlib.", ""]
     lines += ["![Images](pictures.png)", ""]
     lines += [f"Rows: {', '.join(run.name for run in runs)}. Columns: truth and rendering of {_VIEWS} views.", ""]
