@@ -14,13 +14,13 @@ def get_config():
     config.field, config.sampler = "hash_grid", "occupancy"
     config.hash_grid.view_width = 64
     train = config.train
-    train.batch_size, train.cpu_batch_size, train.max_steps, train.lr_steps = "auto", 768, "auto", "auto"
+    train.batch_size, train.cpu_batch_size, train.max_steps, train.lr_steps = "auto", 1024, "auto", "auto"
     train.lr_init, train.lr_final, train.warmup_steps = 5e-3, 1.5e-4, 50
     train.muon = 0.6
     train.beta2, train.epsilon = 0.99, 1e-15  # entries that few samples reach get updates of full size, too
     train.averaging_power = 10.0
     train.log_every, train.save_every = 200, 4000
     # More rays with fewer samples, most of them near surfaces, learn faster than fewer rays with all samples.
-    config.occupancy.pool_samples_per_ray, config.occupancy.occlusion_start_step = 6.7, 300
+    config.occupancy.pool_samples_per_ray, config.occupancy.occlusion_start_step = 5.0, 300
     config.eval.sample_multiplier = 1.5  # no jitter averages over a step in rendering, so steps are shorter
     return config

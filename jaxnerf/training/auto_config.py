@@ -31,6 +31,7 @@ _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
+_MAX_OPEN_RESOLUTION = 96  # where no alpha empties most cells before training, so that all of them are updated
 
 # These depend on the device, so they are inferred at every start and stay "auto" in the workdir.
 DEVICE_FIELDS = (
@@ -210,7 +211,8 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     step_size = longest / min(finest, _MAX_STEPS_PER_SIDE)
     line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
     infer(section, "step_size", step_size, line, **use_box)
-    resolution = min(finest, _MAX_RESOLUTION)
+    open_box = not (use_alpha or section.contracted or ndc)
+    resolution = min(finest, _MAX_OPEN_RESOLUTION if open_box else _MAX_RESOLUTION)
     infer(section, "resolution", resolution, f"grid          {resolution} cells along the longest side", **use_box)
     octaves = int(np.clip(round(1 + math.log2(2 * math.pi / (4 * footprint))), 1, 16))
     for name, used in (("coarse", config.sampler == "hierarchical"), ("fine", config.field == "mlp")):
