@@ -5,7 +5,7 @@ phase p, centre m and width w are learned.
 
 Train with it by
 
-    jaxnerf-train --plugins=gabor_field --config=quickstart --config.field=gabor --workdir=runs/gabor
+    jaxnerf-train --plugins=gabor_field --config=embedded_small --config.field=gabor --workdir=runs/gabor
 
 where gabor_field.py is in the current folder or on PYTHONPATH. The options below may also be set in a config
 file: `config.gabor = {"num_features": 128}`.

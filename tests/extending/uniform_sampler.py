@@ -2,7 +2,7 @@
 
 Train with it by
 
-    jaxnerf-train --plugins=uniform_sampler --config=quickstart --config.sampler=uniform --workdir=runs/uniform
+    jaxnerf-train --plugins=uniform_sampler --config=embedded_small --config.sampler=uniform --workdir=runs/uniform
 
 where uniform_sampler.py is in the current folder or on PYTHONPATH. A config file may set the number of samples:
 `config.uniform = {"num_samples": 256}`.
