@@ -119,8 +119,8 @@ def _training(kept):
         reached.append((name, *(_reached(curve["runs"], bar) for bar in BARS)))
     heads = ("curve", "s", "comparable s", "PSNR", "SSIM", "rays", "compiling s", "set-up s", "s a frame")
     return [
-        f"Training, scored on the test views; medians of the seeds. {kept['machine']}. Comparable seconds: seconds times "
-        f"the GFLOP/s of a matrix product just before and after the run, over {common.REFERENCE_GFLOPS:.0f}.",
+        f"Training, scored on the test views; medians of the seeds. {kept['machine']}. Comparable seconds: seconds "
+        f"times the GFLOP/s of a matrix product just before and after the run, over {common.REFERENCE_GFLOPS:.0f}.",
         "",
         *common.markdown(heads, rows),
         "",
