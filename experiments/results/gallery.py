@@ -90,8 +90,8 @@ def strip(folder: pathlib.Path) -> np.ndarray:
     name = names[len(names) // 2]
     depth = read_stored(folder / "depth" / f"{name}.tiff")
     depth = output_images.depth_image(depth, *output_images.depth_range([depth]))
-    photo, rendering = (read_stored(folder / kind / f"{name}.png") for kind in ("gt-color", "color"))
-    return np.concatenate([photo, rendering, np.repeat(depth[..., None], 3, axis=-1)], axis=1)
+    image, rendering = (read_stored(folder / kind / f"{name}.png") for kind in ("gt-color", "color"))
+    return np.concatenate([image, rendering, np.repeat(depth[..., None], 3, axis=-1)], axis=1)
 
 
 def _at_most(pixels, width):

@@ -48,7 +48,8 @@ def slopes(seed):
 def test_muon_moves_a_matrix_equally_far_in_each_direction():
     params = {"fine": network(jax.random.key(0))}
     update = optimizer()
-    step = jax.jit(update.update)(slopes(1), update.init(params), params)[0]["fine"]
+    nothing = jax.tree.map(jnp.zeros_like, params)  # does not decay
+    step = jax.jit(update.update)(slopes(1), update.init(params), nothing)[0]["fine"]
     for kernel in (step["kernel"], step["deep"]["kernel"]):
         sizes = np.linalg.svd(kernel, compute_uv=False) / (RATE * SIZE * max(kernel.shape) ** 0.5)
         # The gradient's singular values range from 1 to 1e-6. Muon's five iterations bring those above 0.01
@@ -72,11 +73,17 @@ def test_adam_updates_all_other_parameters(power):
     assert np.abs(ends[0]["kernel"] - ends[1]["kernel"]).max() > RATE / 10
 
 
-def test_matrix_without_a_gradient_does_not_move():
+def test_matrices_decay_and_so_stay_bounded():
+    """Without a gradient they shrink; however steady the gradient is, they do not grow beyond a bound."""
     params = {"fine": network(jax.random.key(0))}
     update = optimizer()
     step, _ = update.update(jax.tree.map(jnp.zeros_like, params), update.init(params), params)
-    assert_same(step, jax.tree.map(jnp.zeros_like, params), rtol=0, atol=0)
+    step, start = step["fine"], params["fine"]
+    for name in ("bias", "rgb", "table"):
+        assert_same(step[name], jax.tree.map(jnp.zeros_like, step[name]), rtol=0, atol=0)
+    decay = -np.asarray(step["kernel"]) / np.asarray(start["kernel"])
+    np.testing.assert_allclose(decay, decay.mean(), rtol=1e-3)
+    assert 0.05 * RATE < decay.mean() < RATE
 
 
 def test_reinitialization_resets_the_moments():
