@@ -92,7 +92,7 @@ def solid_run():
 
     model = Model(init=None, render=None, view=view, scene=None, samples_per_ray=1.0)
     section = SimpleNamespace(sample_multiplier=1.0, early_stop_eps=1e-3)
-    experiment = SimpleNamespace(eval=section, ndc=False, pixel_offset=0.5, cameras=None)
+    experiment = SimpleNamespace(model=model, eval=section, ndc=False, pixel_offset=0.5, cameras=None)
     run = SimpleNamespace(experiment=experiment, model_with=lambda settings: model, steps=lambda: [20])
     return run, solid_views()
 
