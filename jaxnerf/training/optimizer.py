@@ -11,9 +11,10 @@ from jaxnerf.training.camera_parameters import CAMERAS
 from jaxnerf.training.state import TrainState
 
 _MIN_SIDE = 8  # least inputs and outputs of a layer that Muon updates; smaller layers gain nothing
-# Fraction of a matrix that is subtracted, times the learning rate. Updates have the same size however small the
-# gradient is; without decay, matrices grew until training diverged after 7,000 steps of fern.
-_WEIGHT_DECAY = 0.2
+# Root mean square of a matrix's entries at which weight decay is as large as an update by Muon. The size of such an
+# update does not depend on the gradient's; without decay, matrices grew until training diverged after 7,000 steps of
+# fern.
+_MAX_RMS = 3.0
 _ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one, they compile once, as a loop
 
 
@@ -89,14 +90,14 @@ def with_muon(
     Muon's updates have the same length in each direction of a matrix, so directions along which the gradient
     is small are learned as fast as the others (arXiv:2502.16982). This does not apply to the rows of a hash grid's
     table, nor to outputs of one or three features: the other optimizer updates these. The matrices decay, which
-    bounds them.
+    bounds their entries, whatever the size is.
 
     Args:
         optimizer: updates the other parameters.
         schedule: step -> learning rate.
         size: root mean square of a matrix's update over the learning rate.
     """
-    muon = optax.contrib.muon(schedule, _ITERATIONS, consistent_rms=size, weight_decay=_WEIGHT_DECAY)
+    muon = optax.contrib.muon(schedule, _ITERATIONS, consistent_rms=size, weight_decay=size / _MAX_RMS)
     return optax.partition({"muon": muon, "other": optimizer}, _labels)
 
 

@@ -73,8 +73,7 @@ def test_adam_updates_all_other_parameters(power):
     assert np.abs(ends[0]["kernel"] - ends[1]["kernel"]).max() > RATE / 10
 
 
-def test_matrices_decay_and_so_stay_bounded():
-    """Without a gradient they shrink; however steady the gradient is, they do not grow beyond a bound."""
+def test_matrices_decay_and_nothing_else():
     params = {"fine": network(jax.random.key(0))}
     update = optimizer()
     step, _ = update.update(jax.tree.map(jnp.zeros_like, params), update.init(params), params)
@@ -83,7 +82,21 @@ def test_matrices_decay_and_so_stay_bounded():
         assert_same(step[name], jax.tree.map(jnp.zeros_like, step[name]), rtol=0, atol=0)
     decay = -np.asarray(step["kernel"]) / np.asarray(start["kernel"])
     np.testing.assert_allclose(decay, decay.mean(), rtol=1e-3)
-    assert 0.05 * RATE < decay.mean() < RATE
+    assert decay.mean() > 0.05 * RATE
+
+
+@pytest.mark.parametrize("size", [0.2, 0.6])
+def test_a_steady_gradient_moves_matrices_only_to_a_bound(size):
+    """The bound is the same for all sizes of the updates."""
+    update = optimizer(muon=size)
+    grads = slopes(1)
+    nothing = jax.tree.map(jnp.zeros_like, grads)
+    move = jax.jit(update.update)
+    direction = move(grads, update.init(nothing), nothing)[0]["fine"]["kernel"] / (RATE * size)  # RMS about 1
+    for scale, grows in ((2.0, True), (4.5, False)):
+        params = {"fine": {**nothing["fine"], "kernel": scale * direction}}
+        step = move(grads, update.init(params), params)[0]["fine"]["kernel"]
+        assert (float(jnp.vdot(step, direction)) > 0) == grows
 
 
 def test_reinitialization_resets_the_moments():
