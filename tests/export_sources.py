@@ -58,6 +58,7 @@ def source_of(scene=ball, *, say=lambda line: None, **settings):
     experiment = SimpleNamespace(
         view_rays=functools.partial(ray_batches.view_rays, ndc=False),
         world_depth=ray_batches.world_depth,
+        ndc=False,
         pixel_offset=0.5,
         model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid)),
         load_split=lambda split: views,

@@ -75,7 +75,7 @@ def _packed_distortion(samples: PackedSamples, near: jax.Array, far: jax.Array) 
     ray = samples.ray_index
     s, length = _fractions(samples.t, samples.delta, samples.used, near[ray], far[ray], samples.rule)
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
-    gaps = jnp.where(starts | ~samples.used, 0, s - jnp.roll(s, 1))
+    gaps = jnp.where(starts | ~samples.used, 0, s - jnp.roll(s, 1))  # without NaN of the ray before
     weights = jnp.where(samples.used, samples.weights, 0)
     before = jnp.where(starts, 0, jnp.roll(_sum_since(starts, weights), 1))
     values = weights * (2 * _sum_since(starts, before * gaps) + weights * length / 3)

@@ -53,8 +53,17 @@ def norm(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch"]:
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
     nonzero = largest != 0  # NaN stays NaN
     largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
-    squares = ((vectors / largest) ** 2).sum(axis=-1, keepdims=True)
+    squares = (divide_by_largest(vectors, largest) ** 2).sum(axis=-1, keepdims=True)
     return jnp.where(nonzero, largest * jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)[..., 0]
+
+
+def divide_by_largest(x: Float[ArrayLike, "*#shape"], largest: Float[ArrayLike, "*#shape"]) -> Float[Array, "*#shape"]:
+    """Computes x / largest for |x| <= largest, without a result of 0 where largest is near the limit of the type.
+
+    XLA may multiply by 1 / largest instead, which is subnormal above 8.5e37 in float32 and then counts as 0.
+    """
+    shrink = jnp.where(largest > 1, 1 / 16, 1.0)  # powers of two do not change the digits
+    return (x * shrink) / (largest * shrink)
 
 
 def normalize(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch D"]:
@@ -62,6 +71,6 @@ def normalize(vectors: Float[ArrayLike, "*batch D"]) -> Float[Array, "*batch D"]
     (vectors,) = at_least_float32(vectors)
     largest = jnp.abs(vectors).max(axis=-1, keepdims=True)
     nonzero = largest != 0  # NaN stays NaN
-    scaled = vectors / jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
+    scaled = divide_by_largest(vectors, jax.lax.stop_gradient(jnp.where(nonzero, largest, 1)))
     squares = (scaled**2).sum(axis=-1, keepdims=True)
     return jnp.where(nonzero, scaled / jnp.sqrt(jnp.where(nonzero, squares, 1)), 0)

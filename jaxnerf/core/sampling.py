@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Key, Num
 
-from jaxnerf.core.safe_math import at_least_float32, clamp, divide
+from jaxnerf.core.safe_math import at_least_float32, clamp, divide, divide_by_largest
 from jaxnerf.core.types import Keys, Samples, check_shapes
 
 
@@ -172,7 +172,7 @@ def inverse_cdf(
     # Divided by the largest first, so that the cumulative sum neither under- nor overflows.
     largest = weights.max(axis=-1, keepdims=True)
     empty = largest < jnp.finfo(weights.dtype).tiny
-    scaled = jnp.where(empty, 1.0, weights / jnp.where(empty, 1.0, largest))
+    scaled = jnp.where(empty, 1.0, divide_by_largest(weights, jnp.where(empty, 1.0, largest)))
     sums = jax.lax.cummax(jnp.cumsum(scaled, axis=-1), axis=scaled.ndim - 1)  # a parallel sum can decrease
     cdf = jnp.concatenate([jnp.zeros_like(sums[..., :1]), sums], axis=-1)
     target = u * cdf[..., -1:]

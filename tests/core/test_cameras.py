@@ -17,6 +17,8 @@ from jaxnerf import (
     rays_from_pixels,
     undistort,
 )
+from jaxnerf.core.cameras import project
+from jaxnerf.core.safe_math import norm, normalize
 
 OPENCV = [[0.0] * 4, [0.08, -0.02, 0.004, -0.003], [-0.25, 0.06, 0.002, 0.001], [-0.3, 0.0, 0.0, 0.0]]
 FISHEYE = [[0.0] * 4, [0.03, -0.01, 0.004, -0.001], [-0.04, 0.01, -0.003, 0.0005]]
@@ -51,7 +53,7 @@ def fisheye(points, *k):
 
 
 fast_undistort, fast_rays, fast_look_at = map(compiled, (undistort, rays_from_pixels, look_at))
-fast_ndc, fast_back, fast_positions = map(compiled, (ndc_rays, ndc_to_t, points_on_rays))
+fast_ndc, fast_back, fast_positions, fast_project = map(compiled, (ndc_rays, ndc_to_t, points_on_rays, project))
 
 
 def test_pixels_are_x_then_y_through_their_centres():
@@ -126,12 +128,43 @@ def test_rays_go_through_their_pixels():
     np.testing.assert_allclose(rays.viewdirs, rays.directions / norms, atol=1e-6)
 
 
+@pytest.mark.parametrize("lens, k", [("pinhole", None), ("opencv", OPENCV[1]), ("fisheye", FISHEYE[1])])
+def test_points_on_rays_project_to_their_pixels(lens, k):
+    camera, pixels = a_camera(lens, k), pixel_grid(60, 80)[::7, ::9]
+    rays = fast_rays(camera, pixels, near=2.0, far=6.0)
+    depth = np.random.default_rng(2).uniform(2, 6, rays.near.shape).astype(np.float32)
+    found, along = fast_project(camera, fast_positions(rays, depth[..., None])[..., 0, :])
+    np.testing.assert_allclose(found, pixels, atol=2e-3)
+    np.testing.assert_allclose(along, depth, rtol=1e-5)
+
+
+def test_a_point_behind_the_camera_has_no_pixel():
+    camera = a_camera()
+    behind = camera.to_world[:, 3] + camera.to_world[:, 2]
+    pixel, depth = project(camera, behind)
+    assert np.isinf(pixel).all() and depth == pytest.approx(-1, abs=1e-5)
+    assert not jax.jacrev(lambda x: project(camera, x)[0])(behind).any()
+
+
+def test_the_zero_vector_has_no_direction():
+    assert not normalize(jnp.zeros((2, 3))).any()
+    assert not jax.jacrev(normalize)(jnp.zeros(3)).any()
+
+
+@pytest.mark.parametrize("size", [1e-37, 1.0, 1e20, 1.1e38])
+def test_lengths_and_directions_up_to_the_largest_numbers(size):
+    vector = np.float32(size) * np.float32([1, -2, 2])
+    for length, direction in ((norm, normalize), (jax.jit(norm), jax.jit(normalize))):
+        np.testing.assert_allclose(length(vector), 3 * size, rtol=1e-6)
+        np.testing.assert_allclose(direction(vector), [1 / 3, -2 / 3, 2 / 3], rtol=1e-6)
+
+
 def test_rays_of_an_image_and_of_one_pixel():
     camera = a_camera("opencv", OPENCV[1])
     image = fast_rays(camera, pixel_grid(3, 4), near=2.0, far=6.0)
     assert image.origins.shape == (3, 4, 3) and image.far.shape == (3, 4)
-    workdir_lock = fast_rays(camera, pixel_grid(3, 4)[1, 2], near=2.0, far=6.0)
-    assert_same(workdir_lock, jax.tree.map(lambda leaf: leaf[1, 2], image))
+    single = fast_rays(camera, pixel_grid(3, 4)[1, 2], near=2.0, far=6.0)
+    assert_same(single, jax.tree.map(lambda leaf: leaf[1, 2], image))
 
 
 def forward_rays():

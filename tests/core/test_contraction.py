@@ -42,6 +42,13 @@ def some_rays(count=64, seed=0, near=0.05, far=1e4):
     )
 
 
+def test_rays_of_an_image_are_marched_as_in_a_row():
+    rays = some_rays(count=12)
+    image = jax.tree.map(lambda leaf: leaf.reshape(3, 4, *leaf.shape[1:]), rays)
+    row, rows = (march_rays(None, a_grid(), each, step_size=0.1, cell=CELL) for each in (rays, image))
+    np.testing.assert_allclose(rows.t.reshape(12, -1), row.t, rtol=1e-6)
+
+
 @settings(deadline=None, max_examples=100)
 @given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3))
 def test_expand_undoes_contract(x):

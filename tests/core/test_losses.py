@@ -163,6 +163,29 @@ def test_nan_weights_show():
     assert np.isnan(compiled_distortion(weights, t, delta, 1, 7))
 
 
+@pytest.mark.parametrize("name", ["t", "weights"])
+def test_nan_in_a_packed_ray_stays_in_its_ray(name):
+    """Ray 1 of three is NaN; slots behind it are of ray 2, and the last two are unused."""
+    arrays = {"t": np.float32([2, 3, 2, 4, 2, 5, 9, 9]), "weights": np.float32([0.3, 0.4] * 3 + [0, 0])}
+    others = {
+        "delta": np.ones(8, np.float32),
+        "ray_index": np.int32([0, 0, 1, 1, 2, 2, 2, 2]),
+        "used": np.arange(8) < 6,
+    }
+    batch = make_batch(np.full(3, 1.0), 7.0)
+
+    def losses(**arrays):
+        samples = jaxnerf.PackedSamples(**arrays, **others)
+        rendering = make_rendering(np.zeros((3, 1), np.float32), np.zeros((3, 1)), np.zeros((3, 1)))
+        return jaxnerf.distortion_loss([dataclasses.replace(rendering, weights=None, samples=samples)], batch)
+
+    clean = np.asarray(losses(**arrays))
+    arrays[name][2:4] = np.nan
+    got = np.asarray(losses(**arrays))
+    np.testing.assert_array_equal(np.isnan(got), [False, True, False])
+    np.testing.assert_array_equal(got[[0, 2]], clean[[0, 2]])
+
+
 RAYS, SEGMENTS = 24, 40
 
 

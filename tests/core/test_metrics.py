@@ -44,6 +44,13 @@ def test_psnr_of_identical_images_is_infinite_with_gradient_zero():
     np.testing.assert_array_equal(slope, 0)
 
 
+def test_gradient_of_psnr():
+    a, b = pair(1, 0.1)
+    difference = a.astype(np.float64) - b
+    want = -20 / np.log(10) * difference / (difference**2).sum()
+    np.testing.assert_allclose(jax.grad(psnr)(a, b), want, rtol=1e-4, atol=1e-7)
+
+
 def test_psnr_keeps_nan():
     a, b = pair(2, 0.1)
     assert jnp.isnan(psnr(jnp.asarray(a).at[0, 0, 0].set(jnp.nan), b))

@@ -82,6 +82,12 @@ def test_draws_fill_their_segment_evenly():
         assert counts.sum() == 4000 and abs(counts - 500).max() < 120  # over five deviations
 
 
+def test_draws_fill_an_infinite_segment_evenly_in_disparity():
+    t = samples_from_edges(jax.random.key(6), np.broadcast_to(f32([2.0, np.inf]), (4000, 2))).t
+    counts = np.histogram(1 / t, bins=8, range=(0, 0.5))[0]
+    assert counts.sum() == 4000 and abs(counts - 500).max() < 120  # over five deviations
+
+
 def test_a_ray_with_its_own_key_does_not_depend_on_its_batch(edges, weights, keys):
     t, points = samples_from_edges(keys, edges).t, importance_points(keys, edges, weights, num_points=POINTS)
     np.testing.assert_array_equal(samples_from_edges(keys[2:4], edges[2:4]).t, t[2:4])
@@ -125,6 +131,11 @@ def test_inverse_cdf_undoes_the_cdf(edges, weights):
 def test_inverse_cdf_has_no_scale(edges, weights, scale):
     u = np.broadcast_to(np.linspace(0, 1, 11), (RAYS, 11))
     np.testing.assert_allclose(inverse_cdf(edges, weights * scale, u), inverse_cdf(edges, weights, u), rtol=1e-6)
+
+
+def test_inverse_cdf_of_weights_whose_sum_overflows():
+    points = inverse_cdf(f32([0, 1, 2, 3, 4]), np.full(4, 3e38, np.float32), f32([0.1, 0.5, 0.8]))
+    np.testing.assert_allclose(points, [0.4, 2, 3.2], rtol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e30])

@@ -95,6 +95,18 @@ def test_gradient_of_a_weight_keeps_its_digits(depth):
     np.testing.assert_allclose(slope, np.exp(-depth), rtol=1e-5)
 
 
+def test_derivative_of_the_weights_of_a_ray_with_thousands_of_samples():
+    """In double precision: dw_i = T_i exp(-tau_i) dtau_i - w_i sum of dtau_k in front of i."""
+    rng, size = np.random.default_rng(2), 5000
+    depth, tangent = np.float32(rng.exponential(2 / size, size)), np.float32(rng.normal(size=size))
+    _, change = jax.jvp(lambda depth: jaxnerf.weights_from_density(depth, jnp.ones(size)), (depth,), (tangent,))
+    exact, moved = depth.astype(np.float64), tangent.astype(np.float64)
+    in_front = np.cumsum(exact) - exact
+    weights = np.exp(-in_front) * -np.expm1(-exact)
+    want = np.exp(-in_front - exact) * moved - weights * (np.cumsum(moved) - moved)
+    np.testing.assert_allclose(change, want, atol=2e-4)
+
+
 def test_composite_adds_the_background_behind():
     weights, values = jnp.array([0.25, 0.5]), jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     np.testing.assert_allclose(composite(weights, values), [0.25, 0.5, 0.0])

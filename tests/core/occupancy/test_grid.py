@@ -90,6 +90,14 @@ def test_updates_empty_cells_without_density_and_keep_the_others():
     np.testing.assert_array_equal(grid.density_mean < 0, ~grid.occupied)
 
 
+@pytest.mark.parametrize("density, dense", [(0.5, False), (0.501, True)])
+def test_a_cell_with_a_density_at_the_threshold_is_empty(density, dense):
+    grid = create_grid(LOWER, UPPER, np.ones((2, 2, 2), bool), initial_density=0.0)
+    fog = lambda x, viewdirs: (jnp.full(x.shape[:-1], density), x)  # noqa: E731
+    updated = jaxnerf.update_grid(jax.random.key(0), grid, fog, np.arange(8), threshold=0.5)
+    assert (np.asarray(updated.occupied) == dense).all()
+
+
 def test_an_update_of_some_cells_does_not_change_the_others():
     grid = checked_grid(1.0, SIZES)
     cells = np.resize(np.int32([0, 3, 77, 300]), 4)
@@ -250,6 +258,12 @@ def test_density_up_to_its_cells_threshold_is_dropped(per_cell):
     clear, rgb = scene(x, x)
     np.testing.assert_array_equal(clear, np.float32(want))
     np.testing.assert_array_equal(rgb, x)
+
+
+def test_a_masked_scene_may_be_evaluated_nowhere():
+    masked = jaxnerf.mask_scene(lambda x, viewdirs: (x[..., 0], x), full_grid())
+    density, rgb = masked(jnp.zeros((0, 3)), jnp.zeros((0, 3)))
+    assert density.shape == (0,) and rgb.shape == (0, 3)
 
 
 def test_without_spread_only_dense_cells_count():

@@ -122,7 +122,14 @@ def test_slots_are_shared_evenly(seed):
         assert not short.size or (short.max() - short.min() <= 1 and number.max() <= short.min() + 1)
 
 
+def test_a_single_slot_is_used(grid, rays, candidates):
+    samples, _ = place(jax.random.key(0), grid, rays, candidates, max_samples=1)
+    assert samples.used.shape == (1,) and samples.used.all()
+
+
 def test_wrong_arguments_are_named(grid, rays, candidates):
+    with pytest.raises(ValueError, match="max_samples 0"):
+        importance_samples(jax.random.key(0), grid, rays, candidates, max_samples=0, uniform_fraction=0.5)
     with pytest.raises(ValueError, match="uniform_fraction 0"):
         importance_samples(jax.random.key(0), grid, rays, candidates, max_samples=9, uniform_fraction=0)
     gauss = dataclasses.replace(candidates, rule="gauss")
