@@ -99,13 +99,12 @@ def score(
     variables, results = run.variables(step), {}
     scene = run.experiment.model.scene(*variables)
     optical_depths = jax.jit(functools.partial(optical_depth, scene))
-    view_rays = jax.jit(run.experiment.view_rays)  # a lens is compiled once instead of for each view
     for split in PLACES:
         if not (truth.split == split).any():
             continue
         views = run.experiment.load_split(split)
         scored = [
-            _score_view(run, variables, (view_rays, optical_depths), views, index, truth, num_rays)
+            _score_view(run, variables, optical_depths, views, index, truth, num_rays)
             for index in range(len(views.names))
         ]
         rows = [each.row for each in scored]
@@ -119,15 +118,14 @@ def score(
     return results
 
 
-def _score_view(run, variables, functions, views, index, truth, num_rays):
-    view_rays, optical_depths = functions
+def _score_view(run, variables, optical_depths, views, index, truth, num_rays):
     name = views.names[index]
     known = list(truth.names).index(name)
     height, width = (int(value) for value in views.size[index])
     depth = truth.depth[known]
     if depth.shape != (height, width):
         raise ValueError(f"{name} has {width} x {height} px, expected those of the ground truth; train with factor 1")
-    rays = view_rays(views, index, pixel_grid(height, width))
+    rays = run.experiment.view_rays(views, index, pixel_grid(height, width))
     image = run.render_image(variables, rays)
     seen = truth.num_seen[known] >= _WITNESSES
     target = reference(views, index)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxnerf.core.occupancy.grid import is_occupied
+from jaxnerf.core.occupancy.grid import clip_rays_to_box, is_occupied
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import Views
 from jaxnerf.data.geometry.seen_cells import likely_empty_cells, seen_cells
@@ -19,7 +19,7 @@ from jaxnerf.models.grid_schedule import GridSchedule, InitialCells
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
-_MAX_RAYS = 2**24  # pixels up to which the ray of each is tested
+_MAX_RAYS = 2**22  # pixels up to which the ray of each is tested
 _NUM_TILES = 2**21  # tiles that are tested instead of more pixels; a ray takes some microseconds
 _SLOW = 0.5  # seconds of work from which the result is cached
 
@@ -250,10 +250,14 @@ def _pixels_of(tiles, side, size):
 
 def _hits(views, schedule, valid, view, pixels, *, ndc, chunk):
     """Returns whether rays [N] of views [N] through pixels [N, 2] hit a valid cell."""
+    everywhere = valid.all()
 
     @jax.jit
     def hits(views, grid, view, pixels):
         rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
+        if everywhere:
+            inside = clip_rays_to_box(grid, rays)
+            return inside.far > inside.near
         samples = march_rays(None, grid, rays, step_size=schedule.step_size, cell=schedule.cell)
         return ((samples.delta > 0) & is_occupied(grid, rays, samples.t)).any(axis=-1)
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -108,8 +109,8 @@ def build(config: ConfigDict) -> Experiment:
         load_split=functools.partial(dataset.load_split, config.data),
         draw=draw,
         pixel_ids=pixel_ids,
-        view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
-        world_depth=functools.partial(ray_batches.world_depth, ndc=config.data.ndc),
+        view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=config.data.ndc)),
+        world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=config.data.ndc)),
         prepare=functools.partial(_prepare, config, model, extras),
         seed=config.seed,
         pixel_offset=config.data.pixel_offset,

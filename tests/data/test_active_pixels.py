@@ -90,6 +90,16 @@ def test_tiles_contain_all_active_pixels(views, monkeypatch):
     assert expected.size < got.size < 0.6 * mask.sum()
 
 
+def test_without_empty_cells_the_rays_through_the_box_are_active(views):
+    """One invalid cell in a corner, which hides the corner's rays alone, makes the rays march through the grid."""
+    schedule = a_schedule(box=((-0.3,) * 3, (0.3,) * 3))
+    valid = np.ones(schedule.shape, bool)
+    through = set(active_pixels.find_active_pixels(views, schedule, valid).all_ids())
+    valid[0, 0, 0] = False
+    marched = set(active_pixels.find_active_pixels(views, schedule, valid).all_ids())
+    assert marched <= through and 0.95 * len(through) < len(marched) < len(views.pixels)
+
+
 def test_a_box_that_no_ray_hits_is_an_error(views):
     with pytest.raises(ValueError, match=r"no ray of 60 views .*\(50, 50, 50\).* correct occupancy.lower"):
         active_region(views, a_schedule(box=((50, 50, 50), (51, 51, 51))), use_alpha=False)

@@ -1,6 +1,7 @@
 """The cells of an occupancy grid that the training cameras see, and those that they see through or past."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import jax
@@ -31,14 +32,17 @@ def seen_cells(
 ) -> tuple[Bool[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
     """Returns the cells that at least min_views views see, and those that are free.
 
-    A view sees a cell if it sees one of its corners between near and far. A cell is free if it is in
-    front of `Views.free_until` for two of the views that see it, or for the only one: what a single camera shows close
-    to it has no parallax, so a field would put fog there that hides the scene from other cameras.
+    A view sees a cell if it sees one of its corners between near and far. A cell is free if it is in front of
+    `Views.free_until` for two of the views that see it, or for the only one: what a single camera shows close to it
+    has no parallax, so a field would put fog there that hides the scene from other cameras.
 
     Args:
         views: of the split that is trained on; a masked pixel sees nothing.
         schedule: of the box.
         min_views: at least 1.
+
+    Raises:
+        ValueError: if the lens of a view shows no pixel; names the view.
     """
     size = schedule.shape[0]
     slabs = -(-size * (schedule.shape[1] + 1) * (schedule.shape[2] + 1) // _SLAB)
@@ -108,7 +112,7 @@ def _view_counter(views, schedule, planes):
         none = jnp.zeros((planes, *shape[1:]), jnp.int32)
         return jax.lax.fori_loop(0, len(free_until), add, (none, none))
 
-    return lambda first: count(stack, first)
+    return functools.partial(count, stack)
 
 
 def _sees(to_world, near, far, free_until, least, scale, shown, x):
@@ -139,6 +143,11 @@ def _shown_slopes(views):
         camera = jax.tree.map(lambda leaf, view=view: np.asarray(leaf)[view], views.cameras)
         camera = dataclasses.replace(camera, to_world=np.eye(3, 4, dtype=np.float32))
         slopes, exists = map(np.asarray, _undistort(camera, pixels * [width, height]))
+        if not exists.any():
+            name = views.names[view] if views.names else view
+            raise ValueError(
+                f"view {name}: its lens shows no pixel, expected a camera that does; correct its distortion"
+            )
         slopes = np.clip(slopes[exists] * [1, -1], -_STEEPEST, _STEEPEST)
         lower, upper = slopes.min(axis=0), slopes.max(axis=0)
         x, y = (lower + (upper - lower) * (np.arange(_SLOPES) + 0.5)[:, None] / _SLOPES).T

@@ -112,6 +112,16 @@ def test_cells_are_seen_through_the_lens():
     assert outside.any() and not through[outside & (depth > 2)].any()
 
 
+def test_a_lens_that_shows_nothing_is_an_error():
+    views = some_views((0.0,))
+    center = np.full((1, 2), 1e5, np.float32)  # px: so far out that this barrel distortion maps no ray there
+    cameras = dataclasses.replace(
+        views.cameras, center=center, distortion=np.float32([[-10.0, 0, 0, 0]]), lens="opencv"
+    )
+    with pytest.raises(ValueError, match="view 0: its lens shows no pixel"):
+        seen_cells(dataclasses.replace(views, cameras=cameras), a_schedule(), min_views=1)
+
+
 @pytest.mark.parametrize("contracted", [False, True])
 def test_the_space_in_front_of_the_stated_depth_is_free(contracted):
     schedule = a_schedule(contracted=contracted)
