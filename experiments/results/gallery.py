@@ -54,9 +54,7 @@ def show(folder: pathlib.Path, out: pathlib.Path) -> list[str]:
     """
     scored, paths = table.scored(folder), list(folder.glob("renders/*/color"))
     if not scored or not paths:
-        raise ValueError(
-            f"{folder}: has no scores or no frames; run jaxnerf-eval and jaxnerf-render --workdir={folder}"
-        )
+        raise ValueError(f"{folder}: lacks scores or frames; run jaxnerf-eval and jaxnerf-render --workdir={folder}")
     path, renders = scored[-1], max(paths, key=lambda path: path.stat().st_mtime)
     results, name = read_json(path, "score it again"), folder.name
     _write(out / f"{name}.jpg", strip(path.parent))

@@ -40,6 +40,7 @@ CURVES = {
     "grid without alpha": _curve("lego_fast", (15, 30, 60, 120), **{"occupancy.use_alpha": False}),
     "grid 200": _curve("lego_fast", (60, 300), **{"data.factor": 4}),
     "grid 400": _curve("lego_fast", (180, 600), **{"data.factor": 2}),
+    "grid 800": _curve("lego_fast", (600,), **{"data.factor": 1}),
     "capture can": _curve("capture", (120, 300, 600), **{"data.dir": "can"}),
     "capture fern": _curve("capture", (120, 300, 600), **{"data.dir": "fern"}),
     "capture fox": _curve("capture", (120, 300, 600), **{"data.dir": "fox"}),

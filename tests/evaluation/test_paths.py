@@ -138,6 +138,20 @@ def test_interpolation_is_even_between_two_poses_and_on_a_line():
     np.testing.assert_allclose(path[:, :, 3], np.linspace(0, 3, 13)[:, None] * [1, 2, 0], atol=1e-5)
 
 
+@pytest.mark.parametrize("closed", [False, True])
+def test_interpolation_halfway_is_that_of_catmull_and_rom(closed):
+    """Between b and c: (9 (b + c) - a - d) / 16, with the neighbours a and d; past an end they are on a line."""
+    eyes = np.random.default_rng(0).normal(size=(5, 3))
+    knots = np.stack([pose(np.eye(3), eye) for eye in eyes])
+    around = np.roll(eyes, 1, axis=0), eyes, np.roll(eyes, -1, axis=0), np.roll(eyes, -2, axis=0)
+    if not closed:
+        padded = np.concatenate([[2 * eyes[0] - eyes[1]], eyes, [2 * eyes[-1] - eyes[-2]]])
+        around = tuple(padded[k : k + 4] for k in range(4))
+    a, b, c, d = around
+    path = interpolate(10 if closed else 9, poses=np.float32(knots), closed=closed)
+    np.testing.assert_allclose(path[1::2, :, 3], (9 * (b + c) - a - d) / 16, atol=1e-5)
+
+
 @pytest.mark.parametrize("degrees", [0.0, 1e-4, 179.99, 180.0, 270.0])
 def test_interpolation_turns_the_shorter_way(degrees):
     knots = np.float32([pose(np.eye(3), [0, 0, 0]), pose(turn([2, -1, 0.5], degrees), [0, 0, 0])])

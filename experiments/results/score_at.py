@@ -1,0 +1,34 @@
+"""Scores a run on the images of another run, which was trained on the same dataset at another resolution.
+
+    python experiments/results/score_at.py --workdir=RUN --like=OTHER --out=DIR
+
+DIR becomes a copy of RUN that reads its images as OTHER does, and holds the scores; table.py prints them.
+"""
+
+import pathlib
+import shutil
+
+from absl import flags
+
+from jaxnerf.evaluation.evaluate import evaluate, summary
+from jaxnerf.runtime import cli
+from jaxnerf.training import workdir
+
+_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run to score.", required=True)
+_LIKE = flags.DEFINE_string("like", None, "Folder of the run whose images are the reference.", required=True)
+_OUT = flags.DEFINE_string("out", None, "Folder of the scored copy, missing.", required=True)
+
+
+def main(argv: list[str]) -> None:
+    """Copies and scores the run."""
+    del argv
+    out, config = pathlib.Path(_OUT.value), workdir.read_config(_WORKDIR.value)
+    if out.exists():
+        raise ValueError(f"{out}: exists, expected a missing folder; remove it, or give another --out")
+    config.data = workdir.read_config(_LIKE.value).data
+    shutil.copytree(_WORKDIR.value, out, ignore=shutil.ignore_patterns("eval", "renders"))
+    print(summary(evaluate(out, config=config)))
+
+
+if __name__ == "__main__":
+    cli.run(main)
