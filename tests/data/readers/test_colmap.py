@@ -7,7 +7,6 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -131,7 +130,15 @@ def test_a_small_model_is_read_as_it_was_written(tmp_path, write):
         np.testing.assert_array_equal(found, np.reshape(kept, (-1, 5)))
 
 
-def test_binary_text_and_pycolmaps_text_agree(tmp_path):
+@pytest.fixture
+def pycolmap():
+    """The library, imported here because its handlers of fatal signals would hide in which test another one crashes."""
+    import pycolmap
+
+    return pycolmap
+
+
+def test_binary_text_and_pycolmaps_text_agree(tmp_path, pycolmap):
     want = colmap.read_capture(put(tmp_path, binary(*model())))
     pycolmap.Reconstruction(str(want.source)).write_text(str(want.source))
     for file in want.source.glob("*.bin"):
@@ -145,7 +152,7 @@ def test_binary_text_and_pycolmaps_text_agree(tmp_path):
 
 
 @pytest.mark.parametrize("number, name, rest, lens, distortion", LENSES, ids=[row[1] for row in LENSES])
-def test_every_lens_agrees_with_colmap(tmp_path, number, name, rest, lens, distortion):
+def test_every_lens_agrees_with_colmap(tmp_path, pycolmap, number, name, rest, lens, distortion):
     """Projections are COLMAP's, including the position of pixel centres."""
     known = pycolmap.Camera.create_from_model_name(1, name, 90.0, 64, 48)
     count = len(known.params) - len(rest) - 2
@@ -417,15 +424,16 @@ def test_a_wrong_count_is_an_error_and_allocates_nothing(tmp_path, count):
         assert peak < 1e6
 
 
-def real_can(scenes_dir):
-    """Returns the reader's and pycolmap's model of the real can."""
+@pytest.fixture
+def real_can(scenes_dir, pycolmap):
+    """The reader's and pycolmap's model of the real can."""
     folder = scenes_dir / "can"
     return colmap.read_capture(folder), pycolmap.Reconstruction(str(folder / "sparse" / "0"))
 
 
 @pytest.mark.scenes("can")
-def test_the_real_can_agrees_with_pycolmap_to_1e_9(scenes_dir):
-    capture, known = real_can(scenes_dir)
+def test_the_real_can_agrees_with_pycolmap_to_1e_9(real_can):
+    capture, known = real_can
     assert len(capture.frames) == 71 and capture.notes == ()
     ids = sorted(known.points3D)
     np.testing.assert_array_equal(capture.points, [known.points3D[key].xyz for key in ids])
@@ -447,9 +455,9 @@ def test_the_real_can_agrees_with_pycolmap_to_1e_9(scenes_dir):
 
 
 @pytest.mark.scenes("can")
-def test_the_real_cans_points_project_to_their_observations(scenes_dir):
+def test_the_real_cans_points_project_to_their_observations(real_can):
     """A mistake in poses, lens, axes or pixel centres moves the projections by half a pixel or more."""
-    capture, known = real_can(scenes_dir)
+    capture, known = real_can
     see = jax.jit(jax.vmap(project, in_axes=(0, None)))
     cameras = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(frame.camera for frame in capture.frames))
     pixels, depth = jax.tree.map(np.asarray, see(cameras, capture.points))
