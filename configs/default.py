@@ -76,7 +76,8 @@ def get_config():
             "hash_grid": {  # of the field "hash_grid"
                 "resolutions": auto(tuple),  # vertices along the longest side, one number per level
                 "features_per_level": 4,
-                "table_size": 2**17,  # maximal rows per level; a level with more vertices is hashed
+                # Maximal rows per level; a level with more vertices is hashed. auto: in proportion to an image's side.
+                "table_size": auto(int, 2**17),
                 "width": 64,  # outputs of the density network's hidden layer
                 "geometry_features": 15,  # outputs of the density network that the colour network reads
                 "view_depth": 2,  # hidden layers of the colour network
@@ -130,15 +131,16 @@ def get_config():
                 "num_images": auto(int),  # of the split "train"
             },
             "train": {
-                # Rays per step, over all devices. auto: cpu_batch_size on a CPU, and with the sampler "hierarchical";
-                # on an accelerator as many as keep it busy, in the same number of steps.
+                # Rays per step, over all devices. auto: cpu_batch_size on a CPU, twice as many for a large hash grid,
+                # and cpu_batch_size with the sampler "hierarchical"; on an accelerator with the sampler "occupancy" as
+                # many as keep it busy, in the same number of steps.
                 "batch_size": auto(int, 1024),
                 "cpu_batch_size": 1024,
                 "microbatch_size": auto(int),  # rays per gradient accumulation
                 "steps_per_dispatch": auto(int),  # training steps between which the host does nothing
                 "batching": "all_images",  # "all_images", or "single_image": each step draws its rays from one view
                 "parallel": "auto",  # "jit", "sharded", "pmap"; "auto": jit on one device, otherwise sharded
-                "max_steps": auto(int, 200_000),
+                "max_steps": auto(int, 200_000),  # auto: by the size of the images; without limit if time is limited
                 # s of training, without compilation; 0: no limit. The learning rate then reaches its end when the time
                 # does, so that the run depends on the clock.
                 "max_seconds": 0.0,

@@ -65,7 +65,7 @@ class Previews:
             why = f"it reached train.max_steps = {options.max_steps:,}"
         else:
             limit, more = "train.max_seconds", 2 * options.max_seconds
-            why = f"train.max_seconds = {options.max_seconds:g} have passed at step {step:,} of {options.max_steps:,}"
+            why = f"train.max_seconds = {options.max_seconds:g} have passed at step {metric_log.of_all(step, options)}"
         return [
             f"done          {why}: {row.get('rays', 0):,} rays in {row['seconds']:.1f} s of training",
             *self._cameras(step, views),

@@ -7,6 +7,7 @@ from absl import flags
 from ml_collections import FieldReference, config_flags
 
 AUTO = "auto"  # the only marker of a value that is inferred
+UNLIMITED_STEPS = 10**7  # train.max_steps of a run that train.max_seconds ends
 
 
 def auto(kind: type, value: Any = AUTO) -> FieldReference:

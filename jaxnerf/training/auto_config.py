@@ -16,7 +16,7 @@ from jaxnerf.data.geometry import poses, visual_hull, world
 from jaxnerf.data.observations import num_shared
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.runtime import devices, processes
-from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.runtime.config_fields import UNLIMITED_STEPS, is_auto
 from jaxnerf.training.build import build_model
 from jaxnerf.training.config_ranges import check_ranges
 from jaxnerf.training.dead_networks import CHECK_EVERY
@@ -24,6 +24,9 @@ from jaxnerf.training.dead_networks import CHECK_EVERY
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, where space is not contracted
 _LEVELS = 4  # of the hash grid; the box of contracted space is twice as large and has one level more
+# Rows of a hash grid's level per pixel of an image's side; finer images show what collisions of the hash cost.
+_ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
+_LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 _MAX_STATED_BOX = 3.0  # times the box of contraction; a stated box that is larger is no better than contraction
@@ -222,10 +225,16 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     line = f"hash grid     {levels} vertices along the longest side"
     infer(config.hash_grid, "resolutions", levels, line, used=config.field == "hash_grid")
     side = float(np.sqrt(np.prod(views.size, axis=1)).mean())
+    rows = 2 ** round(math.log2(np.clip(_ROWS_PER_PIXEL * side, _MIN_ROWS, _MAX_ROWS)))
+    line = f"hash grid     at most {rows:,} rows per level, for images {side:.0f} px wide"
+    infer(config.hash_grid, "table_size", rows, line, used=config.field == "hash_grid")
     steps = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5)
+    why = f"{steps:,} steps, for images {side:.0f} px wide"
+    if train.max_seconds:
+        steps, why = UNLIMITED_STEPS, f"ends after train.max_seconds = {train.max_seconds:g}"
     if "cameras" in config:  # older versions had no such section
         infer(config.cameras, "num_images", len(views.size), "", used=False)
-    infer(train, "max_steps", steps, f"training      {steps:,} steps, for images {side:.0f} px wide")
+    infer(train, "max_steps", steps, f"training      {why}")
     infer(train, "lr_steps", train.max_steps, f"training      learning rate decays over {train.max_steps:,} steps")
     return lines
 
@@ -236,6 +245,9 @@ def _resolve_batch(config: ConfigDict, lines: list[str], platform: str) -> None:
     An accelerator takes more rays in the same number of steps: the schedules, which count steps, keep their meaning.
     """
     rays, why = config.train.get("cpu_batch_size"), "train.cpu_batch_size"
+    large = config.field == "hash_grid" and config.hash_grid.table_size >= _LARGE_TABLE
+    if config.sampler == "occupancy" and large:
+        rays, why = 2 * rays, "twice train.cpu_batch_size, as the hash grid's table is large"
     if platform != "cpu" and config.sampler == "occupancy":
         filling = devices.profile_of(platform).samples_per_step / config.occupancy.pool_samples_per_ray
         rays, why = 2 ** max(math.floor(math.log2(filling)), 0), "they keep this device busy"

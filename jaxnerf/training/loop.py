@@ -93,7 +93,7 @@ def run_training(
     log = metric_log.MetricLog(folder, first_step=first, write=processes.is_first())
     before = log.rows[-1]["seconds"] if log.rows else 0.0
     processes.print_once(*unreadable, *metric_log.header(experiment, views, state, **seconds))
-    progress = metric_log.Progress(options.max_steps, show=processes.is_first())
+    progress = metric_log.Progress(metric_log.all_steps(options), show=processes.is_first())
     previews = _PreviewTimes(options.preview_every if preview else 0.0, before)
     clock = _Clock(before, first * options.batch_size - int(state.counters.get("rays_dropped", 0)))
     reinitialize_dead = make_reinitializer(experiment, folder)
@@ -127,7 +127,8 @@ def run_training(
                 )
                 row["lr"] *= pace.scale
                 log.append(row)
-                progress.show(step, metric_log.line(row, options, out_of_time=out_of_time))
+                text = metric_log.line(row, options, out_of_time=out_of_time)
+                progress.show(step, text, metric_log.fraction_done(row, options))
                 recent = []
                 _check_finite(row, options, folder)
             if save:

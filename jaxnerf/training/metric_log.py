@@ -14,6 +14,7 @@ import numpy as np
 from jaxnerf.core.metrics import decibels
 from jaxnerf.core.types import Views
 from jaxnerf.runtime.atomic_files import naming, open_regular, parse_json, partial_file, read_bytes, write_text
+from jaxnerf.runtime.config_fields import UNLIMITED_STEPS
 from jaxnerf.runtime.devices import devices_of
 from jaxnerf.training.dead_networks import dead_networks
 from jaxnerf.training.state import TrainState
@@ -152,20 +153,26 @@ class _Events:
 class Progress:
     """A progress bar on a terminal; plain lines in a log file."""
 
-    def __init__(self, total: int, stream: TextIO | None = None, show: bool = True):
+    def __init__(self, total: int | None, stream: TextIO | None = None, show: bool = True):
         self._total, self._stream, self._shown = total, stream or sys.stderr, show
         self._terminal = show and self._stream.isatty()
 
-    def show(self, done: int, text: str) -> None:
-        """Shows how many of the total steps are done, followed by a text."""
+    def show(self, done: int, text: str, fraction: float | None = None) -> None:
+        """Shows how many of the total steps are done, followed by a text.
+
+        Args:
+            done: steps.
+            text: what follows.
+            fraction: which part of the work is done, if not that of the steps.
+        """
         if not self._shown:
             return
-        fraction = min(done / self._total, 1.0)
+        fraction = min(done / self._total if fraction is None else fraction, 1.0)
         if self._terminal:
             bar = "#" * int(24 * fraction)
             self._stream.write(f"\r\033[K[{bar:<24}] {100 * fraction:3.0f} %  {text}")
         else:
-            self._stream.write(f"{done}/{self._total}  {text}\n")
+            self._stream.write(f"{done}{f'/{self._total}' if self._total else ''}  {text}\n")
         self._stream.flush()
 
     def note(self, *lines: str) -> None:
@@ -203,7 +210,7 @@ def header(
         lines.append(f"grid          {fraction:.1%} of {cells} cells valid, in {prepare_seconds:.1f} s")
     lines += [
         f"compiled      in {compile_seconds:.1f} s",
-        f"steps         {int(state.step)} of {options.max_steps} done, {options.batch_size} rays per step in "
+        f"steps         {of_all(int(state.step), options)} done, {options.batch_size} rays per step in "
         f"microbatches of {min(options.microbatch_size, options.batch_size // len(devices))}",
     ]
     return lines
@@ -245,6 +252,23 @@ def row(
         "rays_dropped": rays_dropped,
         **{name: int(last[name]) for name in last if name == "num_reinits" or name.startswith("dead_")},
     }
+
+
+def all_steps(options: Any) -> int | None:
+    """Returns the number of steps of a run, or None if only train.max_seconds limits it; options: section `train`."""
+    return None if options.max_seconds and options.max_steps >= UNLIMITED_STEPS else options.max_steps
+
+
+def of_all(step: int, options: Any) -> str:
+    """Returns "1,000 of 2,000", or "1,000" where the number of all steps is not known."""
+    total = all_steps(options)
+    return f"{step:,}" + (f" of {total:,}" if total else "")
+
+
+def fraction_done(row: dict[str, Any], options: Any) -> float:
+    """Returns which part of a run, by its steps or its time, ends with a row of metrics."""
+    by_time = row["seconds"] / options.max_seconds if options.max_seconds else 0.0
+    return max(row["step"] / options.max_steps, by_time)
 
 
 def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:

@@ -129,18 +129,25 @@ def make_train_step(
         total = _sum_over_microbatches(lambda part: microbatch(state, data, part), positions)
         if axis_name is not None:
             total = jax.lax.psum(total, axis_name)
-        metrics, grads, rays = _mean_over_rays(*total)
+        sums, grads = total
+        rays = sums.pop("rays")
+        scale = 1 / jnp.maximum(rays, 1)
+        metrics = jax.tree.map(lambda leaf: leaf * scale, sums)
         errors = {name: metrics["mse" if name == "fine" else "mse_coarse"] for name in networks(grads)}
         dead = count_dead_steps(state.counters, networks(grads), errors, model.input_layers, model.color_layers)
-        metrics, grads = regularize(state, metrics, grads)
-        metrics["grad_norm"] = optax.tree.norm(grads)
+        if regularizers:
+            metrics, grads = regularize(state, metrics, jax.tree.map(lambda leaf: leaf * scale, grads))
+            scale = 1.0
+        metrics["grad_norm"] = scale * optax.tree.norm(grads)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
 
         lr_scale = getattr(data, "lr_scale", None)
-        scale = {} if lr_scale is None else {"lr_scale": lr_scale}
+        options = {} if lr_scale is None else {"lr_scale": lr_scale}
 
         def descend():
-            updates, opt_state = optimizer.update(grads, state.opt_state, state.params, **scale)
+            # The optimizer's own passes over the gradient scale it: a pass more would take long for a large table.
+            mean = jax.tree.map(lambda leaf: leaf * scale, grads)
+            updates, opt_state = optimizer.update(mean, state.opt_state, state.params, **options)
             return optax.apply_updates(state.params, updates), opt_state
 
         # A branch: selecting between old and new arrays would take about as long as the update itself.
@@ -187,13 +194,6 @@ def repeat_step(train_step: Callable[..., tuple], num_steps: int) -> Callable[..
 def _scaled(weight, value):
     """Returns weight * value; a constant weight of 1 adds no operation."""
     return value if isinstance(weight, int | float) and weight == 1 else weight * value
-
-
-def _mean_over_rays(sums, grads):
-    """Returns metrics and gradient as means over the rays that were not dropped, and the number of these rays."""
-    rays = sums.pop("rays")
-    scale = 1 / jnp.maximum(rays, 1)
-    return *jax.tree.map(lambda leaf: leaf * scale, (sums, grads)), rays
 
 
 def _sum_over_microbatches(function, positions):

@@ -19,7 +19,7 @@ from jaxnerf.data import synthetic
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
-from jaxnerf.runtime.config_fields import AUTO
+from jaxnerf.runtime.config_fields import AUTO, UNLIMITED_STEPS
 from jaxnerf.training import workdir
 from jaxnerf.training.auto_config import DEVICE_FIELDS, auto_fields, fill_from, resolve, resolve_for_device
 from jaxnerf.training.build import build
@@ -33,6 +33,7 @@ AUTO_FIELDS = {
     "coarse.num_freqs": 7,
     "fine.num_freqs": 7,
     "hash_grid.resolutions": (8, 16),
+    "hash_grid.table_size": 2**12,
     "occupancy.contracted": True,
     "occupancy.lower": (-1.0, -2.0, -3.0),
     "occupancy.upper": (1.0, 2.0, 3.5),
@@ -338,6 +339,27 @@ def test_larger_images_are_trained_on_longer(views):
     got, _, lines = resolve(config, views)
     assert (got.train.max_steps, got.train.lr_steps) == (7, 7)
     assert not any(line.startswith("training") and "steps, for images" in line for line in lines)
+
+
+def test_a_run_of_limited_time_takes_all_the_steps_that_it_can(views):
+    config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    config.train.max_steps, config.train.lr_steps, config.train.max_seconds = AUTO, AUTO, 60.0
+    got, _, lines = resolve(config, views)
+    assert got.train.max_steps == got.train.lr_steps == UNLIMITED_STEPS
+    assert "training      ends after train.max_seconds = 60" in lines
+
+
+@pytest.mark.parametrize("factor, rows, rays", [(1, 2**17, 300), (8, 2**18, 300), (16, 2**19, 600), (99, 2**20, 600)])
+def test_the_hash_grids_table_follows_the_images_and_a_large_one_gets_more_rays(views, factor, rows, rays):
+    larger = dataclasses.replace(views, size=factor * views.size)
+    config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    config.hash_grid.table_size = config.train.batch_size = AUTO
+    config.train.cpu_batch_size = 300
+    got, _, lines = resolve(config, larger, platform="cpu")
+    assert (got.hash_grid.table_size, got.train.batch_size) == (rows, rays)
+    assert any(f"at most {rows:,} rows per level" in line for line in lines)
+    config.field, config.fine.num_freqs = "mlp", 4  # has no table
+    assert resolve(config, larger, platform="cpu").config.train.batch_size == 300
 
 
 def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):

@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 
+from jaxnerf.runtime.config_fields import UNLIMITED_STEPS
 from jaxnerf.training import metric_log
 
 STEP = {
@@ -60,3 +61,13 @@ def test_a_note_is_a_line_above_the_bar():
         assert stream.getvalue() == expected
         metric_log.Progress(10, stream, show=False).note("c")
         assert stream.getvalue() == expected
+
+
+@pytest.mark.parametrize("max_steps, shown, done", [(100, "20/100  text\n", 0.5), (UNLIMITED_STEPS, "20  text\n", 0.5)])
+def test_progress_of_a_run_of_limited_time(max_steps, shown, done):
+    """Its part is that of the time, and the number of steps is shown only if it may end the run."""
+    train, stream = types.SimpleNamespace(batch_size=64, max_steps=max_steps, max_seconds=10.0), io.StringIO()
+    metric_log.Progress(metric_log.all_steps(train), stream).show(20, "text", 0.5)
+    assert stream.getvalue() == shown
+    assert metric_log.fraction_done(row([{}]), train) == done
+    assert metric_log.of_all(20, train) == ("20 of 100" if max_steps == 100 else "20")
