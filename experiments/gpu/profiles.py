@@ -35,10 +35,9 @@ PEAKS = {
 }
 SECTOR = 32  # bytes: the least that a read or an atomic addition at a random place moves
 
-# More rows than lego_fast.py has: at 400 x 400 and above collisions of the hash limit first.
-FULL_SIZE = {"data.factor": 1, "hash_grid.table_size": 2**19}
+FULL_SIZE = {"data.factor": 1, "hash_grid.table_size": 2**19}  # the table of arXiv:2201.05989
 # The steps never end a run of limited time, and the learning rate follows the time.
-TIMED = {"train.max_steps": 10**6, "train.lr_steps": 10**6}
+TIMED = {"train.max_steps": 10**7, "train.lr_steps": 10**7}
 
 _TINY = {
     "data.format": "synthetic",

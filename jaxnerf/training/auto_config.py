@@ -235,7 +235,9 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     if "cameras" in config:  # older versions had no such section
         infer(config.cameras, "num_images", len(views.size), "", used=False)
     infer(train, "max_steps", steps, f"training      {why}")
-    infer(train, "lr_steps", train.max_steps, f"training      learning rate decays over {train.max_steps:,} steps")
+    unlimited = train.max_steps >= UNLIMITED_STEPS
+    line = "training      learning rate decays until " + ("the end" if unlimited else f"step {train.max_steps:,}")
+    infer(train, "lr_steps", train.max_steps, line)
     return lines
 
 
