@@ -22,8 +22,10 @@ from jaxnerf.training.config_ranges import check_ranges
 from jaxnerf.training.dead_networks import CHECK_EVERY
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
-_FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, where space is not contracted
-_LEVELS = 4  # of the hash grid; the box of contracted space is twice as large and has one level more
+_FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of the last of four levels
+# Of the hash grid. The box of contracted space is twice as large and has one level more; so have images of that many
+# pixels a side. On images of 400 px a fifth level gains less than the rays that it costs in the first minutes.
+_LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a hash grid's level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
@@ -208,8 +210,9 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
         raise ValueError(
             f"occupancy.lower is {section.lower} and occupancy.upper {section.upper}, expected lower < upper"
         )
-    wide = bool(section.contracted)  # half of the box holds the surroundings
-    vertices = int(np.clip(round(longest / (_CELL_PER_PIXEL * footprint)), _FINEST[0], _FINEST[1] << wide))
+    side = float(np.sqrt(np.prod(views.size, axis=1)).mean())
+    more = int(section.contracted or side >= _FIVE_LEVELS_SIDE)  # half of a contracted box holds the surroundings
+    vertices = int(np.clip(round(longest / (_CELL_PER_PIXEL * footprint)), _FINEST[0], _FINEST[1] << more))
     finest = min(vertices, _FINEST[1])
     step_size = longest / min(finest, _MAX_STEPS_PER_SIDE)
     line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
@@ -221,10 +224,9 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     for name, used in (("coarse", config.sampler == "hierarchical"), ("fine", config.field == "mlp")):
         line = f"octaves       {octaves} in {name}; the shortest wave is four pixels long"
         infer(config[name], "num_freqs", octaves, line, used=used)
-    levels = tuple(max(vertices // 2**level, 2) for level in reversed(range(_LEVELS + wide)))
+    levels = tuple(max(vertices // 2**level, 2) for level in reversed(range(_LEVELS + more)))
     line = f"hash grid     {levels} vertices along the longest side"
     infer(config.hash_grid, "resolutions", levels, line, used=config.field == "hash_grid")
-    side = float(np.sqrt(np.prod(views.size, axis=1)).mean())
     rows = 2 ** round(math.log2(np.clip(_ROWS_PER_PIXEL * side, _MIN_ROWS, _MAX_ROWS)))
     line = f"hash grid     at most {rows:,} rows per level, for images {side:.0f} px wide"
     infer(config.hash_grid, "table_size", rows, line, used=config.field == "hash_grid")

@@ -374,10 +374,11 @@ def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
         longest = max(np.subtract(got.occupancy.upper, got.occupancy.lower))
         return got.hash_grid.resolutions, got.occupancy.resolution, round(longest / got.occupancy.step_size)
 
-    for contracted, finest, levels in ((False, (34, 69, 256), 4), (True, (69, 137, 512), 5)):
-        for factor, vertices in zip((1, 2, 16), finest, strict=True):
+    for contracted, finest in ((False, (34, 69, 256, 512)), (True, (69, 137, 512, 512))):
+        for factor, vertices in zip((1, 2, 16, 32), finest, strict=True):
             resolutions, cells, steps = sizes(contracted, factor)
-            assert len(resolutions) == levels and resolutions[-1] == pytest.approx(vertices, abs=1)
+            assert len(resolutions) == 4 + (contracted or factor == 32)
+            assert resolutions[-1] == pytest.approx(vertices, abs=1)
             assert all(2 * a in (b, b - 1) for a, b in itertools.pairwise(resolutions))
             assert cells == min(resolutions[-1], 128 if contracted else 96) and steps == min(resolutions[-1], 144)
 
