@@ -247,7 +247,7 @@ def test_run_resumed_before_the_detection_is_bit_exact(reinitialized, tmp_path):
 
 def test_without_reinitialization_a_dead_run_stays_dead_and_reports_it(reinitialized, tmp_path, monkeypatch):
     shown = []
-    monkeypatch.setattr(metric_log.Progress, "show", lambda self, step, text: shown.append((step, text)))
+    monkeypatch.setattr(metric_log.Progress, "show", lambda self, step, text, _: shown.append((step, text)))
     rows = train_toy(from_step_60(reinitialized, tmp_path), max_reinits=0)
     assert (rows[-1]["dead_coarse"], rows[-1]["num_reinits"]) == (240, 0)
     said = [step for step, text in shown if text.endswith("  coarse network dead")]
