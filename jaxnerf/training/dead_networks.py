@@ -27,6 +27,7 @@ def count_dead_steps(
     errors: Mapping[str, Any],
     input_layers: Mapping[str, Sequence[str]],
     color_layers: Mapping[str, Sequence[str]],
+    scale: Any = 1.0,
 ) -> dict[str, Any]:
     """Counts for how many steps in a row each network has been dead, as counters "dead_<name>".
 
@@ -43,18 +44,19 @@ def count_dead_steps(
 
     Args:
         counters: of the step before; int32 [].
-        grads: network name -> gradient over the whole batch.
+        grads: network name -> gradient over the whole batch, of the mean squared error after it is scaled.
         errors: network name -> mean squared error of its rendering.
         input_layers: network name -> names of the layers that take the position; empty: all layers.
         color_layers: network name -> names of the first layers that serve colour alone; empty: not checked.
+        scale: factor of the gradients.
     """
     dead = {}
     for name, grad in grads.items():
         error = errors[name]
         inputs, color = ([grad[layer] for layer in layers.get(name, ())] for layers in (input_layers, color_layers))
-        still = optax.tree.norm(inputs or grad) <= _GRADIENT * jnp.sqrt(error)
+        still = scale * optax.tree.norm(inputs or grad) <= _GRADIENT * jnp.sqrt(error)
         if color:
-            still |= optax.tree.norm(color) <= _COLOR_GRADIENT * jnp.sqrt(error)
+            still |= scale * optax.tree.norm(color) <= _COLOR_GRADIENT * jnp.sqrt(error)
         before = counters[f"dead_{name}"]
         dead[f"dead_{name}"] = jnp.where(error > _ERROR, (before + 1) * still.astype(jnp.int32), before)
     return dead

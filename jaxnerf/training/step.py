@@ -134,7 +134,8 @@ def make_train_step(
         scale = 1 / jnp.maximum(rays, 1)
         metrics = jax.tree.map(lambda leaf: leaf * scale, sums)
         errors = {name: metrics["mse" if name == "fine" else "mse_coarse"] for name in networks(grads)}
-        dead = count_dead_steps(state.counters, networks(grads), errors, model.input_layers, model.color_layers)
+        layers = model.input_layers, model.color_layers
+        dead = count_dead_steps(state.counters, networks(grads), errors, *layers, scale)
         if regularizers:
             metrics, grads = regularize(state, metrics, jax.tree.map(lambda leaf: leaf * scale, grads))
             scale = 1.0

@@ -13,6 +13,7 @@ import pytest
 
 from helpers import assert_same, random_rays
 from jaxnerf import Batch
+from jaxnerf.models.base import Model
 from jaxnerf.runtime import devices
 from jaxnerf.training import dead_networks, loop, metric_log
 from jaxnerf.training.build import build_model
@@ -21,7 +22,7 @@ from jaxnerf.training.optimizer import with_averaging
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step
 from runs import smoke_config, smoke_experiment
-from toys import LOSSES, toy_draw, toy_model
+from toys import LOSSES, toy_draw, toy_model, toy_rendering
 
 OPTIMIZER = optax.adam(1e-3)
 RAYS = 64
@@ -284,3 +285,16 @@ def test_networks_of_any_structure_and_number_are_counted_by_name():
     errors = {"fine": jnp.float32(0.1), "proposal": jnp.float32(0.1), "warp": jnp.float32(0.0)}
     got = dead_networks.count_dead_steps(counters, grads, errors, {"fine": ()}, {"fine": ()})
     assert jax.tree.map(int, got) == {"dead_fine": 5, "dead_proposal": 0, "dead_warp": 4}
+
+
+@pytest.mark.parametrize("num_rays", [16, 4096])
+@pytest.mark.parametrize("slope, is_dead", [(1e-6, True), (1e-2, False)])
+def test_a_small_gradient_counts_alike_for_any_number_of_rays(num_rays, slope, is_dead):
+    def render(keys, params, grid, rays, step):
+        return (toy_rendering(rays.viewdirs + slope * params["fine"]["w"][None]),)
+
+    model = Model(lambda key: {"fine": {"w": jnp.zeros(3)}}, render, view=None, scene=None, samples_per_ray=1.0)
+    step = jax.jit(make_train_step(model, OPTIMIZER, toy_draw, LOSSES))
+    rays, positions = random_rays(0, (num_rays,)), jnp.arange(num_rays)[None]
+    state, _ = step(create_state(model, OPTIMIZER, 0), (rays, jnp.array([-1])), positions)
+    assert int(state.counters["dead_fine"]) == is_dead
