@@ -23,8 +23,8 @@ from jaxnerf.training.dead_networks import CHECK_EVERY
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of the last of four levels
-# Of the hash grid. The box of contracted space is twice as large and has one level more; so have images of that many
-# pixels a side. On images of 400 px a fifth level gains less than the rays that it costs in the first minutes.
+# Levels of the hash grid. Contracted space, whose box is twice as large, gets one more, and so do images of at least
+# _FIVE_LEVELS_SIDE px a side. At 400 px a fifth level gains less than the rays that it costs in the first minutes.
 _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a hash grid's level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
@@ -228,18 +228,21 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     line = f"hash grid     {levels} vertices along the longest side"
     infer(config.hash_grid, "resolutions", levels, line, used=config.field == "hash_grid")
     rows = 2 ** round(math.log2(np.clip(_ROWS_PER_PIXEL * side, _MIN_ROWS, _MAX_ROWS)))
-    line = f"hash grid     at most {rows:,} rows per level, for images {side:.0f} px wide"
+    line = f"hash grid     at most {rows:,} rows per level, for images of about {side:.0f} x {side:.0f} px"
     infer(config.hash_grid, "table_size", rows, line, used=config.field == "hash_grid")
-    steps = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5)
-    why = f"{steps:,} steps, for images {side:.0f} px wide"
-    if train.max_seconds:
+    planned = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5)
+    steps, why = planned, f"{planned:,} steps, for images of about {side:.0f} x {side:.0f} px"
+    if train.get("max_seconds"):
         steps, why = UNLIMITED_STEPS, f"ends after train.max_seconds = {train.max_seconds:g}"
     if "cameras" in config:  # older versions had no such section
         infer(config.cameras, "num_images", len(views.size), "", used=False)
     infer(train, "max_steps", steps, f"training      {why}")
-    unlimited = train.max_steps >= UNLIMITED_STEPS
-    line = "training      learning rate decays until " + ("the end" if unlimited else f"step {train.max_steps:,}")
-    infer(train, "lr_steps", train.max_steps, line)
+    decay_steps, end = train.max_steps, f"step {train.max_steps:,}"
+    if train.max_steps >= UNLIMITED_STEPS and jax.process_count() == 1:
+        end = "the end"
+    elif train.max_steps >= UNLIMITED_STEPS:  # several processes have no common clock
+        decay_steps, end = planned, f"step {planned:,}"
+    infer(train, "lr_steps", decay_steps, f"training      learning rate decays until {end}")
     return lines
 
 

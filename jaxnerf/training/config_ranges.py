@@ -9,7 +9,7 @@ from ml_collections import ConfigDict
 
 from jaxnerf.configs import default
 from jaxnerf.runtime import memory
-from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.runtime.config_fields import UNLIMITED_STEPS, is_auto
 
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
 _MAX_OCTAVES = 64  # of encoding.positional_encoding
@@ -100,6 +100,12 @@ def check_ranges(config: ConfigDict) -> None:
                 raise ValueError(f"--config.{name} is {fields[name]!r}, expected one of {choices}; correct it")
             if fields.get(name) == "float64" and not jax.config.jax_enable_x64:
                 raise ValueError(f"--config.{name} is 'float64', which requires the environment's JAX_ENABLE_X64=1")
+    for name in ("train.max_steps", "train.lr_steps"):
+        if not is_auto(fields[name]) and fields[name] >= UNLIMITED_STEPS and not fields.get("train.max_seconds"):
+            raise ValueError(
+                f"--config.{name} is {fields[name]:,}, which means that --config.train.max_seconds ends the run, "
+                "and that is 0; set a time, or start another run with a number of steps"
+            )
     _check_lists(fields)
     _check_memory(fields)
 

@@ -347,6 +347,16 @@ def test_a_run_of_limited_time_takes_all_the_steps_that_it_can(views):
     got, _, lines = resolve(config, views)
     assert got.train.max_steps == got.train.lr_steps == UNLIMITED_STEPS
     assert "training      ends after train.max_seconds = 60" in lines
+    assert "training      learning rate decays until the end" in lines
+
+
+def test_the_learning_rate_of_several_processes_depends_on_steps_in_a_run_of_limited_time(views, monkeypatch):
+    config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    config.train.max_steps, config.train.lr_steps, config.train.max_seconds = AUTO, AUTO, 60.0
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    got, _, lines = resolve(config, views)
+    assert (got.train.max_steps, got.train.lr_steps) == (UNLIMITED_STEPS, 4899)
+    assert "training      learning rate decays until step 4,899" in lines
 
 
 @pytest.mark.parametrize("factor, rows, rays", [(1, 2**17, 300), (8, 2**18, 300), (16, 2**19, 600), (99, 2**20, 600)])

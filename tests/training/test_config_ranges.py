@@ -7,7 +7,7 @@ from ml_collections import ConfigDict
 
 from jaxnerf.configs import default
 from jaxnerf.evaluation.evaluate import train_and_evaluate
-from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.runtime.config_fields import UNLIMITED_STEPS, is_auto
 from jaxnerf.training import config_ranges
 from jaxnerf.training.auto_config import resolve_for_device
 from runs import PACKED, ROOT, smoke_config
@@ -33,6 +33,13 @@ def test_a_number_outside_its_range_makes_no_workdir(tmp_path, field, value, exp
     with pytest.raises(ValueError, match=rf"--config.{field} is {value}, {expected}; correct it"):
         train_and_evaluate(config, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("field", ["max_steps", "lr_steps"])
+def test_a_run_that_its_time_ends_cannot_become_one_without_a_limit(field):
+    config_ranges.check_ranges(smoke_config(max_seconds=60.0, **{field: UNLIMITED_STEPS}))
+    with pytest.raises(ValueError, match=rf"--config.train.{field} is 10,000,000, .* and that is 0; set a time"):
+        config_ranges.check_ranges(smoke_config(max_seconds=0.0, **{field: UNLIMITED_STEPS}))
 
 
 @pytest.mark.parametrize(
