@@ -61,4 +61,4 @@ lint: $(BIN)/.dev
 	$(BIN)/ruff format --check .
 
 clean:
-	rm -rf .venv runs build site *.egg-info
+	rm -rf .venv build site *.egg-info

@@ -76,7 +76,8 @@ def get_config():
             "hash_grid": {  # of the field "hash_grid"
                 "resolutions": auto(tuple),  # vertices along the longest side, one number per level
                 "features_per_level": 4,
-                # Maximal rows per level; a level with more vertices is hashed. auto: in proportion to an image's side.
+                # Maximal rows per level; a level with more vertices is hashed. auto: 2^17 to 2^20, in proportion to an
+                # image's side.
                 "table_size": auto(int, 2**17),
                 "width": 64,  # outputs of the density network's hidden layer
                 "geometry_features": 15,  # outputs of the density network that the colour network reads

@@ -121,21 +121,21 @@ def _document(rows):
     planted, found, false, checks = (sum(row[index] for row in rows) for index in (2, 3, 4, 5))
     precision = found / max(found + false, 1)
     lines = [
-        "# What jaxnerf-check accuses",
+        "# What jaxnerf-check flags",
         "",
         *common.provenance(),
         "",
-        "Each check has one planted defect in one random image; a swap concerns two. An accusation is an error that",
-        "names an image. A displaced camera is moved by half the median distance of the cameras from their middle.",
+        "Each check has one planted defect in one random image; a swap concerns two. An image is flagged if an",
+        "error names it. A displaced camera is moved by half the median distance of the cameras from their middle.",
         "",
-        "| scene | defect | checks | images planted | of these accused | good images accused |",
+        "| scene | defect | checks | images planted | of these flagged | good images flagged |",
         "|---|---|---|---|---|---|",
         *(
             f"| {scene} | {defect} | {n} | {there} | {right} | {wrong} |"
             for scene, defect, there, right, wrong, n in rows
         ),
         "",
-        f"Together: precision {precision:.1%}, recall {found / max(planted, 1):.1%}, {false} good images accused in "
+        f"Together: precision {precision:.1%}, recall {found / max(planted, 1):.1%}, {false} good images flagged in "
         f"{checks} checks.",
         "",
     ]

@@ -142,7 +142,11 @@ def ceilings(context: Context) -> dict[str, Any]:
 
 
 def step_parts(context: Context) -> dict[str, Any]:
-    """Times the training step at full size, its parts, and several steps in a dispatch."""
+    """Times the training step at full size, its parts, and several steps in a dispatch.
+
+    FLOP are the compiler's count, in which the iterations of a loop count once unless it knows their number, and on a
+    GPU possibly not the products that a library computes. The product is one in float32.
+    """
     experiment, state, data, config = _built(context, profiles.FULL_SIZE)
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
     positions = jnp.arange(config.train.batch_size).reshape(-1, config.train.microbatch_size)
@@ -171,15 +175,17 @@ def step_parts(context: Context) -> dict[str, Any]:
         "update of the grid": (update, state),
         "step without an update": (step, state, no_updates, positions),
     }
-    rows = []
+    peak, rows = profiles.product_flops(context.tiny), []
     for name, (function, *arguments) in timed.items():
-        seconds = profiles.repeated(jax.jit(function), *arguments, repeats=2 if context.tiny else 20)
-        rows.append({"part": name, "ms": 1e3 * seconds})
+        compiled = jax.jit(function).lower(*arguments).compile()
+        flops = (compiled.cost_analysis() or {}).get("flops", 0.0)
+        seconds = profiles.repeated(compiled, *arguments, repeats=2 if context.tiny else 20)
+        rows.append({"part": name, "ms": 1e3 * seconds, "GFLOP": flops / 1e9, "of a product": flops / seconds / peak})
     for count in (1, 2) if context.tiny else (1, 4, 16):
         run = jax.jit(repeat_step(step, count))
         seconds = profiles.repeated(run, state, data, positions, repeats=1 if context.tiny else max(64 // count, 1))
         rows.append({"part": f"step, {count} in a dispatch", "ms": 1e3 * seconds / count})
-    return {"rays": config.train.batch_size, "rows": rows}
+    return {"rays": config.train.batch_size, "float32 product, GFLOP/s": peak / 1e9, "rows": rows}
 
 
 def _built(context, overrides):

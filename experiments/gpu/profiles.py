@@ -71,17 +71,12 @@ def configuration(base: str, overrides: dict[str, Any], *, tiny: bool):
 
 def measure_ceilings(tiny: bool) -> dict[str, float]:
     """Measures what this device reaches: matrix products, a copy, random reads and additions, and a dispatch."""
-    side, count = (256, 2**16) if tiny else (8192, 2**26)
-    matrix = jax.random.normal(jax.random.key(0), (side, side))
-    found = {}
-    for name, dtype, precision in (
-        ("float32", jnp.float32, "highest"),
-        ("tf32", jnp.float32, "default"),
-        ("bfloat16", jnp.bfloat16, "default"),
-    ):
-        product = jax.jit(functools.partial(jnp.dot, precision=precision))
-        operand = matrix.astype(dtype)
-        found[f"{name}_flops"] = 2 * side**3 / repeated(product, operand, operand)
+    found = {
+        "float32_flops": product_flops(tiny),
+        "tf32_flops": product_flops(tiny, precision="default"),
+        "bfloat16_flops": product_flops(tiny, jnp.bfloat16, "default"),
+    }
+    count = 2**16 if tiny else 2**22 if _on_cpu() else 2**26
     values = jnp.ones(4 * count)
     double = jax.jit(lambda x: 2 * x)
     found["copy_bytes"] = 2 * values.nbytes / repeated(double, values)
@@ -95,6 +90,18 @@ def measure_ceilings(tiny: bool) -> dict[str, float]:
     number = jnp.float32(0)
     found["dispatch_seconds"] = repeated(tick, number, repeats=100)
     return found
+
+
+def product_flops(tiny: bool, dtype: Any = jnp.float32, precision: str = "highest") -> float:
+    """Returns the FLOP/s of a product of square matrices, of a size that suits the device."""
+    side = 256 if tiny else 1024 if _on_cpu() else 8192
+    matrix = jax.random.normal(jax.random.key(0), (side, side)).astype(dtype)
+    product = jax.jit(functools.partial(jnp.dot, precision=precision))
+    return 2 * side**3 / repeated(product, matrix, matrix)
+
+
+def _on_cpu():
+    return jax.default_backend() == "cpu"
 
 
 def repeated(function: Callable[..., Any], *arguments: Any, repeats: int = 10) -> float:

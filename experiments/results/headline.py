@@ -42,8 +42,8 @@ def table(measured: dict) -> list[str]:
             ours = {point["comparable"]: point["psnr"] for point in points}
             cells = [f"{peer}: {_scores(scores)}" for peer, scores in peers.items()]
             rows.append((work, _scores(ours), f"{points[-1]['seconds_per_frame']:.2f} s", "; ".join(cells) or "-"))
-    heads = ("dataset, one CPU core", "PSNR after comparable seconds of training", "a frame", "measured beside it")
-    how = "Comparable seconds allow for the speed of the machine: [speed against error](docs/results/speed.md)."
+    heads = ("dataset, one CPU core", "PSNR after comparable seconds of training", "a frame", "others, CPU seconds")
+    how = "Comparable seconds are seconds scaled by the speed of a matrix product: [how](docs/results/speed.md)."
     return [*common.markdown(heads, rows), "", how]
 
 

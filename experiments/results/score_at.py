@@ -2,7 +2,7 @@
 
     python experiments/results/score_at.py --workdir=RUN --like=OTHER --out=DIR
 
-DIR becomes a copy of RUN that reads its images as OTHER does, and holds the scores; table.py prints them.
+DIR becomes a copy of RUN with its scores on the images of OTHER; table.py prints them.
 """
 
 import pathlib
@@ -18,6 +18,8 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run to score.", r
 _LIKE = flags.DEFINE_string("like", None, "Folder of the run whose images are the reference.", required=True)
 _OUT = flags.DEFINE_string("out", None, "Folder of the scored copy, missing.", required=True)
 
+_MAY_DIFFER = ("dir", "factor", "fingerprint", "width")
+
 
 def main(argv: list[str]) -> None:
     """Copies and scores the run."""
@@ -25,7 +27,14 @@ def main(argv: list[str]) -> None:
     out, config = pathlib.Path(_OUT.value), workdir.read_config(_WORKDIR.value)
     if out.exists():
         raise ValueError(f"{out}: exists, expected a missing folder; remove it, or give another --out")
-    config.data = workdir.read_config(_LIKE.value).data
+    like = workdir.read_config(_LIKE.value).data
+    for name in like:  # another split of the images could put training images of RUN among those that are scored
+        if name not in _MAY_DIFFER and like[name] != config.data.get(name):
+            raise ValueError(
+                f"{_LIKE.value}: data.{name} is {like[name]!r}, in {_WORKDIR.value} it is {config.data.get(name)!r}; "
+                f"expected runs that differ in {', '.join(_MAY_DIFFER)} only"
+            )
+    config.data = like
     shutil.copytree(_WORKDIR.value, out, ignore=shutil.ignore_patterns("eval", "renders"))
     print(summary(evaluate(out, config=config)))
 

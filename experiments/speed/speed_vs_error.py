@@ -133,7 +133,18 @@ def _training(kept):
 def published_tables() -> list[str]:
     """Returns the lines of what others report, and of what was known before the start."""
     heads = ("system", "on", "PSNR", "s", "hardware", "kind", "source")
-    return _others(heads, published.TRAINING, psnr="{:.2f}", seconds="{:,.0f}")
+    peers = [
+        (curve, peer, ", ".join(f"{psnr} dB ({seconds} s)" for seconds, psnr in scores.items()))
+        for curve, measured in published.PEERS.items()
+        for peer, scores in measured.items()
+    ]
+    return [
+        *_others(heads, published.TRAINING, psnr="{:.2f}", seconds="{:,.0f}"),
+        "",
+        "Other programs, run once each by hand on one core of such a machine, in CPU seconds of the process:",
+        "",
+        *common.markdown(("as the curve", "program", "PSNR of the same test views"), peers),
+    ]
 
 
 def _others(heads, entries, **formats):

@@ -186,7 +186,7 @@ def _keep_memory():
         mallopt(-4, 0)  # M_MMAP_MAX: no block is mapped separately
         mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
         mallopt(-2, 2**28)  # M_TOP_PAD: without it, memory that other threads free is still returned
-        mallopt(-8, 1)  # M_ARENA_MAX: the heaps of other threads are unmapped as soon as they are empty
+        mallopt(-8, 1)  # M_ARENA_MAX: all threads share a heap, as others are unmapped whenever they are empty
 
 
 def _parse(argv: Sequence[str], module: str) -> list[str]:

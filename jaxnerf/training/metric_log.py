@@ -266,7 +266,7 @@ def of_all(step: int, options: Any) -> str:
 
 
 def fraction_done(row: dict[str, Any], options: Any) -> float:
-    """Returns which part of a run, by its steps or its time, ends with a row of metrics."""
+    """Returns the fraction of a run that is done at a row of metrics: by its steps or its time, whichever is larger."""
     by_time = row["seconds"] / options.max_seconds if options.max_seconds else 0.0
     return max(row["step"] / options.max_steps, by_time)
 

@@ -40,7 +40,7 @@ def render_path(
 ) -> list[pathlib.Path]:
     """Renders a camera path to <workdir>/renders/<path>-<step>/ and a video beside that folder.
 
-    The folder holds color/0000.png; depth/0000.tiff, float32, the expected distance along the optical axis in
+    The folder holds color/0000.png; depth/0000.tiff, float32, the expected distance along the ray in
     world units of the dataset's file, where the transmittance that remains counts at the far end of the ray (in
     NDC that is infinity, so a ray that hits nothing has inf); depth/0000.png, an image of it with one range for
     the whole path; and path.json, everything that the frames depend on. Existing frames are not rendered again.
