@@ -13,6 +13,7 @@ import pytest
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
+from jaxnerf.runtime.config_fields import AUTO, UNLIMITED_STEPS
 from jaxnerf.training import metric_log, workdir
 from jaxnerf.training.checkpoint import Checkpoints
 from runs import SMOKE_FLAGS, run, smoke_config, start
@@ -115,6 +116,21 @@ def test_resumed_run_does_not_exceed_its_limit_of_seconds(trained, tmp_path):
     for _ in range(2):
         assert train_and_evaluate(smoke_config(max_steps=100, max_seconds=1e-3), folder)
     assert Checkpoints(folder).steps()[-1] == 20
+
+
+@pytest.mark.slow
+def test_a_run_that_only_its_time_ends_can_be_trained_longer(tmp_path):
+    ends = []
+    for seconds in (0.05, 0.3):
+        config = smoke_config(max_seconds=seconds, save_every=10**6)
+        config.train.max_steps = config.train.lr_steps = AUTO
+        assert train_and_evaluate(config, tmp_path)
+        ends.append(Checkpoints(tmp_path).steps()[-1])
+    assert 0 < ends[0] < ends[1] < UNLIMITED_STEPS
+    saved = json.loads((tmp_path / "config.json").read_text())["train"]
+    assert saved["max_steps"] == saved["lr_steps"] == UNLIMITED_STEPS
+    with pytest.raises(ValueError, match="--config.train.max_steps is 10,000,000, .* set a time"):
+        train_and_evaluate(smoke_config(max_steps=UNLIMITED_STEPS, lr_steps=UNLIMITED_STEPS, max_seconds=0.0), tmp_path)
 
 
 def test_load_scene_restores_the_model(trained):
