@@ -403,15 +403,17 @@ def running_sum(x: Float[ArrayLike, "*batch samples"], part_size: int = 16) -> F
 
 def running_sum_since(starts: Bool[ArrayLike, " K"], x: Float[Array, " K"], longest: int) -> Float[Array, " K"]:
     """Computes the cumulative sum since the last start, for runs of at most longest (Hillis and Steele 1986)."""
-    step = 1
-    while step < min(longest, x.size):
-        zeros, ones = jnp.zeros(step, x.dtype), jnp.ones(step, bool)
-        x, starts = (
-            jnp.where(starts, x, x + jnp.concatenate([zeros, x[:-step]])),
-            starts | jnp.concatenate([ones, starts[:-step]]),
-        )
-        step *= 2
-    return x
+    rounds = max(min(longest, x.size) - 1, 0).bit_length()
+
+    def add_before(level, state):
+        x, starts = state
+        at = x.size - (1 << level)
+        before = jnp.concatenate([jnp.zeros_like(x), x]), jnp.concatenate([jnp.ones_like(starts), starts])
+        before = [jax.lax.dynamic_slice_in_dim(leaf, at, x.size) for leaf in before]
+        return jnp.where(starts, x, x + before[0]), starts | before[1]
+
+    # A loop: unrolled, its rounds take several times as long to compile.
+    return jax.lax.fori_loop(0, rounds, add_before, (x, starts))[0]
 
 
 def _sample_index(x):

@@ -3,6 +3,7 @@
 This is the importance sampling of arXiv:2003.08934 (Section 5.2) with the grid in place of the coarse network.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -128,11 +129,12 @@ def divide_slots(count: Int[ArrayLike, " B"], num_slots: int) -> Int[Array, " B"
 def _count_up_to(ascending, row, value):
     """Returns [K], how many of ascending[row] [K, S] are at most value [K]; at most S - 1."""
     size = ascending.shape[-1]
-    found = jnp.zeros(row.shape, jnp.int32)
-    step = 1 << (size.bit_length() - 1)
-    while step:
-        place = found + step
+    largest = 1 << (size.bit_length() - 1)
+
+    def search(level, found):
+        place = found + (largest >> level)
         inside = place < size
-        found = jnp.where(inside & (ascending[row, jnp.minimum(place, size) - 1] <= value), place, found)
-        step //= 2
-    return found
+        return jnp.where(inside & (ascending[row, jnp.minimum(place, size) - 1] <= value), place, found)
+
+    # A loop: unrolled, its steps take several times as long to compile.
+    return jax.lax.fori_loop(0, size.bit_length(), search, jnp.zeros(row.shape, jnp.int32))
