@@ -6,6 +6,7 @@ import gc
 import importlib
 import os
 import pathlib
+import re
 import signal
 import sys
 import warnings
@@ -17,6 +18,7 @@ from ml_collections import config_flags
 
 from jaxnerf.registry import READERS
 from jaxnerf.runtime import signals
+from jaxnerf.runtime.config_fields import schedule
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 
@@ -90,8 +92,8 @@ def define_config(
 
     def parse(value):
         if load_saved and value.endswith(".json"):
-            return load_saved(value).lock()
-        return load(_list_configs() if value == "help" else config_path(value))
+            return _with_losses(load_saved(value)).lock()
+        return _with_losses(load(_list_configs() if value == "help" else config_path(value)))
 
     parser.parse = parse
     if required:
@@ -154,6 +156,18 @@ def config_path(value: str) -> str:
             f"there is no file and no config {name!r}, expected a path or one of {', '.join(config_names())}"
         )
     return f"{CONFIGS / name}.py{colon}{argument}"
+
+
+def _with_losses(config):
+    """Returns a config with all losses whose weight the command line sets; plugins, which register losses, come later.
+
+    A loss that is never registered is an error when the config is resolved.
+    """
+    arguments = [re.match(r"--?config\.losses\.(\w+)(=|$)", argument) for argument in sys.argv[1:]]
+    with config.unlocked():
+        for name in {match[1] for match in arguments if match and "losses" in config} - set(config.get("losses", {})):
+            config.losses[name] = schedule(0.0)
+    return config
 
 
 def _list_configs():

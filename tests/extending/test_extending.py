@@ -132,12 +132,14 @@ def test_the_export_program_restores_a_run_without_a_grid(trained, tmp_path):
 
 @pytest.mark.slow
 def test_the_programs_import_plugins(compiled_once, tmp_path):
-    """Training with the sampler works by --plugins, and without it the message names the flag."""
-    flags = [*SMOKE_FLAGS, "--config.sampler=uniform", "--config.train.max_steps=2", f"--workdir={tmp_path / 'run'}"]
+    """Training with the sampler and the loss works by --plugins, and without it the message names the flag."""
+    changes = ("sampler=uniform", "losses.mask=0.1", "train.max_steps=2")
+    flags = [*SMOKE_FLAGS, *(f"--config.{change}" for change in changes), f"--workdir={tmp_path / 'run'}"]
     path = f"{ROOT / 'tests' / 'extending'}:{ROOT}"
     failed = start("train", *flags, PYTHONPATH=path)
     _, err = failed.communicate(timeout=120)
     assert failed.returncode != 0 and "jaxnerf.register_sampler with --plugins=MODULE" in err
-    trained = start("train", "--plugins=uniform_sampler", *flags, PYTHONPATH=path)
+    trained = start("train", "--plugins=uniform_sampler,mask_loss", *flags, PYTHONPATH=path)
     _, err = trained.communicate(timeout=120)
     assert trained.returncode == 0, err
+    assert "loss_mask" in read_rows(tmp_path / "run")[-1]

@@ -4,6 +4,7 @@ import platform
 import subprocess
 import sys
 
+import ml_collections
 import pytest
 
 from jaxnerf.registry import FIELDS
@@ -113,6 +114,13 @@ def test_a_plugin_registers_a_field(tmp_path):
     code, out, err = call(tmp_path, "--plugins=my_plugin", "--count=auto")
     names = out.split()  # another test of this process may have registered fields, the program has not
     assert (code, names) == (0, ["auto", "mlp", "hash_grid", "mine"]), err
+
+
+def test_the_command_line_sets_the_weight_of_a_loss_that_is_not_registered_yet(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["program", "--config.losses.mine=0.5", "--config.losses.mse", "2"])
+    config = cli._with_losses(ml_collections.ConfigDict({"losses": {"mse": 1.0}}).lock())
+    config.losses.mine = ((0, 0.5), (10, 0.0))  # the field takes schedules, as those of default.py do
+    assert set(config.losses) == {"mse", "mine"} and config.is_locked
 
 
 def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):
