@@ -1,6 +1,6 @@
 """NeRF (arXiv:2003.08934) in one file, on public names of jaxnerf only: reads a dataset, trains, scores, saves images.
 
-    python examples/minimal_nerf.py [--data_dir=FOLDER] [--steps=2000] [--out=minimal_nerf.png]
+    python examples/minimal_nerf.py [--data_dir=FOLDER] [--steps=1000] [--out=minimal_nerf.png]
 
 Without --data_dir it trains on the embedded scene, which needs no download. The networks are small, so that this takes
 about two minutes on one CPU core. `jaxnerf-train` adds what this file leaves out: checkpoints, several devices,
@@ -98,7 +98,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data_dir", default="", help="Folder of a dataset; empty: the embedded scene.")
     parser.add_argument("--factor", type=int, default=1, help="Images are shrunk by this factor.")
-    parser.add_argument("--steps", type=int, default=2000, help="Training steps.")
+    parser.add_argument("--steps", type=int, default=1000, help="Training steps.")
     parser.add_argument("--out", default="minimal_nerf.png", help="File for a test image beside its rendering.")
     flags = parser.parse_args()
 
