@@ -37,18 +37,37 @@ def test_every_page_is_in_the_navigation():
     assert listed == {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
 
 
+@pytest.mark.parametrize("page", sorted({*(DOCS / "results").glob("*.md")} - {DOCS / "results" / "index.md"}), ids=str)
+def test_results_state_command_commit_date_and_machine(page):
+    rows = re.findall(
+        r"^\| command \| commit \| machine \|\n.*\n\| (.*) \| (.*) \| (.+) \|$", page.read_text(), re.MULTILINE
+    )
+    assert rows
+    for command, commit, _ in rows:
+        assert re.search(r"`.*\.py|`jaxnerf-|as above", command)
+        assert re.search(r"\b[0-9a-f]{7}\b.*, \d{4}-\d\d-\d\d$", commit)
+
+
+def test_every_page_of_results_is_in_its_index():
+    listed = re.findall(r"^\| \[.*?\]\((\w+\.md)\)", (DOCS / "results" / "index.md").read_text(), re.MULTILINE)
+    assert sorted([*listed, "index.md"]) == sorted(page.name for page in (DOCS / "results").glob("*.md"))
+
+
 def test_every_public_name_is_on_one_page():
     text = "".join(page.read_text() for page in (DOCS / "api").iterdir())
     assert sorted(re.findall(r"^::: jaxnerf\.(\w+)$", text, re.MULTILINE)) == sorted(jaxnerf.__all__)
 
 
+def lines_of_blocks(page):
+    """Returns the lines of a page's blocks without a language, without comments."""
+    blocks = re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [line.split(" #")[0].strip() for block in blocks for line in block.splitlines()]
+
+
 def commands(page):
-    """Yields the commands of a page: lines of blocks without a language, and code in the text that begins as one."""
-    text = page.read_text().replace("\\\n", " ")
-    blocks = re.findall(r"^```\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-    lines = [line.split(" #")[0] for block in blocks for line in block.splitlines()]
-    text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
-    for line in [*lines, *re.findall(r"`([^`]+)`", text)]:
+    """Yields the commands of a page: lines of its blocks, and code in the text that begins as one."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    for line in [*lines_of_blocks(page), *re.findall(r"`([^`]+)`", text)]:
         for command in re.split(r"; |&& ", line.replace("\n", " ")):
             command = re.sub(r"^(\w+=\S* |taskset -c \d )+", "", command.strip())
             if re.match(r"(jaxnerf-\w|python3? |make |pip3? install|--\w)", command):
