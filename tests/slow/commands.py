@@ -10,6 +10,7 @@ of their own.
 import os
 import pathlib
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -55,10 +56,11 @@ def run(line: str, folder: pathlib.Path) -> subprocess.CompletedProcess:
     """Runs a command line in a folder, at a small size."""
     program, *flags = shlex.split(line)
     module = PROGRAMS[program]
-    scored = next(iter(sorted(folder.glob("runs/lego/eval/*"))), "")
+    if "=DIR" in line:
+        for kind in ("color", "gt-color"):
+            shutil.copytree(next(folder.glob("runs/lego/eval/*")) / kind, folder / "DIR" / kind)
     flags = [flag.replace("/path/to/dataset", "lego").replace("/path/to/lego", "lego") for flag in flags]
-    flags = [flag.replace("=DIR", f"={scored}") for flag in flags] + SHORT.get(module, [])
-    command = [sys.executable, "-m", f"jaxnerf.{module}", *flags]
+    command = [sys.executable, "-m", f"jaxnerf.{module}", *flags, *SHORT.get(module, [])]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
