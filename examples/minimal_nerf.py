@@ -26,7 +26,7 @@ BACKGROUND = jnp.ones(3)  # colour behind the scene and behind the images' alpha
 # Figure 7, with positional encoding (Eq. 4). The coarse network only guides the samples of the fine one.
 NETWORK = {"density_activation": "softplus", "density_bias": -1.0}
 COARSE = jaxnerf.mlp_field(depth=2, width=32, num_freqs=6, use_viewdirs=False, **NETWORK)
-FINE = jaxnerf.mlp_field(depth=4, width=80, view_width=64, num_freqs=7, **NETWORK)
+FINE = jaxnerf.mlp_field(depth=4, width=64, view_width=32, num_freqs=7, **NETWORK)
 
 
 def render(params, keys, rays):
