@@ -67,16 +67,16 @@ def test_every_public_name_is_in_an_example_of_its_page(page):
     assert [name for name in names if not re.search(rf"\bjaxnerf\.{name}\b", code)] == []
 
 
-def lines_of_blocks(page):
+def fenced_lines(page):
     """Returns the lines of a page's blocks without a language, without comments."""
-    blocks = re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
-    return [line.split(" #")[0].strip() for block in blocks for line in block.splitlines()]
+    fences = re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [line.split(" #")[0].strip() for fence in fences for line in fence.splitlines()]
 
 
 def commands(page):
     """Yields the commands of a page: lines of its blocks, and code in the text that begins as one."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
-    for line in [*lines_of_blocks(page), *re.findall(r"`([^`]+)`", text)]:
+    for line in [*fenced_lines(page), *re.findall(r"`([^`]+)`", text)]:
         for command in re.split(r"; |&& ", line.replace("\n", " ")):
             command = re.sub(r"^(\w+=\S* |taskset -c \d )+", "", command.strip())
             if re.match(r"(jaxnerf-\w|python3? |make |pip3? install|--\w)", command):

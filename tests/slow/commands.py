@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 
-from test_documents import DOCS, PROGRAMS, ROOT, lines_of_blocks
+from test_documents import DOCS, PROGRAMS, ROOT, fenced_lines
 
 PAGES = [ROOT / "README.md", DOCS / "getting_started.md"]
 PAGES += [DOCS / "guides" / f"{name}.md" for name in ("your_own_images", "training", "rendering", "evaluation")]
@@ -34,7 +34,7 @@ SKIPPED = ("...", "HOST", "--viewer", "jaxnerf-view", "jaxnerf-cameras", "jaxner
 def main() -> int:
     """Runs each command once; prints its seconds, and the output of those that fail."""
     lines = ["jaxnerf-train --config=quickstart --workdir=runs/demo"]  # as `make demo`, for the pages that export it
-    lines += [line for page in PAGES for line in lines_of_blocks(page) if line.split(" ")[0] in PROGRAMS]
+    lines += [line for page in PAGES for line in fenced_lines(page) if line.split(" ")[0] in PROGRAMS]
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
         for line in dict.fromkeys(lines):
