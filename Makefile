@@ -41,6 +41,7 @@ test-extra: $(BIN)/.dev
 	$(PYTEST) -m extra
 	$(BIN)/python tests/slow/notebooks.py
 	$(BIN)/python tests/slow/minimal_nerf.py
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/commands.py
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/device_matrix.py runs/extra/device_matrix
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/kill_many.py --kills=20 --seed=1 --out=runs/extra/kill_many
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults

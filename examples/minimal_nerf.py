@@ -1,6 +1,6 @@
 """NeRF (arXiv:2003.08934) in one file, on public names of jaxnerf only: reads a dataset, trains, scores, saves images.
 
-    python examples/minimal_nerf.py [--data_dir=FOLDER] [--steps=2000] [--out=minimal_nerf.png]
+    python examples/minimal_nerf.py [--data_dir=FOLDER] [--steps=1000] [--out=minimal_nerf.png]
 
 Without --data_dir it trains on the embedded scene, which needs no download. The networks are small, so that this takes
 about two minutes on one CPU core. `jaxnerf-train` adds what this file leaves out: checkpoints, several devices,
@@ -26,7 +26,7 @@ BACKGROUND = jnp.ones(3)  # colour behind the scene and behind the images' alpha
 # Figure 7, with positional encoding (Eq. 4). The coarse network only guides the samples of the fine one.
 NETWORK = {"density_activation": "softplus", "density_bias": -1.0}
 COARSE = jaxnerf.mlp_field(depth=2, width=32, num_freqs=6, use_viewdirs=False, **NETWORK)
-FINE = jaxnerf.mlp_field(depth=4, width=80, view_width=64, num_freqs=7, **NETWORK)
+FINE = jaxnerf.mlp_field(depth=4, width=64, view_width=32, num_freqs=7, **NETWORK)
 
 
 def render(params, keys, rays):
@@ -98,7 +98,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data_dir", default="", help="Folder of a dataset; empty: the embedded scene.")
     parser.add_argument("--factor", type=int, default=1, help="Images are shrunk by this factor.")
-    parser.add_argument("--steps", type=int, default=2000, help="Training steps.")
+    parser.add_argument("--steps", type=int, default=1000, help="Training steps.")
     parser.add_argument("--out", default="minimal_nerf.png", help="File for a test image beside its rendering.")
     flags = parser.parse_args()
 

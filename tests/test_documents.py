@@ -4,11 +4,15 @@ import re
 
 import jax
 import pytest
+from ml_collections import ConfigDict
 
 import jaxnerf
+from jaxnerf import registry
+from jaxnerf.configs import default
 from runs import ROOT
 
 DOCS = ROOT / "docs"
+PUBLIC = r"^::: jaxnerf\.(\w+)$"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 EXAMPLES = [
     pytest.param(found.group(1), id=f"{page.relative_to(ROOT)}:{page.read_text()[: found.start()].count(chr(10)) + 2}")
@@ -35,9 +39,125 @@ def test_every_page_is_in_the_navigation():
     assert listed == {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
 
 
+@pytest.mark.parametrize("page", sorted({*(DOCS / "results").glob("*.md")} - {DOCS / "results" / "index.md"}), ids=str)
+def test_results_state_command_commit_date_and_machine(page):
+    rows = re.findall(
+        r"^\| command \| commit \| machine \|\n.*\n\| (.*) \| (.*) \| (.+) \|$", page.read_text(), re.MULTILINE
+    )
+    assert rows
+    for command, commit, _ in rows:
+        assert re.search(r"`.*\.py|`jaxnerf-|as above", command)
+        assert re.search(r"\b[0-9a-f]{7}\b.*, \d{4}-\d\d-\d\d$", commit)
+
+
+def test_every_page_of_results_is_in_its_index():
+    listed = re.findall(r"^\| \[.*?\]\((\w+\.md)\)", (DOCS / "results" / "index.md").read_text(), re.MULTILINE)
+    assert sorted([*listed, "index.md"]) == sorted(page.name for page in (DOCS / "results").glob("*.md"))
+
+
 def test_every_public_name_is_on_one_page():
     text = "".join(page.read_text() for page in (DOCS / "api").iterdir())
-    assert sorted(re.findall(r"^::: jaxnerf\.(\w+)$", text, re.MULTILINE)) == sorted(jaxnerf.__all__)
+    assert sorted(re.findall(PUBLIC, text, re.MULTILINE)) == sorted(jaxnerf.__all__)
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "api").iterdir()), ids=lambda page: page.name)
+def test_every_public_name_is_in_an_example_of_its_page(page):
+    code = "".join(re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE))
+    names = re.findall(PUBLIC, page.read_text(), re.MULTILINE)
+    assert [name for name in names if not re.search(rf"\bjaxnerf\.{name}\b", code)] == []
+
+
+def fenced_lines(page):
+    """Returns the lines of a page's blocks without a language, without comments."""
+    fences = re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [line.split(" #")[0].strip() for fence in fences for line in fence.splitlines()]
+
+
+def commands(page):
+    """Yields the commands of a page: lines of its blocks, and code in the text that begins as one."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    for line in [*fenced_lines(page), *re.findall(r"`([^`]+)`", text)]:
+        for command in re.split(r"; |&& ", line.replace("\n", " ")):
+            command = re.sub(r"^(\w+=\S* |taskset -c \d )+", "", command.strip())
+            if re.match(r"(jaxnerf-\w|python3? |make |pip3? install|--\w)", command):
+                yield command
+
+
+def defined_flags(files):
+    """Returns the names of the flags that Python files define, by absl or argparse."""
+    text = "".join(file.read_text() for file in files)
+    return set(re.findall(r'(?:DEFINE_\w+|define_\w+)\(\s*"(\w+)"', text)) | set(
+        re.findall(r'add_argument\("--(\w+)"', text)
+    )
+
+
+PROGRAMS = dict(re.findall(r"^    (jaxnerf-\w+) = jaxnerf\.(\w+):run$", (ROOT / "setup.cfg").read_text(), re.MULTILINE))
+COMMON = {"help", "config", "plugins", "page"}  # of jaxnerf/runtime/cli.py and experiments/common.py
+FLAGS = {name: COMMON | defined_flags([ROOT / "jaxnerf" / f"{module}.py"]) for name, module in PROGRAMS.items()}
+ALL_FLAGS = set.union(*FLAGS.values(), defined_flags((ROOT / "experiments").rglob("*.py")))
+
+
+def faults(command):
+    """Returns what a command names and does not exist: programs, files, targets, extras, flags, configs and fields."""
+    words = command.split()
+    found, flags = [], ALL_FLAGS
+    if words[0] in PROGRAMS:
+        flags = FLAGS[words[0]]
+    elif words[0].startswith("jaxnerf-"):
+        found.append(words[0])
+    elif words[0] == "make" and not re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE):
+        found.append(words[1])
+    elif words[0] == "pip":
+        extras = re.findall(r"^(\w+) =", (ROOT / "setup.cfg").read_text().split("extras_require]")[1], re.MULTILINE)
+        found += [
+            extra for names in re.findall(r"'\.\[(.*?)\]", command) for extra in set(names.split(",")) - {*extras}
+        ]
+    elif words[0].startswith("python") and words[1].endswith(".py"):
+        script = ROOT / words[1]
+        if not script.exists():
+            return [words[1]]
+        flags = COMMON | defined_flags(script.parent.glob("*.py"))
+    elif words[0].startswith("python"):
+        return []
+    for name, value in re.findall(r"--([\w.]+)(?:=(\S+))?", command):
+        if name.startswith("config."):
+            found += _missing_field(name)
+        elif words[0] != "pip" and name.removeprefix("no") not in flags and name not in flags:
+            found.append(f"--{name}")
+        if name == "config" and re.fullmatch("[a-z]\\w*", value) and value != "help":
+            found += [] if (ROOT / "configs" / f"{value}.py").exists() else [f"--config={value}"]
+    return found
+
+
+def _missing_field(name):
+    """Returns [name] if no config has this field."""
+    section = default.get_config()
+    for part in name.split(".")[1:]:
+        if part.isupper():  # stands for any name
+            return []
+        if part not in section:
+            return [f"--{name}"]
+        section = section[part]
+    return []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_and_config_fields_exist(page):
+    assert {command: found for command in commands(page) if (found := faults(command))} == {}
+    fields = re.findall(r"`(\w+\.(?!py`)\w+)(?:=\S+)?`", page.read_text())
+    sections = {name for name, value in default.get_config().items() if isinstance(value, ConfigDict)}
+    assert [f for f in fields if f.split(".")[0] in sections and _missing_field(f"config.{f}")] == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *("jaxnerf-fly --workdir=x", "jaxnerf-eval --fly", "jaxnerf-train --config=fly", "--config.train.fly=1"),
+        *("make fly", "pip install '.[fly]'", "python examples/fly.py", "python examples/minimal_nerf.py --fly=1"),
+    ],
+)
+def test_faults_of_commands_are_found(command):
+    assert len(faults(command)) == 1
 
 
 def test_the_readme_is_short():
@@ -48,5 +168,7 @@ def test_the_readme_is_short():
 @pytest.mark.parametrize("code", EXAMPLES)
 def test_python_examples_run(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for parts in (registry.LOSSES, registry.FIELDS, registry.SAMPLERS, registry.READERS, registry.EXPORTERS):
+        monkeypatch.setattr(parts, "_parts", dict(parts._parts))  # what an example registers is forgotten
     with jax.numpy_rank_promotion("allow"):
         exec(compile(code, "example", "exec"), {})

@@ -7,7 +7,7 @@ sum of two means in world units: from points of the mesh to the bodies, in close
 to the mesh. Points of the mesh that are nearer to the glass (the brick, and that of the lamp) than to an opaque body
 have no counterpart among these and are excluded; "with glass" includes them. All of the bodies' surfaces count, also
 the underside of the plinth, a fifth of their area, which no training view sees: only the closed mesh has a surface
-there. Seconds include compilation. The PSNR of splats is that of held-out views.
+there. Seconds include compilation. The PSNR of splats is that of the test views.
 """
 
 import pathlib

@@ -222,11 +222,20 @@ def page(name: str, config, found: dict[str, Counts], compiled: dict[str, float]
 def main(argv: list[str]) -> None:
     """Counts the steps and writes the page."""
     del argv
+    rates = [
+        (name, f"{peaks.bytes_per_second / 1e12:g} TB/s")
+        + tuple(f"{rate / 1e12:g} TFLOP/s" for rate in (peaks.float32, peaks.tf32, peaks.bfloat16))
+        for name, peaks in profiles.PEAKS.items()
+    ]
     lines = [
         "# A training step on paper, at the sizes of a GPU",
         "",
-        "`python experiments/gpu/roofline.py` writes this page; no accelerator has measured anything on it.",
-        f"Commit {common.commit()}. Sizes are those that `auto` fields get on a GPU.",
+        *common.provenance(),
+        "",
+        "Nothing on this page was measured on an accelerator. The operations of a training step are counted, at the "
+        "sizes that `auto` fields get on a GPU, and divided by what the data sheets of GPUs state:",
+        "",
+        *common.markdown(("", "memory", "float32", "products of float32 (TF32)", "products of bfloat16"), rates),
         "",
         "Counts are those of the traced step. The update of the occupancy grid is not part of the whole step: most "
         f"steps have none. A row at a random place moves at least {profiles.SECTOR} bytes, and an addition reads and "
@@ -237,8 +246,8 @@ def main(argv: list[str]) -> None:
         "overlap.",
         "",
         "Additions to the table's gradient are atomic on a GPU, in no fixed order, so float32 sums differ between "
-        "runs. A run resumes bit for bit with `XLA_FLAGS=--xla_gpu_deterministic_ops=true`, which sorts the rows "
-        "first and is slower; experiments/gpu/run.py measures both.",
+        "runs. A run should resume bit for bit with `XLA_FLAGS=--xla_gpu_deterministic_ops=true`, which sorts the "
+        "rows first and is slower; experiments/gpu/run.py measures both.",
     ]
     for name, overrides in _CONFIGS.items():
         config = profiles.configuration(name, overrides, tiny=_TINY.value)

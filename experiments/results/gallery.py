@@ -1,4 +1,4 @@
-"""Writes the gallery: of each run a photograph, its rendering, the depth, and a short video along a camera path.
+"""Writes the gallery: of each run a test image, its rendering, the depth, and a short video along a camera path.
 
     python experiments/results/gallery.py WORKDIR ... --out=docs/gallery [--frames=24] [--width=240]
 
@@ -57,7 +57,8 @@ def show(folder: pathlib.Path, out: pathlib.Path) -> list[str]:
         raise ValueError(f"{folder}: lacks scores or frames; run jaxnerf-eval and jaxnerf-render --workdir={folder}")
     path, renders = scored[-1], max(paths, key=lambda path: path.stat().st_mtime)
     results, name = read_json(path, "score it again"), folder.name
-    _write(out / f"{name}.jpg", strip(path.parent))
+    shown = strip(path.parent)
+    _write(out / f"{name}.jpg", shown)
     frames = sorted(renders.glob("*.png"))
     chosen = frames[:: -(-len(frames) // _FRAMES.value)]
     _write(
@@ -70,10 +71,11 @@ def show(folder: pathlib.Path, out: pathlib.Path) -> list[str]:
     return [
         f"## {name}",
         "",
-        f"`{config.data.format}`, {results['training_seconds']:.0f} s of training, PSNR {results['psnr']:.2f} dB and "
+        f"Format `{config.data.format}`, {shown.shape[1] // 3} x {shown.shape[0]} px, "
+        f"{results['training_seconds']:.0f} s of training, PSNR {results['psnr']:.2f} dB and "
         f"SSIM {results['ssim']:.3f} on {results['views']} views, {results['seconds_per_frame']:.2f} s a frame.",
         "",
-        f"![{name}: photograph, rendering, depth]({name}.jpg)",
+        f"![{name}: image, rendering, depth]({name}.jpg)",
         "",
         f"![{name}: {renders.parent.name}]({name}.webp)",
         "",
@@ -81,7 +83,7 @@ def show(folder: pathlib.Path, out: pathlib.Path) -> list[str]:
 
 
 def strip(folder: pathlib.Path) -> np.ndarray:
-    """Returns uint8: photograph, rendering and depth of a scored view side by side."""
+    """Returns uint8: image, rendering and depth of a scored view side by side."""
     names = sorted(path.stem for path in (folder / "color").glob("*.png"))
     if not names:
         raise ValueError(f"{folder / 'color'}: has no images; score the run again with --overwrite")
