@@ -140,3 +140,11 @@ def test_a_name_from_a_workdir_is_not_imported():
     """Names that a config.json could contain are looked up, and never imported."""
     with pytest.raises(ValueError, match="no field 'os:system'.*register_field with --plugins"):
         FIELDS.get("os:system")
+
+
+def test_too_little_memory_is_one_line(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text("import numpy\nfrom jaxnerf.runtime import cli\ncli.run(lambda argv: numpy.zeros(2**58))\n")
+    done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: out of memory (Unable to allocate") and len(done.stderr.splitlines()) == 1
