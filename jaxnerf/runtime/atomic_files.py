@@ -163,9 +163,10 @@ def write_text_once(path: str | os.PathLike, text: str) -> None:
 
 
 def sweep(folder: pathlib.Path, pattern: str = "*.tmp") -> None:
-    """Removes the partial files of killed processes below a folder in which everything is finished."""
+    """Removes the partial files of killed processes below a folder in which everything is finished; folders stay."""
     for path in folder.rglob(pattern):
-        path.unlink(missing_ok=True)
+        if not path.is_dir() or path.is_symlink():
+            path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
