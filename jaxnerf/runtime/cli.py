@@ -65,15 +65,18 @@ def run(
             _leave(1, error)
         except MemoryError as error:
             _leave(1, f"out of memory ({error}); free memory, or reduce what the flags ask for")
-        except KeyboardInterrupt as interrupt:
-            code = 128 + (interrupt.args or (signal.SIGINT,))[0]
-            print(f"error: stopped {stopped}", file=sys.stderr)
-            sys.stdout.flush()
-            sys.stderr.flush()
-            # A regular exit would destroy what threads of XLA still use, which can end in a segmentation fault.
-            os._exit(code)
 
-    app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
+    try:
+        app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
+    except KeyboardInterrupt as interrupt:
+        code = 128 + (interrupt.args or (signal.SIGINT,))[0]
+        print(f"error: stopped {stopped}", file=sys.stderr)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        # A regular exit would destroy what threads of XLA still use, which can end in a segmentation fault.
+        os._exit(code)
+    finally:  # all is done: a signal while Python shuts down prints nothing
+        signals.handle(lambda number, _: os._exit(128 + number))
 
 
 def define_config(
