@@ -17,8 +17,10 @@ from jaxnerf.evaluation.evaluate import evaluate
 from jaxnerf.evaluation.paths.path_files import read_path_file
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
+from jaxnerf.exporters.base import export_run
 from jaxnerf.interop.published_weights import read_weights
 from jaxnerf.runtime import shards
+from jaxnerf.structure_from_motion.estimate import estimate_cameras
 from jaxnerf.structure_from_motion.images import is_rotated_jpeg
 from jaxnerf.training.metric_log import MetricLog, read_rows
 from jaxnerf.training.workdir import read_config, workdir_lock
@@ -93,7 +95,10 @@ def test_the_copy_of_a_damaged_file_replaces_a_link(tmp_path):
     assert (tmp_path / "run" / "metrics.jsonl.damaged").read_text() == "echo a stranger's words\n"
 
 
-@pytest.mark.parametrize("folder, program", [("eval", evaluate), ("renders", render_path)])
+@pytest.mark.parametrize(
+    "folder, program",
+    [("eval", evaluate), ("renders", render_path), ("exports", lambda run: export_run(run, "points"))],
+)
 def test_evaluation_writes_to_no_linked_folder(trained, tmp_path, folder, program):
     run = shutil.copytree(trained, tmp_path / "run")
     (tmp_path / "precious").mkdir()
@@ -101,6 +106,20 @@ def test_evaluation_writes_to_no_linked_folder(trained, tmp_path, folder, progra
     with pytest.raises(ValueError, match=f"run/{folder}: is a symbolic link"):
         program(run)
     assert not list((tmp_path / "precious").iterdir())
+
+
+@pytest.mark.parametrize("name", ["cameras", "cameras/log.txt", "sparse", "images"])
+def test_cameras_are_written_through_no_link(tmp_path, name):
+    for folder in ("precious", "photographs"):
+        (tmp_path / folder).mkdir()
+    for index in range(3):
+        Image.new("RGB", (8, 8)).save(tmp_path / "photographs" / f"{index}.png")
+    path = tmp_path / "out" / name
+    path.parent.mkdir(parents=True)
+    os.symlink(tmp_path / "precious", path)
+    with pytest.raises(ValueError, match=f"out/{name}: is a symbolic link"):
+        estimate_cameras(tmp_path / "photographs", tmp_path / "out", overwrite=True)
+    assert not any((tmp_path / "precious").iterdir())
 
 
 def test_no_image_starts_ghostscript(tmp_path, monkeypatch):

@@ -67,6 +67,11 @@ HARD_CASES = "tests/core/test_stability.py"
 EQUIVALENT = {
     ("return _Occupied(words.reshape(-1), ends, sizes.sum(-1, dtype=jnp.int32))", "-1", "1"): "it has two axes",
     (
+        'used = n < count.at[ray, None].get(mode="fill", fill_value=0)',
+        "0",
+        "1",
+    ): "what a slot without a ray computes is dropped",
+    (
         "density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)",
         "0",
         "1",

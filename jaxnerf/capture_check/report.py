@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxnerf.capture_check import cameras, depths, tracks
+from jaxnerf.capture_check import cameras, depths, folds, tracks
 from jaxnerf.capture_check import images as images_module
 from jaxnerf.capture_check.findings import Finding, percent
 from jaxnerf.data.geometry import path_poses
@@ -80,7 +80,11 @@ def inspect(
     if not wrong:  # from one position, rays fit any axes and focal length
         wrong, evidence = cameras.judge_axes(capture, evidence)
         focal, evidence = cameras.judge_focal(capture, evidence)
-        findings += focal + cameras.judge_views(capture, evidence)
+        views = cameras.judge_views(capture, evidence)
+        findings += focal + views
+        if not wrong:
+            accused = {index for finding in views for index in finding.frames if finding.severity == "error"}
+            findings += folds.judge_folds(capture, evidence, accused)
     findings += wrong
     points, point_tracks = cameras.points_of(evidence)
     bounds, stated = depths.ranges(capture, near, far)

@@ -5,7 +5,7 @@ judge the cameras as stored and every alternative reading of them.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -68,7 +68,7 @@ def keypoints_of(capture: Capture, images: Sequence[ImageSummary | None]) -> lis
     for frame, image in zip(capture.frames, images, strict=True):
         camera = frame.camera
         if image is None:
-            result.append(Keypoints(np.zeros((0, 2)), np.zeros((0, 1), np.float32)))
+            result.append(Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32)))
         elif camera.lens == "pinhole" or camera.distortion is None:
             result.append(Keypoints((image.corners - camera.center) / camera.focal, image.descriptors))
         else:
@@ -122,7 +122,7 @@ def follow(
 
 def count_fits(
     keypoints: Sequence[Keypoints],
-    near: Int[np.ndarray, "V K"],
+    near: Int[np.ndarray, "V K"] | Mapping[int, Sequence[int]],
     poses: Float[np.ndarray, "V 3 4"],
     scale: Float[np.ndarray, " V"],
     *,

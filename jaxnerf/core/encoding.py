@@ -38,7 +38,8 @@ def positional_encoding(
 
     Returns:
         [..., D (1 + 2F)], or [..., D 2F] without the input, ordered as in Eq. 4, each entry D
-        wide and at least float32. Infinite x gives NaN in its sines and cosines. The gradient of sin 2^k x is
+        wide and at least float32. Infinite x gives NaN in its sines and cosines, and so does x where 2^(F-1) x is
+        infinite in x's type. The gradient of sin 2^k x is
         2^k cos 2^k x, to the same accuracy.
 
     Raises:

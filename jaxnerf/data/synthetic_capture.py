@@ -128,6 +128,7 @@ def write_capture(
 
     Raises:
         ValueError: on wrong arguments, or if the folder is not empty.
+        OSError: if it cannot be written, or is not empty any more; names the file.
     """
     folder = pathlib.Path(folder)
     _check(folder, (num_views, num_held_out, num_far), width, height, image_format)
@@ -388,7 +389,7 @@ def _sparse_points(count, lens, rgb, poses, depths, seed):
 
 def _write(folder, truth, rgb, colors, image_format):
     """Writes the files of a capture, transforms.json last: without it, the folder is no dataset."""
-    (folder / "images").mkdir(parents=True, exist_ok=True)
+    (folder / "images").mkdir(parents=True)  # an error if there is now a link, through which images would be written
     kind, options = _SUFFIXES[image_format]
     for name, image, gain in zip(truth.names, rgb, truth.gains, strict=True):
         pixels = np.uint8(np.rint(255 * np.clip(image * gain, 0, 1)))

@@ -1,6 +1,7 @@
 """Finished views of an evaluation, and the results.json that is made from them; see `evaluate`."""
 
 import json
+import math
 import os
 import pathlib
 import shutil
@@ -61,11 +62,12 @@ def view_files(folder: pathlib.Path, index: int, *, count: int) -> list[pathlib.
 
 
 def is_finished(content: Any) -> bool:
-    """Returns whether what a row's file holds is what `finish` writes: all metrics are numbers."""
+    """Returns whether what a row's file holds is what `finish` writes: all metrics are numbers, and times finite."""
     row = content.get("row") if isinstance(content, dict) else None
     values = [row.get(key) for key in (*_MEANS, "seconds")] + [content.get("rays")] if isinstance(row, dict) else [None]
     named = isinstance(row, dict) and isinstance(row.get("name"), str) and isinstance(content.get("first"), bool)
-    return named and all(type(value) in (int, float) for value in values) and row["seconds"] > 0
+    numbers = named and all(type(value) in (int, float) for value in values)
+    return numbers and 0 < row["seconds"] < math.inf and 0 < content["rays"] < math.inf
 
 
 def read(target: pathlib.Path, origin: Mapping[str, Any], remedy: str) -> dict[str, Any]:

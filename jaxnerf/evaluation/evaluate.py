@@ -200,7 +200,8 @@ def _score_views(run, render, views, folder, shard):
     count = len(views.names)
     frames = shards.own(range(count), shard)
     files = [aggregate.view_files(folder, index, count=count) for index in frames]
-    readable = output_images.readable(files, is_valid=aggregate.is_finished)
+    sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
+    readable = output_images.readable(files, sizes, is_valid=aggregate.is_finished)
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     progress, first = metric_log.Progress(len(frames), show=processes.is_first()), True
     for done, index in enumerate(todo, len(frames) - len(todo) + 1):

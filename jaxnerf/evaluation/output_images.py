@@ -17,6 +17,7 @@ from jaxnerf.runtime import atomic_files
 
 CONTACT_SHEET_ROWS = 4
 _VIEW_FILES = {"color": "png", "gt-color": "png", "depth": "tiff"}
+_CHANNELS = {"depth": (), "rgba": (4,)}  # of the images in a folder of that name; all others have (3,)
 
 
 def to_8_bits(image: ArrayLike) -> np.ndarray:
@@ -37,21 +38,29 @@ def view_files(folder: pathlib.Path, name: str) -> list[pathlib.Path]:
 
 
 def readable(
-    groups: Sequence[Sequence[pathlib.Path]], *, is_valid: Callable[[Any], bool] = lambda content: True
+    groups: Sequence[Sequence[pathlib.Path]],
+    sizes: Sequence[tuple[int, int]],
+    *,
+    is_valid: Callable[[Any], bool] = lambda content: True,
 ) -> list[bool]:
     """Returns for each group of image and JSON files whether all exist and are whole; prints those that are not.
 
     Args:
         groups: of paths.
+        sizes: (height, width) of the images of each group, except those in a folder contact_sheet.
         is_valid: returns whether the content of a JSON file is as expected.
     """
 
-    def check(files):
+    def check(files, size):
         for file in files if all(file.is_file() for file in files) else ():
             try:
-                if file.suffix != ".json":
-                    read_stored(file)
-                elif not is_valid(atomic_files.read_json(file, "")):
+                if file.suffix == ".json":
+                    valid = is_valid(atomic_files.read_json(file, ""))
+                else:
+                    pixels, kind = read_stored(file), file.parent.name
+                    shape = (*(pixels.shape[:2] if kind == "contact_sheet" else size), *_CHANNELS.get(kind, (3,)))
+                    valid = pixels.shape == shape and pixels.dtype == (np.float32 if kind == "depth" else np.uint8)
+                if not valid:
                     raise ValueError("unexpected content")
             except (ValueError, OSError):
                 if file.is_file():  # otherwise another process has finished and moved the folder
@@ -60,7 +69,7 @@ def readable(
         return all(file.is_file() for file in files)
 
     with ThreadPoolExecutor(num_workers()) as pool:
-        return list(pool.map(check, groups))
+        return list(pool.map(check, groups, sizes))
 
 
 def write_image(path: pathlib.Path, pixels: ArrayLike) -> None:

@@ -21,9 +21,11 @@ def export_depth(source: ExportSource, folder: pathlib.Path) -> None:
         (folder / name).mkdir()
     box = None if source.settings.box is None else np.float64(source.settings.box).reshape(2, 3)
     frames, images = [], render_depth_images(source, source.settings.size)
-    for image in images:
+    files = [pathlib.PurePath(image.name).name for image in images]
+    if len(set(files)) < len(files):  # of images in several folders
+        files = [f"{index:04d}_{file}" for index, file in enumerate(files)]
+    for file, image in zip(files, images, strict=True):
         kept = np.isfinite(image.depth) & inside(image.points(), box)
-        file = pathlib.PurePath(image.name).name
         write_image(folder / "depth" / f"{file}.tiff", np.where(kept, image.depth, 0))
         write_image(folder / "images" / f"{file}.png", image.rgb)
         matrix = np.concatenate([np.float64(image.camera.to_world), [[0, 0, 0, 1]]])

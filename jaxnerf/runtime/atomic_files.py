@@ -38,15 +38,23 @@ def open_regular(path: str | os.PathLike, mode: str = "r") -> IO[Any]:
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """Returns the content of a regular file; see `open_regular`."""
+    """Returns the content of a regular file; see `open_regular`. OSError also if it does not fit into memory."""
     with open_regular(path, "rb") as file:
-        return file.read()
+        try:
+            return file.read()
+        except MemoryError:  # also a small archive can hold a file of any size that is zero
+            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM), str(path)) from None
 
 
 def parse_json(content: str | bytes) -> Any:
-    """Returns what JSON of unknown origin holds; raises ValueError if it is malformed or nested too deeply."""
+    """Returns what JSON of unknown origin holds.
+
+    Raises:
+        ValueError: if it is malformed, nested too deeply, or has a whole number of more than 64 bits, which no float
+            and no array would hold.
+    """
     try:
-        found = json.loads(content)
+        found = json.loads(content, parse_int=_parse_int)
     except RecursionError:
         raise ValueError("nested too deeply") from None
     level = [found]
@@ -56,6 +64,12 @@ def parse_json(content: str | bytes) -> Any:
         if not level:
             return found
     raise ValueError(f"nested more than {_MAX_DEPTH} levels deep")
+
+
+def _parse_int(digits):
+    if len(digits) > 20 or not -(2**63) <= int(digits) < 2**64:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def read_json(path: str | os.PathLike, remedy: str) -> Any:
@@ -149,9 +163,10 @@ def write_text_once(path: str | os.PathLike, text: str) -> None:
 
 
 def sweep(folder: pathlib.Path, pattern: str = "*.tmp") -> None:
-    """Removes the partial files of killed processes below a folder in which everything is finished."""
+    """Removes the partial files of killed processes below a folder in which everything is finished; folders stay."""
     for path in folder.rglob(pattern):
-        path.unlink(missing_ok=True)
+        if not path.is_dir() or path.is_symlink():
+            path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

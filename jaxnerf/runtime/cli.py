@@ -33,8 +33,8 @@ def run(
 ) -> None:
     """Parses the flags, imports the plugins and calls main(argv).
 
-    The process exits with 2 on a wrong flag and with 1 on a ValueError or OSError, each reported in one line,
-    and with 128 plus the signal's number on SIGINT, SIGTERM or SIGHUP, see `signals`.
+    The process exits with 2 on a wrong flag and with 1 on a ValueError, OSError or MemoryError, each reported in one
+    line, and with 128 plus the signal's number on SIGINT, SIGTERM or SIGHUP, see `signals`.
 
     Args:
         main: the program. Its module's docstring opens the help.
@@ -65,15 +65,20 @@ def run(
             return result
         except (ValueError, OSError) as error:
             _leave(1, error)
-        except KeyboardInterrupt as interrupt:
-            code = 128 + (interrupt.args or (signal.SIGINT,))[0]
-            print(f"error: stopped {stopped}", file=sys.stderr)
-            sys.stdout.flush()
-            sys.stderr.flush()
-            # A regular exit would destroy what threads of XLA still use, which can end in a segmentation fault.
-            os._exit(code)
+        except MemoryError as error:
+            _leave(1, f"out of memory ({error}); free memory, or reduce what the flags ask for")
 
-    app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
+    try:
+        app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
+    except KeyboardInterrupt as interrupt:
+        code = 128 + (interrupt.args or (signal.SIGINT,))[0]
+        print(f"error: stopped {stopped}", file=sys.stderr)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        # A regular exit would destroy what threads of XLA still use, which can end in a segmentation fault.
+        os._exit(code)
+    finally:  # all is done: a signal while Python shuts down prints nothing
+        signals.handle(lambda number, _: os._exit(128 + number))
 
 
 def define_config(

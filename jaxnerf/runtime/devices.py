@@ -200,7 +200,7 @@ def default_microbatch(rays: int, samples_per_ray: float, platform: str) -> int:
     """
     if platform != "cpu":
         return rays
-    fitting = max(CPU_MICROBATCH_SAMPLES // int(samples_per_ray), 1)
+    fitting = max(CPU_MICROBATCH_SAMPLES // max(int(samples_per_ray), 1), 1)
     return max(size for size in range(1, min(rays, fitting) + 1) if rays % size == 0) if rays > 0 else 0
 
 

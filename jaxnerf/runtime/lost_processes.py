@@ -17,7 +17,9 @@ import time
 from jaxnerf.runtime import signals
 
 _REMEDY = "start all processes again to continue from the last checkpoint"
-_COORDINATION = re.compile(rb"^[EF].*(coordination_service|client\.h:)", re.MULTILINE)
+_COORDINATION = re.compile(
+    rb"^([EF].*(coordination_service|client\.h:)|W.*coordination_service.*ConnectAfterBarrierPasses)", re.MULTILINE
+)
 _INTERVAL = 0.2  # s, after which other messages of libraries are printed
 _LAST_WORDS = 1.0  # s that the service of process 0 still answers, so that the others receive the reason
 
@@ -29,12 +31,17 @@ def describe(messages: str) -> str:
             f"process {found[1]} has connected twice: --process_id={found[1]} was given to two processes, or one was "
             f"started again alone; {_REMEDY}, each with its own id"
         )
+    if "more recent barrier call" in messages:  # while the processes still wait for each other
+        return (
+            f"a process has connected twice: one --process_id was given to two processes; {_REMEDY}, each with its own"
+        )
     if found := re.search(r"stopped sending heartbeats\):\s*((?:\d+\s+)+)", messages):
         names = ", ".join(found[1].split())
         return f"process {names} does not answer any more: it hangs, or its machine or network is down; {_REMEDY}"
     if re.search(r"Failed to send RPC|Deadline Exceeded|Socket closed|failed to connect", messages, re.IGNORECASE):
         return f"process 0 does not answer any more: it has ended or hangs, see its output; {_REMEDY}"
-    return f"another process may have ended; {_REMEDY} ({' '.join(messages.split())[-400:]})"
+    words = " ".join(re.sub(r"^\s*@ +0x.*$", "", messages, flags=re.MULTILINE).split())  # without the stack
+    return f"another process may have ended; {_REMEDY} ({words[-400:]})"
 
 
 class LostProcesses:

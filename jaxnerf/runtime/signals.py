@@ -65,11 +65,11 @@ class _Output:
     """A stream that discards what is written after its reader has gone.
 
     The first write that fails stops the program as SIGHUP does, unless a signal is already stopping it: Ctrl-C also
-    ends the other programs of a pipeline.
+    ends the other programs of a pipeline. Messages that a full disk cannot hold are discarded, too, but stop nothing.
     """
 
-    def __init__(self, stream: TextIO):
-        self._stream = stream
+    def __init__(self, stream: TextIO, *, messages: bool = False):
+        self._stream, self._messages = stream, messages
 
     def write(self, text: str) -> int:
         """Writes a text."""
@@ -86,10 +86,11 @@ class _Output:
         try:
             return call(*arguments)
         except OSError as error:
-            if error.errno not in _GONE:
+            gone = error.errno in _GONE
+            if not (gone or self._messages):
                 raise
         _discard(self._stream.fileno())
-        if not _stopping:
+        if gone and not _stopping:
             signal.raise_signal(_HANGUP)
         return call(*arguments)
 
@@ -100,12 +101,12 @@ def keep_streams() -> None:
         if getattr(sys, name) is None:  # otherwise the next file that is opened would receive what libraries print
             _discard(number)
             setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))
-    sys.stdout, sys.stderr = _Output(sys.stdout), _Output(sys.stderr)
+    sys.stdout, sys.stderr = _Output(sys.stdout), _Output(sys.stderr, messages=True)
 
 
 def output(number: int) -> TextIO:
-    """Returns a stream that writes to a file descriptor; a reader that goes away stops the program once."""
-    return _Output(open(number, "w", buffering=1, errors="backslashreplace", closefd=False))
+    """Returns a stream that writes messages to a file descriptor; a reader that goes away stops the program once."""
+    return _Output(open(number, "w", buffering=1, errors="backslashreplace", closefd=False), messages=True)
 
 
 def _discard(number):

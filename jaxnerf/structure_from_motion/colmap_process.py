@@ -18,6 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxnerf.runtime.atomic_files import open_regular
+
 SEED = 0
 _MIN_INLIERS, _MAX_DEGREES = 50, 60.0  # of a pair that can contradict a model, and the angle at which it does
 _PAIRS_AT_A_TIME = 200  # after which matches are committed; an interruption loses no more
@@ -230,7 +232,7 @@ def _contradictions(model, database, names):
 
 def _run(stage, arguments, sender, log):
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the other one ends this one
-    with open(log, "a") as file:
+    with open_regular(log, "a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     threading.Thread(target=_end_with_parent, daemon=True).start()

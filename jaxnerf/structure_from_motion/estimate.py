@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from jaxnerf.data.readers import colmap
 from jaxnerf.registry import READERS
-from jaxnerf.runtime.atomic_files import check_tree, partial_file, sweep, write_text
+from jaxnerf.runtime.atomic_files import check_tree, partial_file, read_bytes, sweep, write_text
 from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.structure_from_motion import colmap_process
 from jaxnerf.structure_from_motion import images as images_module
@@ -259,7 +259,7 @@ class _Stages:
     def _claim(self):
         """Writes the settings; if they differ from an earlier call's, its database is deleted or refused."""
         file, text = self.work / "settings.json", json.dumps(self.settings, indent=2) + "\n"
-        if self.database.exists() and (not file.exists() or file.read_text() != text):
+        if self.database.exists() and (not file.exists() or read_bytes(file) != text.encode()):
             if not self.overwrite:
                 raise ValueError(
                     f"{self.database}: was made of other images or with other settings, listed in {file.name} beside "

@@ -116,6 +116,8 @@ def resolve_for_device(config: ConfigDict, platform: str | None = None) -> tuple
     line = f"grid          {cells} cells evaluated at once in an update, for this device"
     infer(config.occupancy, "update_chunk", cells, line, used=config.sampler == "occupancy")
     if is_auto(config.train.microbatch_size):
+        if is_auto(config.train.batch_size):
+            raise ValueError("train.batch_size is 'auto'; resolve the config against a dataset, or set a number")
         used = devices.devices_of(config.train.parallel)
         device_rays = config.train.batch_size // len(used)
         size = devices.default_microbatch(

@@ -32,7 +32,8 @@ class Checkpoints:
         if not self._folder.is_dir():
             return []
         names = (path.name for path in self._folder.iterdir() if path.is_dir())
-        return sorted(int(name) for name in names if name.isdigit())
+        steps = {int(name): name for name in names if name.isascii() and name.isdigit()}
+        return sorted(step for step, name in steps.items() if name == str(step) and step < 2**31)
 
     def save(self, state: TrainState) -> None:
         """Writes the state under its step unless it is there, and returns when it is on the disk.

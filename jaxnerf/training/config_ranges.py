@@ -8,11 +8,14 @@ import jax
 from ml_collections import ConfigDict
 
 from jaxnerf.configs import default
+from jaxnerf.data.readers.validation import MAX_FLOAT32, short_repr
 from jaxnerf.runtime import memory
-from jaxnerf.runtime.config_fields import UNLIMITED_STEPS, is_auto
+from jaxnerf.runtime.config_fields import AUTO, UNLIMITED_STEPS, is_auto
 
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
 _MAX_OCTAVES = 64  # of encoding.positional_encoding
+_MAX_STEPS_PER_SIDE = 2**16  # of ray marching, through the box
+_MAX_INT, _MAX_SEED = 2**31 - 1, 2**63 - 1  # int32, in which JAX counts, and what jax.random.key takes
 
 # By range: (its text, whether a number is in it, the fields). What depends on the dataset is checked with it.
 _RANGES = (
@@ -52,16 +55,19 @@ _RANGES = (
         "more than 0",
         lambda value: value > 0,
         (
-            "hash_grid.feature_scale occupancy.step_size occupancy.pool_samples_per_ray train.lr_init train.lr_final "
+            "hash_grid.feature_scale occupancy.step_size train.lr_init train.lr_final "
             "train.epsilon cameras.exposure_lr cameras.refine_lr eval.sample_multiplier"
         ),
     ),
+    ("from 0.01 to 100,000", lambda value: 0.01 <= value <= 100_000, "occupancy.pool_samples_per_ray"),
     ("more than 0 and at most 1", lambda value: 0 < value <= 1, "occupancy.uniform_fraction"),
     ("at least 0 and below 1", lambda value: 0 <= value < 1, "train.beta1 train.beta2 eval.early_stop_eps"),
 )
 
+_DTYPES = ("float32", "bfloat16", "float16", "float64")
 _CHOICES = {
-    "coarse.compute_dtype fine.compute_dtype hash_grid.compute_dtype": ("float32", "bfloat16", "float16", "float64"),
+    "coarse.compute_dtype fine.compute_dtype": _DTYPES,
+    "hash_grid.compute_dtype": (*_DTYPES, AUTO),
     "coarse.density_activation fine.density_activation": ("relu", "softplus"),
     "sampling.rule": ("segments", "gauss", "points"),
 }
@@ -69,10 +75,9 @@ _CHOICES = {
 # Configs of older versions may lack these: they have a value where they are missing, or only training reads them, for
 # which `workdir.config_to_resume` has added the defaults.
 _OPTIONAL = (
-    "cameras occupancy.uniform_fraction occupancy.near_gradient_distance occupancy.min_views train.log_every "
-    "train.save_every train.preview_every train.max_to_keep train.max_nonfinite train.max_reinits train.max_seconds "
-    "eval.at_end eval.summary_seconds occupancy.update_chunk hash_grid.compute_dtype train.steps_per_dispatch "
-    "train.cpu_batch_size"
+    "cameras occupancy.uniform_fraction occupancy.near_gradient_distance occupancy.min_views train.preview_every "
+    "train.max_to_keep train.max_nonfinite train.max_seconds eval.at_end eval.summary_seconds occupancy.update_chunk "
+    "hash_grid.compute_dtype train.steps_per_dispatch train.cpu_batch_size"
 ).split()
 
 # Sections that become the arguments of one function, which takes no others.
@@ -96,8 +101,10 @@ def check_ranges(config: ConfigDict) -> None:
                 raise ValueError(f"--config.{name} is {value}, expected {expected}; correct it")
     for names, choices in _CHOICES.items():
         for name in names.split():
-            if name in fields and not is_auto(fields[name]) and fields[name] not in choices:
-                raise ValueError(f"--config.{name} is {fields[name]!r}, expected one of {choices}; correct it")
+            if name in fields and fields[name] not in choices:
+                raise ValueError(
+                    f"--config.{name} is {short_repr(fields[name])}, expected one of {choices}; correct it"
+                )
             if fields.get(name) == "float64" and not jax.config.jax_enable_x64:
                 raise ValueError(f"--config.{name} is 'float64', which requires the environment's JAX_ENABLE_X64=1")
     for name in ("train.max_steps", "train.lr_steps"):
@@ -107,6 +114,7 @@ def check_ranges(config: ConfigDict) -> None:
                 "and that is 0; set a time, or start another run with a number of steps"
             )
     _check_lists(fields)
+    _check_steps(fields)
     _check_memory(fields)
 
 
@@ -118,7 +126,7 @@ def _checked_fields(config) -> Iterator[tuple[str, Any]]:
             yield from _typed(known, config, section, section)
             continue
         if not isinstance(config.get(section, {}), ConfigDict | dict):
-            raise ValueError(f"--config.{section} is {config[section]!r}, expected a section; correct it")
+            raise ValueError(f"--config.{section} is {short_repr(config[section])}, expected a section; correct it")
         if section not in config:
             if section in _OPTIONAL:
                 continue
@@ -139,29 +147,54 @@ def _typed(known, section, field, name):
     value, expected = section[field], known.get_type(field)
     accepts = {float: int | float, tuple: tuple | list}.get(expected, expected)
     if not isinstance(value, accepts) or (isinstance(value, bool) and expected in (int, float)):
-        raise ValueError(f"--config.{name} is {value!r}, expected {expected.__name__.replace('_', ' or ')}; correct it")
-    if isinstance(value, float) and math.isinf(value):
-        raise ValueError(f"--config.{name} is {value}, expected a finite number; correct it")
+        kind = expected.__name__.replace("_", " or ")
+        raise ValueError(f"--config.{name} is {short_repr(value)}, expected {kind}; correct it")
+    limit = (
+        _MAX_SEED if name == "seed" else _MAX_INT if isinstance(value, int) and expected is not float else MAX_FLOAT32
+    )
+    if not all(abs(number) <= limit for number in _numbers(value)):
+        raise ValueError(
+            f"--config.{name} is {short_repr(value)}, expected a finite number of at most {limit:g}; correct it"
+        )
     yield name, value
+
+
+def _numbers(value):
+    """Yields the numbers of a value, which may be a list of lists, as a schedule is."""
+    for each in value if isinstance(value, tuple | list) else [value]:
+        if isinstance(each, tuple | list):
+            yield from _numbers(each)
+        elif isinstance(each, int | float):
+            yield each
 
 
 def _check_lists(fields):
     """Checks the box and the levels."""
     for name in ("occupancy.lower", "occupancy.upper"):
-        if not (is_auto(fields[name]) or (len(fields[name]) == 3 and all(map(_is_finite, fields[name])))):
-            raise ValueError(f"--config.{name} is {fields[name]}, expected 3 finite numbers; correct it")
+        if not (is_auto(fields[name]) or (len(fields[name]) == 3 and len([*_numbers(fields[name])]) == 3)):
+            found = short_repr(fields[name])
+            raise ValueError(f"--config.{name} is {found}, expected 3 finite numbers; correct it")
     levels = fields["hash_grid.resolutions"]
     if not is_auto(levels) and not (
         0 < len(levels) <= _MAX_LAYERS and all(isinstance(each, int) and 2 <= each <= 2**20 for each in levels)
     ):
         raise ValueError(
-            f"--config.hash_grid.resolutions is {levels}, expected 1 to {_MAX_LAYERS} whole numbers, each from 2 to "
-            "2^20; correct it"
+            f"--config.hash_grid.resolutions is {short_repr(levels)}, expected 1 to {_MAX_LAYERS} whole numbers, each "
+            "from 2 to 2^20; correct it"
         )
 
 
-def _is_finite(value):
-    return isinstance(value, int | float) and math.isfinite(value)
+def _check_steps(fields):
+    """Checks that the box of ray marching has a limited number of steps."""
+    lower, upper, step_size = (fields[f"occupancy.{name}"] for name in ("lower", "upper", "step_size"))
+    if fields["sampler"] != "occupancy" or is_auto(lower) or is_auto(upper) or is_auto(step_size):
+        return
+    longest = max(high - low for low, high in zip(lower, upper, strict=True))
+    if longest > _MAX_STEPS_PER_SIDE * step_size:
+        raise ValueError(
+            f"--config.occupancy.step_size is {step_size}, expected at least {longest / _MAX_STEPS_PER_SIDE:.3g}: the "
+            f"longest side of the box, {longest:.3g}, in at most {_MAX_STEPS_PER_SIDE:,} steps; correct it"
+        )
 
 
 def _check_memory(fields):
@@ -170,7 +203,7 @@ def _check_memory(fields):
     if free is None:
         return
     number = lambda name: fields[name] if isinstance(fields[name], int) else 1  # noqa: E731
-    needed = {}
+    needed = {"train.batch_size": 64 * number("train.batch_size")}  # the rays and colours of a step, at least
     for section in ("coarse", "fine"):
         if (
             section == "fine"
@@ -186,6 +219,9 @@ def _check_memory(fields):
         each = number("hash_grid.table_size")
         rows = each if is_auto(levels) else sum(min(each, level**3) for level in levels)
         needed["hash_grid.table_size"] = 16 * rows * number("hash_grid.features_per_level")
+        inputs = number("hash_grid.features_per_level") * (1 if is_auto(levels) else len(levels))
+        outputs = 1 + number("hash_grid.geometry_features")
+        needed["hash_grid.width"] = 16 * number("hash_grid.width") * (inputs + outputs)
         width = number("hash_grid.view_width")
         needed["hash_grid.view_width"] = 16 * width * width * max(number("hash_grid.view_depth") - 1, 0)
     if fields["sampler"] == "occupancy":
@@ -200,5 +236,5 @@ def _check_memory(fields):
         if size > free:
             raise ValueError(
                 f"--config.{name} is {fields[name]}, which needs {size / 1e9:,.1f} GB for parameters, gradients and "
-                f"the optimizer or the grid, and {free / 1e9:,.1f} GB are free; reduce it"
+                f"the optimizer, the grid or rays, and {free / 1e9:,.1f} GB are free; reduce it"
             )

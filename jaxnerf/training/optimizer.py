@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.camera_parameters import CAMERAS
 from jaxnerf.training.state import TrainState
 
@@ -115,6 +116,8 @@ def _labels(params):
 
 
 def _schedule(train):
+    if is_auto(train.lr_steps):
+        raise ValueError("train.lr_steps is 'auto'; resolve the config against a dataset, or set a number")
     ratio = train.lr_final / train.lr_init
     decay = optax.exponential_decay(train.lr_init, train.lr_steps, ratio, end_value=train.lr_final)
     if not train.warmup_steps:

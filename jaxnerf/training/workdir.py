@@ -66,7 +66,8 @@ def claim(workdir: str | os.PathLike, config: ConfigDict) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     for name in ("config.json", "metrics.jsonl"):
         for partial in path.parent.glob(f"{name}.*.tmp"):
-            partial.unlink(missing_ok=True)
+            if not partial.is_dir():
+                partial.unlink(missing_ok=True)
     atomic_files.write_text(path, config.to_json_best_effort(indent=2) + "\n")
 
 

@@ -53,6 +53,14 @@ def moved(found, view):
     return _with_poses(found.keypoints, poses), true
 
 
+def test_an_unreadable_image_neither_confirms_nor_denies_a_pose():
+    """As a truncated file beside a wrong pose."""
+    wrong, true = moved(evidence(), 4)
+    (nothing,) = tracks.keypoints_of(capture()._replace(frames=capture().frames[:1]), [None])
+    other = find_alternative(_with_poses([*wrong.keypoints[:5], nothing, *wrong.keypoints[6:]], wrong.poses), 4)
+    assert np.abs(other.pose - true).max() < 0.01 and other.other.cameras == 5
+
+
 def test_a_wrong_pose_is_found_and_the_right_one_estimated():
     wrong, true = moved(evidence(), 4)
     other = find_alternative(wrong, 4)

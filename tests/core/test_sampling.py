@@ -53,6 +53,14 @@ def test_uniform_edges_reach_infinity_in_disparity():
     np.testing.assert_allclose(got, [2, 8 / 3, 4, 8, np.inf], rtol=1e-6)
 
 
+@pytest.mark.parametrize("rule", ["segments", "gauss"])
+def test_random_samples_move_with_their_edges(edges, keys, rule):
+    """They can be differentiated by the edges: all edges shifted by the same distance shift all samples by it."""
+    move = lambda edges: jaxnerf.samples_from_edges(keys, edges, rule=rule).t  # noqa: E731
+    _, moved = jax.jvp(move, (edges,), (np.ones_like(edges),))
+    np.testing.assert_allclose(moved, 1, rtol=1e-5)
+
+
 @pytest.mark.parametrize("in_disparity", [False, True])
 def test_uniform_edges_of_an_empty_ray(in_disparity):
     same = f32([0.1, 3.3])

@@ -1,6 +1,7 @@
 """Captures of the embedded room: what the reader finds in the files agrees with the ground truth."""
 
 import hashlib
+import os
 
 import jax
 import numpy as np
@@ -158,6 +159,28 @@ def test_wrong_arguments_name_themselves(plain, tmp_path):
     with pytest.raises(ValueError, match="ground_truth.npz: no such file"):
         synthetic_capture.read_ground_truth(tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_nothing_is_written_through_a_link(tmp_path, monkeypatch):
+    """The folder is empty when the call begins; rendering takes a while."""
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "capture").mkdir()
+    sparse_points = synthetic_capture._sparse_points
+
+    def link(*arguments):
+        os.symlink(tmp_path / "precious", tmp_path / "capture" / "images")
+        return sparse_points(*arguments)
+
+    monkeypatch.setattr(synthetic_capture, "_sparse_points", link)
+    small = SIZES | {"num_far": 0, "num_held_out": 0, "num_views": 8, "width": 16, "height": 12}
+    with pytest.raises(OSError, match="capture/images"):
+        synthetic_capture.write_capture(tmp_path / "capture", **small)
+    assert not any((tmp_path / "precious").iterdir())
+    os.symlink(tmp_path / "missing", tmp_path / "dangling")
+    monkeypatch.setattr(synthetic_capture, "_sparse_points", sparse_points)
+    with pytest.raises(OSError, match="dangling"):
+        synthetic_capture.write_capture(tmp_path / "dangling", **small)
+    assert not (tmp_path / "missing").exists()
 
 
 @pytest.mark.slow

@@ -46,6 +46,25 @@ def test_a_contact_sheet_of_infinite_depths_is_black(tmp_path):
     assert iio.imread(tmp_path / "sheet.png")[:, 8:].max() == 0
 
 
+def test_images_of_another_size_or_kind_are_damaged(tmp_path, capsys):
+    """They would be shown as frames, or end the evaluation each time without a name."""
+    good = {"color": np.zeros((4, 6, 3), np.uint8), "depth": np.zeros((4, 6), np.float32)}
+    good |= {"rgba": np.zeros((4, 6, 4), np.uint8), "contact_sheet": np.zeros((3, 9, 3), np.uint8)}
+    wrong = {name: [pixels[:3], pixels[..., 0], np.zeros((4, 6), np.uint8)] for name, pixels in good.items()}
+    wrong["depth"] = [good["depth"][:3], good["color"]]
+    wrong["contact_sheet"] = [good["rgba"], good["depth"]]
+    for kind, pixels in good.items():
+        suffix = "tiff" if kind == "depth" else "png"
+        files = [tmp_path / kind / f"{index}.{suffix}" for index in range(len(wrong[kind]) + 1)]
+        (tmp_path / kind).mkdir()
+        for file, content in zip(files, [pixels, *wrong[kind]], strict=True):
+            iio.imwrite(file, content, extension=".tiff" if content.dtype == np.float32 else ".png")
+        found = output_images.readable([[file] for file in files], [(4, 6)] * len(files))
+        assert found == [True] + [False] * len(wrong[kind])
+        said = capsys.readouterr().err.splitlines()
+        assert sorted(said) == sorted(f"{file}: is damaged; its view is rendered again" for file in files[1:])
+
+
 def test_straight_alpha_recovers_a_known_colour_over_any_background():
     opacity = np.array([[0.0, 0.5, 1.0, 1e-4]])
     own = np.array([0.2, 0.4, 0.6])

@@ -51,6 +51,14 @@ def test_depth_images_lie_on_the_surface(images, tmp_path):
         assert np.isinf(image.depth[0, 0])  # empty space
 
 
+def test_depth_images_of_equal_names_in_several_folders_are_kept(images, tmp_path, monkeypatch):
+    named = [image._replace(name=f"{index}/view") for index, image in enumerate(images)]
+    monkeypatch.setattr("jaxnerf.exporters.depth.render_depth_images", lambda *_: named)
+    export_depth(source_of(), tmp_path)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert len({frame["depth_file_path"] for frame in frames}) == len(list((tmp_path / "depth").iterdir())) == 14
+
+
 def test_the_box_crops_depth_images(tmp_path):
     export_depth(source_of(box=(*CENTER, *(CENTER + 2))), tmp_path)
     seen = [(iio.imread(path) > 0).sum() for path in sorted((tmp_path / "depth").iterdir())]

@@ -1,6 +1,7 @@
 """Files appear complete or not at all, whatever interrupts or competes with the writer."""
 
 import os
+import resource
 import threading
 
 import pytest
@@ -95,6 +96,26 @@ def test_a_tree_has_no_links_pipes_or_devices(tmp_path):
     os.mkfifo(folder / "pipe")
     with pytest.raises(ValueError, match="folder/pipe: is a pipe or a device"):
         atomic_files.check_tree(folder, links=True)
+
+
+def test_a_file_larger_than_memory_is_an_error_that_names_it(tmp_path):
+    """A sparse file takes no space, neither on the disk nor in an archive."""
+    (tmp_path / "file").touch()
+    os.truncate(tmp_path / "file", 2**43)
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (2**42, limits[1]))
+    try:
+        with pytest.raises(OSError, match="Cannot allocate memory.*file"):
+            atomic_files.read_bytes(tmp_path / "file")
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+def test_whole_numbers_have_at_most_64_bits():
+    assert atomic_files.parse_json(f"[{2**64 - 1}, {-(2**63)}, 1e999]") == [2**64 - 1, -(2**63), float("inf")]
+    for digits in (str(2**64), str(-(2**63) - 1), "1" * 400, "-" + "1" * 10_000):
+        with pytest.raises(ValueError, match=f"a whole number of {len(digits)} digits"):
+            atomic_files.parse_json(f'{{"a": [{digits}]}}')
 
 
 @pytest.mark.parametrize("content", ["[" * 100_000, '{"a":' * 100_000, '{"a": 1', "\xff"])

@@ -1,5 +1,6 @@
 """Tests of what all command-line programs share: config names, flags, plugins and memory."""
 
+import os
 import platform
 import subprocess
 import sys
@@ -148,3 +149,33 @@ def test_a_name_from_a_workdir_is_not_imported():
     """Names that a config.json could contain are looked up, and never imported."""
     with pytest.raises(ValueError, match="no field 'os:system'.*register_field with --plugins"):
         FIELDS.get("os:system")
+
+
+def test_too_little_memory_is_one_line(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text("import numpy\nfrom jaxnerf.runtime import cli\ncli.run(lambda argv: numpy.zeros(2**58))\n")
+    done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: out of memory (Unable to allocate") and len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("flag", ["--help", "--config=help"])
+def test_a_reader_that_goes_away_while_flags_are_parsed_is_one_line(flag):
+    """As in `jaxnerf-train --help | head -1`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "jaxnerf.train", "--workdir=run", flag]
+    done = subprocess.run(command, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert done.returncode == 129
+    assert done.stderr.startswith("error: stopped before") and len(done.stderr.splitlines()) == 1
+
+
+def test_a_signal_after_the_end_prints_nothing(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import atexit, os, signal\nfrom jaxnerf.runtime import cli\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\ncli.run(lambda argv: None)\n"
+    )
+    done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "")

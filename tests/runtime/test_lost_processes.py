@@ -12,6 +12,10 @@ from runs import ROOT, SMOKE_FLAGS, start_together
 TWICE = (
     "E1123 12:03:45.78 9562 coordination_service.cc:518] 1 unexpectedly tried to connect with a different incarnation."
 )
+EARLY = (
+    "W1124 23:29:39.22 20580 coordination_service.cc:388] [11] ConnectAfterBarrierPasses: CANCELLED: Cancelled because "
+    "there's a more recent barrier call for [Init]Wait_for_all_tasks_to_register::0 from the same task."
+)
 SILENT = (
     "coordination_service.cc:1549] tasks are unhealthy (stopped sending heartbeats):\n1\n3\nThe tasks have crashed."
 )
@@ -28,6 +32,11 @@ SILENT = (
             "client.h:80] absl::Status: DEADLINE_EXCEEDED: Deadline Exceeded\nRPC: Heartbeat",
             "process 0 does not answer",
         ),
+        (EARLY, "a process has connected twice: one --process_id was given to two processes"),
+        (
+            "client.h:80] something\n    @     0x7f5b4a103b62  xla::CoordinationServiceAgent::Connect()\n",
+            r"another process may have ended; start all .*checkpoint \(client.h:80\] something\)$",
+        ),
         ("client.h:80] something\n new", r"another process may have ended; start all .*client.h:80\] something new"),
     ],
 )
@@ -35,7 +44,10 @@ def test_describe(messages, line):
     assert re.match(line, lost_processes.describe(messages))
 
 
-def test_an_abort_prints_one_line_and_other_messages_stay():
+@pytest.mark.parametrize(
+    "message, line", [(TWICE, "error: process 1 has connected"), (EARLY, "error: a process has connected")]
+)
+def test_an_abort_prints_one_line_and_other_messages_stay(message, line):
     program = f"""if True:
         import os, sys, time
         from jaxnerf.runtime import lost_processes
@@ -44,14 +56,14 @@ def test_an_abort_prints_one_line_and_other_messages_stay():
         os.write(2, b"a library's message\\n")
         watch.flush()
         print("the program's", file=sys.stderr)
-        os.write(2, b"another\\n" + {TWICE.encode()!r} + b"\\nmore of it\\n")
+        os.write(2, b"another\\n" + {message.encode()!r} + b"\\nmore of it\\n")
         os.abort()
     """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
     *others, last = done.stderr.splitlines()
     assert done.returncode == 1
     assert others == ["a library's message", "the program's", "another"]
-    assert last.startswith("error: process 1 has connected twice: ")
+    assert last.startswith(f"{line} twice: ")
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 import os
 import shutil
 import threading
@@ -102,7 +103,10 @@ def test_damaged_files_are_named_and_their_views_rendered_again(fresh, whole, re
     damaged = [folder / "20.tmp" / name for name in ("color/000.png", "depth/002.tiff", "contact_sheet/004.png")]
     for path in (*damaged, folder / "20.tmp" / "rows" / "006.json"):
         os.truncate(path, path.stat().st_size // 2)
+    (folder / "20.tmp" / "rows" / "stranger.tmp").mkdir()
+    (folder / "20.tmp" / "color" / "stranger.tmp").mkdir()
     assert without_times(score()) == without_times(whole[0])
+    (folder / "20" / "color" / "stranger.tmp").rmdir()
     assert len(rendered) == 4 + 8 and contents(folder / "20") == contents(whole[1])
     said = capsys.readouterr().err
     assert all(f"{path}: is damaged; its view is rendered again" in said for path in damaged)
@@ -117,6 +121,7 @@ def test_only_complete_rows_and_results_are_believed(whole, tmp_path):
     wrong = [{}, [], 5, None, {**good, "row": []}, {**good, "rays": None}, {**good, "first": 1}]
     wrong += [{**good, "row": {**row, name: value}} for name in ("psnr", "seconds") for value in (None, "1", True)]
     wrong += [{**good, "row": {**row, "name": 3}}, {**good, "row": {**row, "seconds": 0.0}}]
+    wrong += [{**good, "row": {**row, "seconds": math.inf}}, {**good, "rays": -math.inf}, {**good, "rays": math.nan}]
     assert not any(map(aggregate.is_finished, wrong))
     origin = {"split": "test"}
     for content in ("[]", "{}", json.dumps({**results, "psnr": "high"})):

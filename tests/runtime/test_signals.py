@@ -88,6 +88,16 @@ def test_a_full_disk_is_an_error():
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+def test_messages_that_a_full_disk_cannot_hold_are_discarded():
+    with open("/dev/full", "w", buffering=1) as stream:
+        output = signals._Output(stream, messages=True)
+        with signals.Interrupt() as interrupt:
+            print("text", file=output, flush=True)
+            print("text", file=output, flush=True)
+            assert not interrupt.caught
+        assert os.readlink(f"/proc/self/fd/{stream.fileno()}") == os.devnull
+
+
 @pytest.mark.parametrize(
     "command, ours",
     [

@@ -7,8 +7,9 @@ from ml_collections import ConfigDict
 
 from jaxnerf.configs import default
 from jaxnerf.evaluation.evaluate import train_and_evaluate
+from jaxnerf.runtime import devices
 from jaxnerf.runtime.config_fields import UNLIMITED_STEPS, is_auto
-from jaxnerf.training import config_ranges
+from jaxnerf.training import build, config_ranges
 from jaxnerf.training.auto_config import resolve_for_device
 from runs import PACKED, ROOT, smoke_config
 
@@ -18,7 +19,7 @@ from runs import PACKED, ROOT, smoke_config
     [
         ("train.max_steps", -5, "expected at least 1"),
         ("train.max_seconds", -1.0, "expected at least 0"),
-        ("train.max_seconds", math.nan, "expected at least 0"),
+        ("train.max_seconds", math.nan, r"expected a finite number of at most 3.4e\+38"),
         ("data.factor", -2, "expected at least 1"),
         ("train.lr_init", 0.0, "expected more than 0"),
         ("train.beta2", 1.0, "expected at least 0 and below 1"),
@@ -64,9 +65,22 @@ def test_a_run_that_its_time_ends_cannot_become_one_without_a_limit(field):
         ("hash_grid.resolutions", (16, "a"), "expected 1 to 64 whole numbers"),
         ("hash_grid.view_depth", 1000, "expected from 0 to 64"),
         ("occupancy.lower", (0.0, 1.0), "expected 3 finite numbers"),
-        ("occupancy.upper", (0.0, 1.0, math.nan), "expected 3 finite numbers"),
+        ("occupancy.upper", (0.0, 1.0, math.nan), "expected a finite number"),
+        ("occupancy.upper", (0.0, 1.0, "a"), "expected 3 finite numbers"),
         ("losses.mse", "much", "expected schedule"),
         ("seed", "first", "expected int"),
+        ("train.lr_final", 10**400, "expected a finite number"),
+        ("train.batch_size", 2**31, r"expected a finite number of at most 2.14748e\+09"),
+        ("train.warmup_steps", 2**40, "expected a finite number"),
+        ("seed", 2**64, "expected a finite number"),
+        ("coarse.density_bias", 1e39, "expected a finite number"),
+        ("losses.mse", [[0, 1.0], [5, math.nan]], "expected a finite number"),
+        ("losses.mse", 2 * [[10**400, 1]], "expected a finite number"),
+        ("coarse.compute_dtype", "auto", "expected one of"),
+        ("data.ndc", 10**6 * "a", "expected auto or bool"),
+        ("train.log_every", None, "is missing"),
+        ("train.save_every", None, "is missing"),
+        ("train.max_reinits", None, "is missing"),
         ("train", 3, "expected a section"),
         ("train", None, "is missing"),
         ("eval.chunk", None, "is missing"),
@@ -81,18 +95,57 @@ def test_an_edited_config_is_rejected_with_its_field(field, value, expected):
         del place[name]
     else:
         place[name] = value
-    with pytest.raises(ValueError, match=rf"--config.{field} (is .*)?{expected}"):
+    with pytest.raises(ValueError, match=rf"--config.{field} (is .*)?{expected}") as error:
         resolve_for_device(ConfigDict(content, type_safe=False))
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(
+    "field, other", [("train.batch_size", {"train.microbatch_size": "auto"}), ("train.lr_steps", {})]
+)
+def test_a_value_that_was_never_resolved_is_an_error(field, other):
+    config = smoke_config()
+    config.update_from_flattened_dict({field: "auto", **other})
+    with pytest.raises(ValueError, match=f"{field} is 'auto'; resolve the config"):
+        build.build(resolve_for_device(config)[0])
+
+
+def test_a_pool_of_less_than_a_sample_per_ray_has_a_microbatch():
+    assert devices.default_microbatch(64, 0.5, "cpu") == 64
+
+
+@pytest.mark.parametrize(
+    "field, value, expected",
+    [
+        ("occupancy.step_size", 1e-30, "at least 4.*e-05: the longest side"),
+        ("occupancy.pool_samples_per_ray", 1e-9, "from 0.01 to 100,000"),
+        ("occupancy.pool_samples_per_ray", 1e12, "from 0.01 to 100,000"),
+    ],
+)
+def test_the_samples_of_ray_marching_are_limited(field, value, expected):
+    config = smoke_config()
+    config.update_from_flattened_dict(PACKED | {"occupancy.lower": (-1.5,) * 3, "occupancy.upper": (1.5,) * 3})
+    config.update_from_flattened_dict({field: value})
+    with pytest.raises(ValueError, match=f"--config.{field} is {value}, expected {expected}".replace("+", r"\+")):
+        config_ranges.check_ranges(config)
 
 
 @pytest.mark.parametrize(
     "field, value",
-    [("hash_grid.table_size", 10**12), ("hash_grid.view_width", 10**7), ("occupancy.resolution", 10**6)],
+    [
+        ("hash_grid.table_size", 10**9),
+        ("hash_grid.width", 10**9),
+        ("hash_grid.geometry_features", 10**9),
+        ("hash_grid.view_width", 10**7),
+        ("occupancy.resolution", 10**6),
+        ("train.batch_size", 10**9),
+    ],
 )
 def test_what_does_not_fit_into_memory_is_rejected(field, value):
     config = smoke_config()
     config.update_from_flattened_dict(PACKED | {"hash_grid.resolutions": (2**20,), field: value})
-    with pytest.raises(ValueError, match=rf"--config.{field} is {value}, which needs .* GB"):
+    name = "hash_grid.width" if field == "hash_grid.geometry_features" else field
+    with pytest.raises(ValueError, match=rf"--config.{name} is .*, which needs .* GB"):
         config_ranges.check_ranges(config)
 
 

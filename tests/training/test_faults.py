@@ -108,6 +108,13 @@ def test_checkpoint_of_another_step_is_an_error(folder):
     assert int(state.step) == 20 and "kept as 25.unreadable" in said[0]
 
 
+def test_folders_that_are_no_steps_are_ignored(folder):
+    for name in ("030", "9" * 20, "²", "٣", "25.unreadable"):
+        (folder / "checkpoints" / name).mkdir()
+    assert Checkpoints(folder).steps() == [10, 15, 20]
+    assert int(load_newest(folder, keep=3)[0].step) == 20
+
+
 def test_if_no_checkpoint_can_be_read_none_is_renamed(folder):
     for step in (10, 15, 20):
         cut(numbers(folder, step))
@@ -294,6 +301,12 @@ def test_signal_before_training_prints_one_line(number):
 def test_partial_files_of_a_killed_run_are_removed_and_no_others(tmp_path):
     for name in ("config.json.0a1b.tmp", "metrics.jsonl.0a1b.tmp", "notes.tmp"):
         (tmp_path / name).write_text("partial")
-    (tmp_path / "folder.tmp").mkdir()
+    for name in ("folder.tmp", "config.json.folder.tmp"):
+        (tmp_path / name).mkdir()
     claim(tmp_path, smoke_config())
-    assert {path.name for path in tmp_path.iterdir()} == {"config.json", "notes.tmp", "folder.tmp"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "config.json",
+        "notes.tmp",
+        "folder.tmp",
+        "config.json.folder.tmp",
+    }

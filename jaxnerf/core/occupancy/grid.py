@@ -128,7 +128,7 @@ def update_grid(
     x = grid.lower[None] + place * (grid.upper - grid.lower)[None]
     # Density has no direction; any will do.
     density_at = lambda x: scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]))[0][0, 0]  # noqa: E731
-    found = jax.lax.map(density_at, x, batch_size=min(chunk, cells.size))
+    found = jax.lax.map(density_at, x, batch_size=min(chunk, cells.size)).astype(grid.density_max.dtype)
     largest, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
     largest = largest.at[cells].set(jnp.maximum(decay * largest[cells], found)).reshape(grid.density_max.shape)
     mean = mean.at[cells].add(smoothing * (found - mean[cells])).reshape(grid.density_mean.shape)

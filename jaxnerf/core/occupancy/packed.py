@@ -88,7 +88,7 @@ def render_packed(
             f"render_packed: early_stop_eps is {early_stop_eps} and median_depth is True, expected at most 0.5: rays "
             "would end before their median depth"
         )
-    shape = rays.near.shape
+    shape, scene = rays.near.shape, _without_gradient_if_empty(scene, rays)
     rays, samples = _flattened("render_packed", rays, samples, max_samples)
     words = _occupied_words(grid, rays, samples)
     if early_stop_eps > 0:
@@ -129,7 +129,8 @@ def render_placed(
         Rendering [B] without weights; `samples` is PackedSamples [K], K being 0 if there are no rays.
     """
     check_shapes("render_placed", near=(rays.near, "B"), t=(placed.t, "K"), delta=(placed.delta, "K"))
-    shape, rays = rays.near.shape, _at_least_one(jax.tree.map(jnp.asarray, rays))
+    shape, scene = rays.near.shape, _without_gradient_if_empty(scene, rays)
+    rays = _at_least_one(jax.tree.map(jnp.asarray, rays))
     options = {"rule": "segments", "longest": longest}
     sums, packed = _composite("render_placed", scene, rays, placed, near_gradient_distance, **options)
     num_dropped = _at_least_one(placed.num_dropped)
@@ -228,6 +229,11 @@ class _Sums(NamedTuple):
     depth: Array
     disparity: Array
     median_depth: Array | None = None
+
+
+def _without_gradient_if_empty(scene, rays):
+    """Returns the scene; without rays no position is safe to evaluate, so that its gradient may be NaN."""
+    return (lambda x, viewdirs: jax.lax.stop_gradient(scene(x, viewdirs))) if math.prod(rays.near.shape) == 0 else scene
 
 
 def _flattened(function, rays, samples, max_samples):

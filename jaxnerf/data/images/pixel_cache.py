@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt
 
 from jaxnerf.data.images import image_files
-from jaxnerf.runtime.atomic_files import partial_file
+from jaxnerf.runtime.atomic_files import open_regular, partial_file
 from jaxnerf.runtime.fingerprint import file_sha256, fingerprint
 from jaxnerf.runtime.user_cache import private_folder
 
@@ -104,10 +104,13 @@ def _in_memory(fill, shape, dtype):
 def _open(path, shape, dtype, mapped):
     """Opens the pixels of a cached file; returns None if it is missing or damaged."""
     try:
-        pixels = np.load(path, mmap_mode="r" if mapped else None)
+        with open_regular(path, "rb"):  # np.load would wait for a pipe
+            pixels = np.load(path, mmap_mode="r" if mapped else None)
     except FileNotFoundError:
         return None
-    except (ValueError, EOFError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # numpy parses the header as Python, so a damaged one raises almost any exception
         logging.warning("%s cannot be read (%s); it is written again", path, error)
         return None
     if pixels.shape != tuple(shape) or pixels.dtype != dtype:

@@ -118,7 +118,7 @@ def write_frames(
         return [index for index, group in enumerate(files) if not all(file.is_file() for file in group)]
 
     frames = shards.own(range(len(files)), shard)
-    readable = output_images.readable([files[index] for index in frames])
+    readable = output_images.readable([files[index] for index in frames], [(path.height, path.width)] * len(frames))
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     if todo:
         render = functools.partial(run.render_image, run.variables(step))

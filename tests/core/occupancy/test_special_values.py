@@ -227,6 +227,28 @@ def test_no_rays_have_an_empty_result():
         assert needed.shape == samples.t.shape and may_hit.shape == shape
 
 
+def test_no_rays_have_no_gradient_where_the_scene_is_undefined_at_the_origin():
+    rays = jax.tree.map(lambda leaf: leaf[:0], axis_rays(1))
+
+    @jax.jit
+    @jax.grad
+    def slope(density):
+        scene = lambda x, viewdirs: (density * jnp.log((x**2).sum(axis=-1)), jnp.ones_like(x))  # noqa: E731
+        return sum(render(scene, GRID, rays).rgb.sum() for render in (training, packed))
+
+    assert slope(1.0) == 0
+
+
+@pytest.mark.filterwarnings("error::FutureWarning")
+def test_an_update_keeps_the_type_of_the_grid_in_double_precision():
+    fog = lambda x, viewdirs: (jnp.ones_like(x[..., 0], jnp.float64), x)  # noqa: E731
+    with jax.enable_x64(True):
+        got = jax.eval_shape(
+            lambda: jaxnerf.update_grid(jax.random.key(0), GRID, fog, jnp.arange(4), threshold=0.5).density_max
+        )
+    assert got.dtype == jnp.float32
+
+
 def test_counts_are_int32_in_double_precision():
     with jax.enable_x64(True):
         rays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), axis_rays(3))

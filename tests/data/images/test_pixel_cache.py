@@ -81,6 +81,30 @@ def test_a_damaged_cache_file_is_replaced(image_file, cache, monkeypatch, conten
     assert fill(image_file, decoded)[:, 0].tolist() == [7] * 6 + [8] * 6 and len(decoded) == 2
 
 
+@pytest.mark.parametrize("many", [True, False])
+def test_no_flipped_bit_of_a_file_is_believed(image_file, cache, monkeypatch, many):
+    """Also in the header, which numpy parses as Python."""
+    monkeypatch.setattr(pixel_cache, "_LARGE", 1 if many else 2**28)
+    monkeypatch.setattr(pixel_cache, "_SLOW", 0.0)
+    right = np.array(fill(image_file, []))
+    (file,) = cache.iterdir()
+    kept = file.read_bytes()
+    for position in range(len(kept)):
+        changed = bytearray(kept)
+        changed[position] ^= 1 << position % 8
+        file.write_bytes(changed)
+        np.testing.assert_array_equal(fill(image_file, []), right)
+
+
+def test_a_pipe_in_the_cache_is_not_waited_for(image_file, cache, caplog):
+    right = np.array(fill(image_file, []))
+    (file,) = cache.iterdir()
+    file.unlink()
+    os.mkfifo(file)
+    np.testing.assert_array_equal(fill(image_file, []), right)
+    assert "Not a regular file" in caplog.text
+
+
 def test_failed_decoding_leaves_no_cache_file(image_file, cache):
     def bad():
         raise ValueError("image.png: unreadable")
