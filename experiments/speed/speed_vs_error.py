@@ -124,7 +124,7 @@ def _training(kept):
         "",
         *common.markdown(heads, rows),
         "",
-        "Seconds (comparable seconds) of training at the first score that reached:",
+        "Shortest training, in seconds (comparable seconds), whose PSNR reached the bar; only the times above were tried:",
         "",
         *common.markdown(("curve", *(f"{bar:g} dB" for bar in BARS)), reached),
     ]
