@@ -205,7 +205,7 @@ MAY_READ = {
     "evaluation/restore.py": {"data", "eval"},
     "interop/convert.py": {"data", "train"},
 }
-PROGRAMS_MAY_SET = {"data", "train", "eval"}
+PROGRAMS_MAY_SET = {"data", "train", "eval", "losses"}
 
 
 def test_only_build_and_auto_config_read_resolved_configs():
@@ -219,7 +219,7 @@ def test_only_build_and_auto_config_read_resolved_configs():
             node.attr
             for node in ast.walk(ast.parse(path.read_text()))
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "config"
-        } - {"get", "ignore_type", "to_json_best_effort", "update", "value"}
+        } - {"get", "ignore_type", "to_json_best_effort", "unlocked", "update", "value"}
         assert read <= (PROGRAMS_MAY_SET if program else MAY_READ.get(name, set())), (name, read)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core.safe_math import at_least_float32, divide
 from jaxnerf.core.types import check_shapes
+from jaxnerf.core.varying import vary_like
 
 # Beyond this optical depth exp(-x) is 0 in every float type. Larger or infinite depths are replaced by it, so that
 # sums and products stay finite.
@@ -413,7 +414,7 @@ def running_sum_since(starts: Bool[ArrayLike, " K"], x: Float[Array, " K"], long
         return jnp.where(starts, x, x + before[0]), starts | before[1]
 
     # A loop: unrolled, its rounds take several times as long to compile.
-    return jax.lax.fori_loop(0, rounds, add_before, (x, starts))[0]
+    return jax.lax.fori_loop(0, rounds, add_before, vary_like((x, starts), x, starts))[0]
 
 
 def _sample_index(x):

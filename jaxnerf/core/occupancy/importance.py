@@ -11,6 +11,7 @@ from jaxnerf.core.occupancy.grid import OccupancyGrid, estimate_optical_depth
 from jaxnerf.core.occupancy.packed import PlacedSamples
 from jaxnerf.core.sampling import uniform
 from jaxnerf.core.types import Keys, Rays, Samples, check_shapes
+from jaxnerf.core.varying import vary_like
 from jaxnerf.core.volume_rendering import exclusive_sum, running_sum
 
 _PARTS = 2.0**16  # probabilities are multiples of its inverse: float32 then sums them exactly, in any order
@@ -137,4 +138,5 @@ def _count_up_to(ascending, row, value):
         return jnp.where(inside & (ascending[row, jnp.minimum(place, size) - 1] <= value), place, found)
 
     # A loop: unrolled, its steps take several times as long to compile.
-    return jax.lax.fori_loop(0, size.bit_length(), search, jnp.zeros(row.shape, jnp.int32))
+    none = vary_like(jnp.zeros(row.shape, jnp.int32), ascending, row, value)
+    return jax.lax.fori_loop(0, size.bit_length(), search, none)
