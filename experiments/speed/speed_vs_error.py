@@ -124,7 +124,8 @@ def _training(kept):
         "",
         *common.markdown(heads, rows),
         "",
-        "Shortest training, in seconds (comparable seconds), whose PSNR reached the bar; only the times above were tried:",
+        "Shortest training, in seconds (comparable seconds), whose PSNR reached the bar; only the times above were "
+        "tried:",
         "",
         *common.markdown(("curve", *(f"{bar:g} dB" for bar in BARS)), reached),
     ]
