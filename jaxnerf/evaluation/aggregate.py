@@ -88,14 +88,15 @@ def merge(
     views: Views,
     variables: tuple,
     origin: Mapping[str, Any],
+    overwrite: bool,
 ) -> dict[str, Any] | None:
-    """Writes results.json and moves the folder `partial` to `target`.
+    """Writes results.json and moves the folder `partial` to `target`, which it replaces only with overwrite.
 
     Returns:
         What results.json holds; None if a view is missing.
 
     Raises:
-        FileNotFoundError: if another process does the same and was faster.
+        OSError: if another process does the same and was faster.
     """
     count = len(views.names)
     if not all(file.is_file() for index in range(count) for file in view_files(partial, index, count=count)):
@@ -107,7 +108,7 @@ def merge(
     with atomic_files.partial_file(partial / "results.json") as file:
         file.write_text(json.dumps(results, indent=2) + "\n")
     old = target.with_name(target.name + ".old")
-    if target.exists():  # a process killed between the two moves loses neither result
+    if overwrite and target.exists():  # a process killed between the two moves loses neither result
         shutil.rmtree(old, ignore_errors=True)  # left by such a process
         os.replace(target, old)
     os.replace(partial, target)

@@ -5,6 +5,7 @@ skipped, whichever process made them: an interrupted one, or another shard. The 
 finished writes results.json and moves the folder to eval/<step>/.
 """
 
+import errno
 import functools
 import os
 import pathlib
@@ -139,11 +140,11 @@ def score_run(
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
             _score_views(run, functools.partial(run.render_image, variables), views, partial, shard)
-            return aggregate.merge(
-                partial, target, run=run, workdir=workdir, views=views, variables=variables, origin=origin
-            )
-    except FileNotFoundError:  # another process has finished and moved the folder, perhaps just now
-        if partial.exists() and any((partial / "rows").glob("*")) or not target.exists():
+            options = {"run": run, "workdir": workdir, "views": views, "variables": variables, "origin": origin}
+            return aggregate.merge(partial, target, overwrite=overwrite, **options)
+    except OSError as error:
+        # Another process has finished and moved the folder, perhaps just now, which a later one may have made again.
+        if overwrite or error.errno not in (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST) or not target.exists():
             raise
         shutil.rmtree(partial, ignore_errors=True)
         return aggregate.read(target, origin, _REMEDY)

@@ -148,6 +148,27 @@ def test_two_shards_that_finish_together_both_return_the_result(fresh, monkeypat
     assert others[1:] == [results, results] and [path.name for path in folder.iterdir()] == ["20"]
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_a_call_that_is_overtaken_keeps_the_result_of_the_other(fresh, whole, monkeypatch, late):
+    """The other one finishes after this one has written results.json; a late third one makes the folder again."""
+    score, folder = fresh
+    replace, others = os.replace, []
+
+    def overtaken(source, target):
+        replace(source, target)
+        if str(target).endswith("20.tmp/results.json") and not others:
+            others.append("running")
+            others.append(score())
+            if late:
+                (folder / "20.tmp" / "rows").mkdir(parents=True)
+                (folder / "20.tmp" / "rows" / "000.json").write_text("{}")
+
+    monkeypatch.setattr(aggregate.os, "replace", overtaken)
+    results = score()
+    assert others[1] == results and contents(folder / "20") == contents(whole[1])
+    assert [path.name for path in folder.iterdir()] == ["20"]
+
+
 def test_concurrent_calls_damage_no_file(fresh, whole):
     score, folder = fresh
     found, texts = [], ["0/2", "1/2", "0/2", "1/2", "0/1"]
