@@ -413,7 +413,7 @@ def running_sum_since(starts: Bool[ArrayLike, " K"], x: Float[Array, " K"], long
         before = [jax.lax.dynamic_slice_in_dim(leaf, at, x.size) for leaf in before]
         return jnp.where(starts, x, x + before[0]), starts | before[1]
 
-    # A loop: unrolled, its rounds take several times as long to compile.
+    # A loop: unrolled, XLA makes a kernel of each round, which computes some of the earlier rounds again.
     return jax.lax.fori_loop(0, rounds, add_before, vary_like((x, starts), x, starts))[0]
 
 

@@ -166,7 +166,7 @@ def config_path(value: str) -> str:
 def _with_losses(config):
     """Returns a config with all losses whose weight the command line sets; plugins, which register losses, come later.
 
-    A loss that is never registered is an error when the config is resolved.
+    A loss that no plugin registers is an error when the run is built.
     """
     arguments = [re.match(r"--?config\.losses\.(\w+)(=|$)", argument) for argument in sys.argv[1:]]
     with config.unlocked():

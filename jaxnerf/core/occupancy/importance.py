@@ -137,6 +137,6 @@ def _count_up_to(ascending, row, value):
         inside = place < size
         return jnp.where(inside & (ascending[row, jnp.minimum(place, size) - 1] <= value), place, found)
 
-    # A loop: unrolled, its steps take several times as long to compile.
+    # A loop: unrolled, XLA makes a kernel of each step, which computes some of the earlier steps again.
     none = vary_like(jnp.zeros(row.shape, jnp.int32), ascending, row, value)
     return jax.lax.fori_loop(0, size.bit_length(), search, none)
