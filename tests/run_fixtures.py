@@ -15,8 +15,8 @@ from runs import smoke_config
 @pytest.fixture(scope="session")
 def compiled_once(tmp_path_factory):
     """Caches compiled programs on disk, as many processes of these tests run the same step."""
-    options = {"jax_persistent_cache_min_compile_time_secs": 0.5}
-    with _options(**options, jax_compilation_cache_dir=str(_shared(tmp_path_factory) / "compiled")):
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_shared(tmp_path_factory) / "compiled")
+    with _options(jax_compilation_cache_dir=folder, jax_persistent_cache_min_compile_time_secs=0.0):
         compilation_cache.reset_cache()
         yield
     compilation_cache.reset_cache()
