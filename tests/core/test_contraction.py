@@ -15,6 +15,9 @@ from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.fields.base import Field, contract_field
 from jaxnerf.models.grid_schedule import make_grid_schedule
 
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 KEY = jax.random.key(0)
 INNER, SIDE = 0.5, 32  # half the uncontracted part's side, cells per side
 CELL = (4 * INNER / SIDE,) * 3

@@ -1,6 +1,7 @@
 """Losses and regularizers: closed forms, gradients, degenerate rays, dense and packed."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compi
 from jaxnerf.core.losses import depth_loss, hash_decay, mse_loss, opaque_loss, total_variation
 from jaxnerf.core.occupancy.grid import mask_samples
 from jaxnerf.core.types import TableLevel, without_samples
+
+pytest_plugins = ["run_fixtures"]
 
 KEPT, FINITE_FAR, INFINITE_FAR = 0.7, (1.0, 7.0), (1.5, np.inf)
 
@@ -189,9 +192,30 @@ def test_nan_in_a_packed_ray_stays_in_its_ray(name):
 RAYS, SEGMENTS = 24, 40
 
 
+def dense_rendering(scene, rays, samples):
+    return jaxnerf.render_samples(scene, rays, samples)
+
+
+def packed_rendering(scene, rays, samples):
+    return jaxnerf.render_packed(scene, None, rays, samples, max_samples=RAYS * SEGMENTS + 7)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def losses_and_slope(render, rays, samples, batch):
+    """Returns three losses [3, RAYS] of a Gaussian ball, and the derivative of their sum by its density."""
+
+    def total(scale):
+        outputs = [render(lambda x, v: (scale * jnp.exp(-2 * (x**2).sum(axis=-1)), jax.nn.sigmoid(x)), rays, samples)]
+        losses = jnp.stack([loss(outputs, batch) for loss in (jaxnerf.distortion_loss, depth_loss, opaque_loss)])
+        return losses.sum(), losses
+
+    (_, losses), slope = jax.value_and_grad(total, has_aux=True)(jnp.float32(4.0))
+    return losses, slope
+
+
 @pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("rule", ["segments", pytest.param("points", marks=pytest.mark.slow)])
-def test_dense_and_packed_renderings_have_the_same_losses(masked, rule):
+def test_dense_and_packed_renderings_have_the_same_losses(masked, rule, unoptimized):
     """Also in value and gradient where the occupancy grid skips samples, or the buffer has unused slots."""
     rays = rays_past_origin(0, RAYS)
     edges = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=SEGMENTS)
@@ -203,24 +227,8 @@ def test_dense_and_packed_renderings_have_the_same_losses(masked, rule):
     fields = {"alpha": np.full(RAYS, 0.5, np.float32), "depth": depth, "depth_weight": np.arange(RAYS) % 3 / 2.0}
     batch = jaxnerf.Batch(rays=rays, rgb=np.zeros((RAYS, 3), np.float32), **fields)
 
-    def scene(scale, x, viewdirs):
-        return scale * jnp.exp(-2 * (x**2).sum(axis=-1)), jax.nn.sigmoid(x)
-
-    def dense(scene):
-        return jaxnerf.render_samples(scene, rays, samples)
-
-    def packed(scene):
-        return jaxnerf.render_packed(scene, None, rays, samples, max_samples=RAYS * SEGMENTS + 7)
-
-    def loss_and_slope(render):
-        def total(scale):
-            outputs = [render(lambda x, viewdirs: scene(scale, x, viewdirs))]
-            losses = jnp.stack([loss(outputs, batch) for loss in (jaxnerf.distortion_loss, depth_loss, opaque_loss)])
-            return losses.sum(), losses
-
-        return jax.jit(jax.value_and_grad(total, has_aux=True))(jnp.float32(4.0))
-
-    ((_, want), want_slope), ((_, got), slope) = loss_and_slope(dense), loss_and_slope(packed)
+    want, want_slope = losses_and_slope(dense_rendering, rays, samples, batch)
+    got, slope = losses_and_slope(packed_rendering, rays, samples, batch)
     assert got.shape == (3, RAYS) and np.max(want, axis=1).min() > 1e-3
     np.testing.assert_allclose(got[0], want[0], rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(got[1:], want[1:], rtol=1e-5, atol=1e-6)

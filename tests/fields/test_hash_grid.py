@@ -9,6 +9,9 @@ import pytest
 from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
 from jaxnerf.fields.hash_grid import color_activation, harmonics, hash_grid_field, interpolate, vertices
 
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 BOX = {"lower": (-1.0, 0.0, 2.0), "upper": (1.0, 3.0, 3.0)}
 SIZE = (3, 5, 4)  # vertices of the level that is dense
 COUNT = int(np.prod(SIZE))

@@ -10,6 +10,9 @@ from helpers import assert_same
 from jaxnerf.fields.hash_grid import hash_grid_field
 from jaxnerf.fields.mlp import mlp_field
 
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 
 def count(params):
     return sum(leaf.size for leaf in jax.tree.leaves(params))

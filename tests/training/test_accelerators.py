@@ -19,6 +19,8 @@ from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step, repeat_step
 from runs import PACKED, smoke_config
 
+pytest_plugins = ["run_fixtures"]
+
 PLATFORMS = ("cuda", "rocm", "tpu")
 # Threefry has kernels of its own on GPUs.
 ALLOWED_CALLS = {"cu_threefry2x32", "cu_threefry2x32_ffi", "hip_threefry2x32", "hip_threefry2x32_ffi"}
@@ -122,7 +124,7 @@ def test_a_callback_would_be_found():
 
 
 @pytest.mark.slow
-def test_steps_of_one_dispatch_transfer_nothing_and_are_the_same_bit_for_bit(views):
+def test_steps_of_one_dispatch_transfer_nothing_and_are_the_same_bit_for_bit(views, unoptimized):
     step, (state, data, _) = train_step(views, "cpu")
     results = []
     for count in (1, 4):

@@ -24,6 +24,9 @@ from jaxnerf.training.step import make_train_step
 from runs import smoke_config, smoke_experiment
 from toys import LOSSES, toy_draw, toy_model, toy_rendering
 
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 OPTIMIZER = optax.adam(1e-3)
 RAYS = 64
 EMPTY, WALL = -1e6, 1e6  # biases of the density

@@ -16,6 +16,9 @@ from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step
 from runs import smoke_config
 
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 RAYS, STEPS = 64, 3
 OPTIMIZER = optax.adam(1e-2)
 
