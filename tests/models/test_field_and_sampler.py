@@ -1,4 +1,7 @@
-"""Any field trains with any sampler, and with the distortion loss."""
+"""Any field trains with any sampler, and with the distortion loss.
+
+tests/training/test_fast_training.py trains a hash grid with the occupancy sampler for longer.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +23,7 @@ STEPS = 40
     ("field", "sampler"),
     [
         ("mlp", "hierarchical"),
-        pytest.param("hash_grid", "occupancy", marks=pytest.mark.slow),
+        pytest.param("hash_grid", "occupancy", marks=pytest.mark.extra),
         pytest.param("mlp", "occupancy", marks=pytest.mark.slow),
         pytest.param("hash_grid", "hierarchical", marks=pytest.mark.slow),
     ],

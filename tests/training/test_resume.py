@@ -49,7 +49,7 @@ def long_run(folder):
     return start("train", f"--workdir={folder}", *flags)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.extra)])
 def test_signal_saves_and_exits_with_0(compiled_once, tmp_path, number):
     folder = tmp_path / "run"
     process = long_run(folder)
@@ -113,8 +113,7 @@ def test_a_config_to_resume_has_the_types_of_its_fields(trained, tmp_path):
 @pytest.mark.slow
 def test_resumed_run_does_not_exceed_its_limit_of_seconds(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
-    for _ in range(2):
-        assert train_and_evaluate(smoke_config(max_steps=100, max_seconds=1e-3), folder)
+    assert train_and_evaluate(smoke_config(max_steps=100, max_seconds=1e-3), folder)
     assert Checkpoints(folder).steps()[-1] == 20
 
 
