@@ -11,6 +11,8 @@ from jaxnerf import registry
 from jaxnerf.configs import default
 from runs import ROOT
 
+pytest_plugins = ["run_fixtures"]
+
 DOCS = ROOT / "docs"
 PUBLIC = r"^::: jaxnerf\.(\w+)$"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
@@ -166,7 +168,7 @@ def test_the_readme_is_short():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", EXAMPLES)
-def test_python_examples_run(code, tmp_path, monkeypatch):
+def test_python_examples_run(code, unoptimized, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for parts in (registry.LOSSES, registry.FIELDS, registry.SAMPLERS, registry.READERS, registry.EXPORTERS):
         monkeypatch.setattr(parts, "_parts", dict(parts._parts))  # what an example registers is forgotten

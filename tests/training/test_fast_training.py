@@ -49,6 +49,7 @@ def tiny_config():
     train.batch_size, train.lr_steps, train.warmup_steps = BATCH, STEPS, 10
     train.lr_init, train.lr_final, train.beta2, train.epsilon = 2e-2, 2e-3, 0.99, 1e-15
     train.muon = 0.15  # times this learning rate it is as large as in lego_fast.py
+    config.eval.summary_seconds = 0.0
     return config
 
 

@@ -16,6 +16,9 @@ from jaxnerf.core.occupancy.grid import is_occupied, mask_samples
 from jaxnerf.core.types import without_samples
 from jaxnerf.fields import analytic
 
+pytest_plugins = ["run_fixtures"]
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 RAYS, SEGMENTS = 24, 40
 BACKGROUND = np.float32([0.9, 0.2, 0.5])
 OUTPUTS = ("rgb", "opacity", "depth", "disparity")
