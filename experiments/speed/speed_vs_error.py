@@ -1,7 +1,7 @@
 """Measures error against seconds: of training, of rendering, and how near both come to the machine's peak.
 
     JAXNERF_SCENES=... python experiments/speed/speed_vs_error.py --out=DIR \
-        [--parts=training,rendering,limits,cost] [--curves=grid,dense] \
+        [--parts=training,rendering,limits,cost,parts] [--curves=grid,dense] \
         [--workdir=DIR of a trained run, or none] [--page=FILE.md]
 
 Writes DIR/<part>.json, DIR/published.json (what others report, with its source) and DIR/speed_vs_error.png, and
@@ -20,12 +20,12 @@ from absl import flags
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
-from speed import published, rendering, step, training
+from speed import published, rendering, step, step_parts, training
 
 from jaxnerf.runtime import cli
 
 _CURVE = "grid"  # whose run the other parts take
-PARTS = ("training", "rendering", "limits", "cost")
+PARTS = ("training", "rendering", "limits", "cost", "parts")
 BARS = (29.0, 30.0, 31.0, 32.0, 32.5, 33.5)
 _OUT = flags.DEFINE_string("out", None, "Folder of the measurements.", required=True)
 _PARTS = flags.DEFINE_list("parts", list(PARTS), f"Parts to measure, of {PARTS}; 'report' alone measures nothing.")
@@ -75,6 +75,8 @@ def _measure(part, out):
         )
     if part == "cost":
         step.measure_cost(kept, save, config)
+    if part == "parts":
+        step_parts.measure_all(kept, save)
     if part == "rendering":
         if folder is None:
             print("rendering is skipped: it needs a trained run, see --workdir")
@@ -87,7 +89,13 @@ def _measure(part, out):
 
 def report(measured: dict[str, dict]) -> list[str]:
     """Returns the lines of all parts that were measured."""
-    tables = {"training": _training, "rendering": _rendering, "limits": _limits, "cost": _cost}
+    tables = {
+        "training": _training,
+        "rendering": _rendering,
+        "limits": _limits,
+        "cost": _cost,
+        "parts": step_parts.table,
+    }
     lines = []
     for part, table in tables.items():
         if measured.get(part):

@@ -2,14 +2,19 @@
 
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnerf.core.sampling import inverse_cdf
+from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.training import workdir
 from studies import common, study
 
 speed = study("speed/speed_vs_error")
 training = study("speed/training")
+step_parts = study("speed/step_parts")
 
 
 def test_the_front_contains_the_points_that_no_other_beats():
@@ -66,3 +71,24 @@ def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, t
     monkeypatch.setattr(common, "matrix_gflops", lambda: 2 * common.REFERENCE_GFLOPS)
     point = training.run_to(3, config, tmp_path)
     assert (point["ended"], point["seconds"], point["comparable"]) == (ended, 2.0, 4.0)
+
+
+def test_an_operation_is_not_charged_for_those_inside():
+    events = [
+        {"name": "loop", "ph": "X", "tid": 1, "ts": 0, "dur": 10},
+        {"name": "add", "ph": "X", "tid": 1, "ts": 1, "dur": 3},
+        {"name": "inside", "ph": "X", "tid": 1, "ts": 2, "dur": 1},
+        {"name": "add", "ph": "X", "tid": 1, "ts": 5, "dur": 4},
+        {"name": "add", "ph": "X", "tid": 2, "ts": 5, "dur": 7},
+        {"name": "not an operation", "ph": "X", "tid": 1, "ts": 5, "dur": 1},
+        {"name": "loop", "ph": "M", "tid": 1},
+    ]
+    found = step_parts.own_times(events, {"loop", "add", "inside"})
+    assert found == [("loop", 3), ("add", 2), ("inside", 1), ("add", 4), ("add", 7)]
+
+
+def test_the_compiler_says_which_function_an_operation_comes_from():
+    text = jax.jit(harmonics).lower(jnp.ones((4, 3))).compile().as_text()
+    assert set(step_parts.parts_of_operations(text).values()) >= {"networks"}
+    text = jax.jit(inverse_cdf).lower(jnp.linspace(0, 1, 5), jnp.ones(4), jnp.linspace(0, 1, 3)).compile().as_text()
+    assert set(step_parts.parts_of_operations(text).values()) >= {"compositing and losses"}
