@@ -82,7 +82,7 @@ def resolve(config: ConfigDict, views: Views | None = None, *, platform: str | N
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
     lines = lines + _resolve_sizes(config, views)
-    _resolve_batch(config, lines, platform or jax.default_backend())
+    _resolve_schedule(config, views, lines, platform or jax.default_backend())
     views = _resolve_near(config, views, lines)
     left = [name for name in auto_fields(config) if name not in DEVICE_FIELDS]
     if left:
@@ -191,7 +191,7 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     """Fills the sizes of grids, networks and training into a config; returns lines."""
     lines: list[str] = []
     infer = _inferring(lines)
-    section, train, ndc = config.occupancy, config.train, config.data.ndc
+    section, ndc = config.occupancy, config.data.ndc
     paper = config.sampler == "hierarchical" and config.field == "mlp"  # has no box
     use_box = {"used": not paper or config.eval.bake_occupancy}
     # Alpha bounds the box of a field that is defined in it. A box only for rendering holds all that cameras see.
@@ -212,7 +212,7 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
         raise ValueError(
             f"occupancy.lower is {section.lower} and occupancy.upper {section.upper}, expected lower < upper"
         )
-    side = float(np.sqrt(np.prod(views.size, axis=1)).mean())
+    side = _side(views)
     more = int(section.contracted or side >= _FIVE_LEVELS_SIDE)  # half of a contracted box holds the surroundings
     vertices = int(np.clip(round(longest / (_CELL_PER_PIXEL * footprint)), _FINEST[0], _FINEST[1] << more))
     finest = min(vertices, _FINEST[1])
@@ -232,27 +232,23 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     rows = 2 ** round(math.log2(np.clip(_ROWS_PER_PIXEL * side, _MIN_ROWS, _MAX_ROWS)))
     line = f"hash grid     at most {rows:,} rows per level, for images of about {side:.0f} x {side:.0f} px"
     infer(config.hash_grid, "table_size", rows, line, used=config.field == "hash_grid")
-    planned = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5)
-    steps, why = planned, f"{planned:,} steps, for images of about {side:.0f} x {side:.0f} px"
-    if train.get("max_seconds"):
-        steps, why = UNLIMITED_STEPS, f"ends after train.max_seconds = {train.max_seconds:g}"
     if "cameras" in config:  # older versions had no such section
         infer(config.cameras, "num_images", len(views.size), "", used=False)
-    infer(train, "max_steps", steps, f"training      {why}")
-    decay_steps, end = train.max_steps, f"step {train.max_steps:,}"
-    if train.max_steps >= UNLIMITED_STEPS and jax.process_count() == 1:
-        end = "the end"
-    elif train.max_steps >= UNLIMITED_STEPS:  # several processes have no common clock
-        decay_steps, end = planned, f"step {planned:,}"
-    infer(train, "lr_steps", decay_steps, f"training      learning rate decays until {end}")
     return lines
 
 
-def _resolve_batch(config: ConfigDict, lines: list[str], platform: str) -> None:
-    """Fills the number of rays per step into a config.
+def _side(views):
+    """Returns the mean side of square images with as many pixels, px."""
+    return float(np.sqrt(np.prod(views.size, axis=1)).mean())
 
-    An accelerator takes more rays in the same number of steps: the schedules, which count steps, keep their meaning.
+
+def _resolve_schedule(config: ConfigDict, views: Views, lines: list[str], platform: str) -> None:
+    """Fills the numbers of rays per step and of steps into a config.
+
+    A run is planned as a number of rays: steps of fewer rays than would be inferred are more steps. An accelerator
+    takes more rays in the same number of steps.
     """
+    infer, train, side = _inferring(lines), config.train, _side(views)
     rays, why = config.train.get("cpu_batch_size"), "train.cpu_batch_size"
     large = config.field == "hash_grid" and config.hash_grid.table_size >= _LARGE_TABLE
     if config.sampler == "occupancy" and large:
@@ -260,7 +256,21 @@ def _resolve_batch(config: ConfigDict, lines: list[str], platform: str) -> None:
     if platform != "cpu" and config.sampler == "occupancy":
         filling = devices.profile_of(platform).samples_per_step / config.occupancy.pool_samples_per_ray
         rays, why = 2 ** max(math.floor(math.log2(filling)), 0), "they keep this device busy"
-    _inferring(lines)(config.train, "batch_size", rays, f"batch         {rays:,} rays per step: {why}")
+    infer(train, "batch_size", rays, f"batch         {rays:,} rays per step: {why}")
+    planned = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5 * (rays or train.batch_size) / train.batch_size)
+    steps, why = (
+        planned,
+        f"{planned:,} steps of {train.batch_size:,} rays, for images of about {side:.0f} x {side:.0f} px",
+    )
+    if train.get("max_seconds"):
+        steps, why = UNLIMITED_STEPS, f"ends after train.max_seconds = {train.max_seconds:g}"
+    infer(train, "max_steps", steps, f"training      {why}")
+    decay_steps, end = train.max_steps, f"step {train.max_steps:,}"
+    if train.max_steps >= UNLIMITED_STEPS and jax.process_count() == 1:
+        end = "the end"
+    elif train.max_steps >= UNLIMITED_STEPS:  # several processes have no common clock
+        decay_steps, end = planned, f"step {planned:,}"
+    infer(train, "lr_steps", decay_steps, f"training      learning rate decays until {end}")
 
 
 def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:

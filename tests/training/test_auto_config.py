@@ -328,6 +328,7 @@ def test_larger_images_are_trained_on_longer(views):
     """16 times the pixels per side take 4 times the steps; lr_steps follows max_steps."""
     config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
     config.train.max_steps = config.train.lr_steps = AUTO
+    config.train.cpu_batch_size = config.train.batch_size
     assert {"train.max_steps", "train.lr_steps"} <= unresolved(config)
     got, _, lines = resolve(config, views)
     large = resolve(config, dataclasses.replace(views, size=16 * views.size)).config
@@ -339,6 +340,20 @@ def test_larger_images_are_trained_on_longer(views):
     got, _, lines = resolve(config, views)
     assert (got.train.max_steps, got.train.lr_steps) == (7, 7)
     assert not any(line.startswith("training") and "steps, for images" in line for line in lines)
+
+
+@pytest.mark.parametrize("platform, auto_rays", [("cpu", 300), ("gpu", 2**14)])
+def test_fewer_rays_per_step_take_more_steps(views, platform, auto_rays):
+    config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    train = config.train
+    train.batch_size = train.max_steps = train.lr_steps = AUTO
+    train.cpu_batch_size = 300
+    inferred = resolve(config, views, platform=platform).config.train
+    assert (inferred.batch_size, inferred.max_steps) == (auto_rays, 4899)
+    train.batch_size = auto_rays // 4
+    fewer = resolve(config, views, platform=platform).config.train
+    assert fewer.max_steps * fewer.batch_size == pytest.approx(4899 * auto_rays, rel=1e-3)
+    assert fewer.lr_steps == fewer.max_steps
 
 
 def test_a_run_of_limited_time_takes_all_the_steps_that_it_can(views):
@@ -353,6 +368,7 @@ def test_a_run_of_limited_time_takes_all_the_steps_that_it_can(views):
 def test_the_learning_rate_of_several_processes_depends_on_steps_in_a_run_of_limited_time(views, monkeypatch):
     config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
     config.train.max_steps, config.train.lr_steps, config.train.max_seconds = AUTO, AUTO, 60.0
+    config.train.cpu_batch_size = config.train.batch_size
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     got, _, lines = resolve(config, views)
     assert (got.train.max_steps, got.train.lr_steps) == (UNLIMITED_STEPS, 4899)
