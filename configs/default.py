@@ -146,7 +146,10 @@ def get_config():
                 # does, so that the run depends on the clock.
                 "max_seconds": 0.0,
                 "lr_init": 5e-4,  # Adam
-                "lr_final": 5e-5,  # reached exponentially at lr_steps
+                "lr_final": 5e-5,  # reached at lr_steps
+                # The rate is lr_init (lr_final / lr_init)^((step / lr_steps)^lr_decay_power). 1: exponential decay, as in
+                # the paper; larger: the rate stays high for most of the run and then decreases quickly.
+                "lr_decay_power": 1.0,
                 "lr_steps": auto(int, 200_000),  # the run may end earlier or later; auto: max_steps
                 "warmup_steps": 0,  # the learning rate rises linearly from 0
                 "beta1": 0.9,

@@ -15,7 +15,7 @@ def get_config():
     config.hash_grid.view_width, config.hash_grid.table_size = 64, "auto"
     train = config.train
     train.batch_size, train.cpu_batch_size, train.max_steps, train.lr_steps = "auto", 1024, "auto", "auto"
-    train.lr_init, train.lr_final, train.warmup_steps = 5e-3, 1.5e-4, 50
+    train.lr_init, train.lr_final, train.lr_decay_power, train.warmup_steps = 5e-3, 1.5e-4, 8.0, 50
     train.muon = 0.6
     train.beta2, train.epsilon = 0.99, 1e-15  # entries that few samples reach get updates of full size, too
     train.averaging_power = 10.0

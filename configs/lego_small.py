@@ -25,6 +25,7 @@ def get_config():
     train.batch_size = 256
     train.max_steps, train.lr_steps, train.max_seconds = 40_000, 12_000, 600.0
     train.lr_init, train.lr_final, train.warmup_steps, train.beta2 = 8e-3, 3e-4, 50, 0.99
+    train.lr_decay_power = 4.0
     train.muon = 0.4
     train.log_every, train.save_every = 200, 2000
     return config

@@ -89,6 +89,7 @@ PAPER = {
     "data.pixel_offset": 0.0,
     "train.lr_init": 5e-4,
     "train.lr_final": 5e-5,
+    "train.lr_decay_power": 1.0,
     "train.beta1": 0.9,
     "train.beta2": 0.999,
     "train.epsilon": 1e-7,

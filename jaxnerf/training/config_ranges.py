@@ -55,7 +55,7 @@ _RANGES = (
         "more than 0",
         lambda value: value > 0,
         (
-            "hash_grid.feature_scale occupancy.step_size train.lr_init train.lr_final "
+            "hash_grid.feature_scale occupancy.step_size train.lr_init train.lr_final train.lr_decay_power "
             "train.epsilon cameras.exposure_lr cameras.refine_lr eval.sample_multiplier"
         ),
     ),
@@ -77,7 +77,7 @@ _CHOICES = {
 _OPTIONAL = (
     "cameras occupancy.uniform_fraction occupancy.near_gradient_distance occupancy.min_views train.preview_every "
     "train.max_to_keep train.max_nonfinite train.max_seconds eval.at_end eval.summary_seconds occupancy.update_chunk "
-    "hash_grid.compute_dtype train.steps_per_dispatch train.cpu_batch_size"
+    "hash_grid.compute_dtype train.steps_per_dispatch train.cpu_batch_size train.lr_decay_power"
 ).split()
 
 # Sections that become the arguments of one function, which takes no others.

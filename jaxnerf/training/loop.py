@@ -284,10 +284,9 @@ class _Clock:
 class _Pace:
     """The learning rate of a run of limited time: it reaches its end when the time does, if not before.
 
-    The exponent of its decay is the fraction of the steps that are done, or the fourth power of the fraction of the
-    time that has passed, whichever is larger: a run with time for few steps keeps a high learning rate for most of
-    them, which is better than a steady decay. Such a run depends on the clock. Several processes have several clocks,
-    so their learning rate depends on the steps alone.
+    It depends on the fraction of the steps that are done or on that of the time that has passed, whichever is larger.
+    Such a run depends on the clock. Several processes have several clocks, so their learning rate depends on the
+    steps alone.
     """
 
     def __init__(self, experiment: build.Experiment, clock: _Clock, data: Any):
@@ -298,9 +297,9 @@ class _Pace:
         if self._data.lr_scale is None:
             return self._data
         by_steps = min((step - 1) / self._options.lr_steps, 1.0)
-        by_time = min(self._clock.seconds() / self._options.max_seconds, 1.0) ** 4
-        ratio = self._options.lr_final / self._options.lr_init
-        self.scale = ratio ** (max(by_steps, by_time) - by_steps)
+        by_time = min(self._clock.seconds() / self._options.max_seconds, 1.0)
+        ratio, power = self._options.lr_final / self._options.lr_init, self._options.get("lr_decay_power", 1.0)
+        self.scale = ratio ** (max(by_steps, by_time) ** power - by_steps**power)
         return self._data._replace(lr_scale=devices.place(np.float32(self.scale), self._data.lr_scale.sharding))
 
 

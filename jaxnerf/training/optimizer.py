@@ -19,6 +19,8 @@ _MAX_RMS = 3.0
 # AdamW's decay of all other parameters. Without it a hash grid's entries and the weights of the colour's output grew
 # steadily at a constant learning rate, until lego collapsed after 16,000 to 22,000 steps.
 _DECAY = 0.05
+# The average takes every step's parameters at first, then those of every n-th step: a pass over a large table fewer.
+_AVERAGE_ALL, _AVERAGE_EVERY = 256, 8
 _ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one, they compile once, as a loop
 
 
@@ -38,7 +40,7 @@ def make_optimizer(train: Any, cameras: Any = None) -> tuple[optax.GradientTrans
     for name in ("averaging_power", "muon"):
         if train[name] < 0:
             raise ValueError(f"train.{name} is {train[name]}, expected a number above 0, or 0 for off")
-    schedule = _schedule(train)
+    schedule = learning_rate(train)
     moments = {"b1": train.beta1, "b2": train.beta2, "eps": train.epsilon}
     if train.muon:
         optimizer = with_muon(optax.adamw(schedule, **moments, weight_decay=_DECAY), schedule, train.muon)
@@ -115,11 +117,15 @@ def _labels(params):
     return jax.tree_util.tree_map_with_path(label, params)
 
 
-def _schedule(train):
+def learning_rate(train: Any) -> Callable[[Any], Any]:
+    """Returns the learning rate of the networks, step -> float, of a config's section `train`."""
     if is_auto(train.lr_steps):
         raise ValueError("train.lr_steps is 'auto'; resolve the config against a dataset, or set a number")
-    ratio = train.lr_final / train.lr_init
-    decay = optax.exponential_decay(train.lr_init, train.lr_steps, ratio, end_value=train.lr_final)
+    ratio, power = train.lr_final / train.lr_init, train.get("lr_decay_power", 1.0)  # older configs lack the power
+
+    def decay(step):
+        return train.lr_init * ratio ** (jnp.minimum(step / train.lr_steps, 1.0) ** power)
+
     if not train.warmup_steps:
         return decay
     return lambda step: decay(step) * jnp.minimum(1.0, (step + 1) / train.warmup_steps)
@@ -144,7 +150,8 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
 
     The average has polynomial decay (arXiv:1212.1824): after step t the parameters of step s have a weight of
     about (s / t)^power. It thus spans about the last 1 / power of all steps, however many there are. After the
-    first update it equals the parameters.
+    first update it equals the parameters. After 256 steps the parameters of every eighth step count for the
+    seven before it, too.
 
     Args:
         optimizer: makes the updates.
@@ -157,9 +164,18 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
     def update(grads, state, params, **scale):
         updates, inner = optimizer.update(grads, state.inner, params, **scale)
         count = state.count + 1
-        fraction = (power + 1) / (power + count)
-        new = optax.apply_updates(params, updates)
-        average = jax.tree.map(lambda old, new: old + fraction * (new - old), state.average, new)
+        each = count <= _AVERAGE_ALL
+        steps = count - jnp.arange(_AVERAGE_EVERY)  # for which these parameters count, only the first if `each`
+        kept = jnp.where((steps < count) & each, 1, (steps - 1) / (steps + power))
+
+        def add(_, average):
+            new = optax.apply_updates(params, updates)
+            fraction = 1 - kept.prod()
+            return jax.tree.map(lambda old, new: old + fraction * (new - old), average, new)
+
+        # A loop of at most one iteration changes the average in place; a branch would copy it.
+        due = each | (count % _AVERAGE_EVERY == 0)
+        average = jax.lax.fori_loop(0, due.astype(jnp.int32), add, state.average)
         return updates, Averaging(count, average, inner)
 
     return optax.GradientTransformationExtraArgs(init, update)

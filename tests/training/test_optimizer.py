@@ -137,10 +137,15 @@ def descend(optimizer, steps=40):
     """Returns the parameters after each step towards a moving minimum, and the optimizer's last state."""
     params = {"a": jnp.float32([3.0, -2.0]), "b": jnp.float32(1.0)}
     state, params_of_steps = optimizer.init(params), []
-    for step in range(steps):
-        grads = jax.tree.map(lambda leaf, step=step: leaf - jnp.sin(step / 3), params)
+
+    @jax.jit
+    def take(step, params, state):
+        grads = jax.tree.map(lambda leaf: leaf - jnp.sin(step / 3), params)
         updates, state = optimizer.update(grads, state, params)
-        params = optax.apply_updates(params, updates)
+        return optax.apply_updates(params, updates), state
+
+    for step in range(steps):
+        params, state = take(step, params, state)
         params_of_steps.append(params)
     return params_of_steps, state
 
@@ -157,6 +162,17 @@ def test_average_has_the_weights_of_polynomial_decay(power):
     rough = (np.arange(1, len(params_of_steps) + 1) + power / 2) ** power
     assert np.abs(weights - rough / rough.sum()).max() < 0.1 * weights.max()
     expected = jax.tree.map(lambda *leaves: np.tensordot(weights, np.float64(leaves), 1), *params_of_steps)
+    assert_same(state.average, expected, rtol=0, atol=1e-6)
+
+
+def test_later_every_eighth_step_counts_for_eight():
+    _, state = descend(with_averaging(ADAM, 10.0), steps=261)
+    assert_same(state.average, descend(with_averaging(ADAM, 10.0), steps=256)[1].average, rtol=0, atol=0)
+    params_of_steps, state = descend(with_averaging(ADAM, 10.0), steps=270)
+    expected = params_of_steps[0]
+    for count in range(1, 265):
+        new = params_of_steps[count - 1 if count <= 256 else 263]
+        expected = jax.tree.map(lambda old, new, count=count: old + 11 / (10 + count) * (new - old), expected, new)
     assert_same(state.average, expected, rtol=0, atol=1e-6)
 
 
