@@ -162,13 +162,13 @@ class HashGrid(linen.Module):
         # The logarithm of a density is up to 15, where bfloat16 has steps of 1/16.
         outputs = {"dtype": None if self.compute_dtype is None else table.dtype}
         geometry = Dense(1 + self.geometry_features, name="density", **outputs)(hidden)
-        density, inputs = geometry[0], [self._rounded(geometry[1:])]
+        density, hidden = geometry[0], self._rounded(geometry[1:])
         if self.use_viewdirs:
             directions = jnp.broadcast_to(harmonics(viewdirs), (*shape, 9))
-            inputs.append(self._rounded(directions.reshape(-1, 9).T))
+            hidden = jnp.concatenate([hidden, self._rounded(directions.reshape(-1, 9).T)])
         for layer in range(self.view_depth):
-            inputs = [jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(*inputs))]
-        rgb = Dense(3, name="rgb", **outputs)(*inputs)
+            hidden = jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(hidden))
+        rgb = Dense(3, name="rgb", **outputs)(hidden)
         return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 

@@ -70,7 +70,8 @@ def importance_samples(
     kept = occupied & ~(in_front > max_optical_depth)
     count = kept.sum(axis=-1, dtype=jnp.int32)
     number = divide_slots(count, max_samples)
-    weights = jnp.where(kept, jnp.exp(-in_front) * -jnp.expm1(-optical_depth), 0)
+    transmittance = jnp.exp(-in_front)
+    weights = jnp.where(kept, transmittance - transmittance * jnp.exp(-optical_depth), 0)
     weights = jnp.where((number < count)[:, None], (1 - uniform_fraction) * weights, 0)
     even = (1 - weights.sum(axis=-1)) / jnp.maximum(count, 1)
     probability = weights + even[:, None]
