@@ -31,6 +31,9 @@ _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
+# Space is not contracted as far as the cameras, so that cells near them are small: large ones fill with fog. But the
+# cube is at most this many times as large as that which most images show: what they look at gets fewer cells then.
+_MAX_INNER_BOX = 3.0
 _MAX_STATED_BOX = 3.0  # times the box of contraction; a stated box that is larger is no better than contraction
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
@@ -310,6 +313,7 @@ class _LookAt:
             cameras are at one point, or there is one view, no such point lies in front of the cameras; the
             center is then the mean of the middles of the views' depth ranges.
         distance: [V] from the cameras to the center.
+        reach: half the side of the cube around the center that holds nine in ten cameras.
         half_size: [V, 2] half the width and height of the images at that distance.
         footprint: the size of a pixel at that distance, the median over views.
     """
@@ -325,13 +329,14 @@ class _LookAt:
         if spread < 1e-6 or np.median(self.distance) < 1e-3 * np.median(np.where(near > 0, near, middle)):
             self.center = (eyes - middle[:, None] * axes).mean(axis=0)
             self.distance = middle
+        self.reach = float(np.quantile(np.abs(eyes - self.center).max(axis=-1), 0.9))
         focal = np.asarray(views.cameras.focal, np.float64)
         self.half_size = self.distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / focal
         self.footprint = float(np.median(self.distance / focal[:, 0]))
 
     @property
     def inner_half_side(self):
-        """Half the side of the cube that most images show completely; it gets most cells."""
+        """Half the side of the cube that most images show completely."""
         return float(np.median(self.half_size.min(axis=1)))
 
 
@@ -358,7 +363,7 @@ def _box(views, use_alpha, *, ndc, contracted):
         return *np.asarray(views.box, np.float64), "as the dataset states"
     look_at = _LookAt(views)
     if contracted:
-        half = look_at.inner_half_side
+        half = min(max(look_at.inner_half_side, look_at.reach), _MAX_INNER_BOX * look_at.inner_half_side)
         return look_at.center - 2 * half, look_at.center + 2 * half, f"not contracted within {half:.2g} of its centre"
     half = look_at.half_size.max()
     lower, upper = look_at.center - half, look_at.center + half

@@ -400,13 +400,32 @@ def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
         longest = max(np.subtract(got.occupancy.upper, got.occupancy.lower))
         return got.hash_grid.resolutions, got.occupancy.resolution, round(longest / got.occupancy.step_size)
 
-    for contracted, finest in ((False, (34, 69, 256, 512)), (True, (69, 137, 512, 512))):
+    for contracted, finest in ((False, (34, 69, 256, 512)), (True, (181, 362, 512, 512))):
         for factor, vertices in zip((1, 2, 16, 32), finest, strict=True):
             resolutions, cells, steps = sizes(contracted, factor)
             assert len(resolutions) == 4 + (contracted or factor == 32)
             assert resolutions[-1] == pytest.approx(vertices, abs=1)
             assert all(2 * a in (b, b - 1) for a, b in itertools.pairwise(resolutions))
             assert cells == min(resolutions[-1], 128 if contracted else 96) and steps == min(resolutions[-1], 144)
+
+
+@pytest.mark.parametrize("zoom, expected", [(1.0, "cameras"), (4.0, "three times"), (0.2, "images")])
+def test_space_is_not_contracted_around_the_cameras(views, zoom, expected):
+    cameras = dataclasses.replace(views.cameras, focal=np.float32(zoom * np.asarray(views.cameras.focal)))
+    views = dataclasses.replace(views, cameras=cameras)
+    section = resolve(auto_config(use_alpha=False, contracted=True), views).config.occupancy
+    lower, upper = np.float64(section.lower), np.float64(section.upper)
+    inner = (upper - lower) / 4  # half the side of the part that is not contracted
+    eyes, middle = np.asarray(cameras.to_world)[:, :, 3], (lower + upper) / 2
+    inside = (np.abs(eyes - middle) <= inner * (1 + 1e-4)).all(axis=-1).mean()
+    distance = np.median(np.linalg.norm(eyes - middle, axis=-1))
+    seen = distance * np.min(views.size[0]) / 2 / cameras.focal[0, 0]
+    if expected == "cameras":
+        assert 0.8 < inside < 1 and seen < inner[0] < 3 * seen
+    elif expected == "images":
+        assert inside == 1 and inner == pytest.approx(seen, rel=0.1)
+    else:
+        assert inside < 0.5 and inner == pytest.approx(3 * seen, rel=0.1)
 
 
 def test_box_holds_all_matter_of_the_embedded_scene(resolved):
