@@ -298,7 +298,7 @@ class _Pace:
             return self._data
         by_steps = min((step - 1) / self._options.lr_steps, 1.0)
         by_time = min(self._clock.seconds() / self._options.max_seconds, 1.0)
-        ratio, power = self._options.lr_final / self._options.lr_init, self._options.get("lr_decay_power", 1.0)
+        ratio, power = self._options.lr_final / self._options.lr_init, self._options.lr_decay_power
         self.scale = ratio ** (max(by_steps, by_time) ** power - by_steps**power)
         return self._data._replace(lr_scale=devices.place(np.float32(self.scale), self._data.lr_scale.sharding))
 

@@ -18,7 +18,7 @@ def test_it_reaches_its_end_when_the_time_or_the_steps_do(seconds, step, fractio
     options = ConfigDict({"lr_init": 1e-2, "lr_final": 1e-4, "lr_steps": 100, "lr_decay_power": power})
     options.update({"max_seconds": 10.0, "warmup_steps": 0})
     data = TrainData(None, None, None, None, lr_scale=jax.device_put(np.float32(1)))
-    pace = _Pace(SimpleNamespace(train=options), SimpleNamespace(seconds=lambda: seconds), data)
+    pace = _Pace(SimpleNamespace(train=SimpleNamespace(**options)), SimpleNamespace(seconds=lambda: seconds), data)
     rate = float(pace.data_of(step).lr_scale) * float(learning_rate(options)(step - 1))
     assert rate == pytest.approx(1e-2 * 0.01 ** (fraction**power), rel=1e-5)
 
