@@ -19,7 +19,8 @@ _MAX_RMS = 3.0
 # AdamW's decay of all other parameters. Without it a hash grid's entries and the weights of the colour's output grew
 # steadily at a constant learning rate, until lego collapsed after 16,000 to 22,000 steps.
 _DECAY = 0.05
-# The average takes every step's parameters at first, then those of every n-th step: a pass over a large table fewer.
+# Up to the first number of steps the average takes the parameters of every step, and then those of every eighth: adding
+# them is a pass over the whole table.
 _AVERAGE_ALL, _AVERAGE_EVERY = 256, 8
 _ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one, they compile once, as a loop
 
