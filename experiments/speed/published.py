@@ -53,6 +53,8 @@ RENDERING = [  # seconds of an 800x800 frame, but where another size is said
     _entry("jaxngp", None, 3.75, "GTX 1080 Ti", "1080p, of 288 frames", "jaxngp README"),
     _entry("nerf-pytorch", None, 4870, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
     _entry("JaxNeRF", None, 3840, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
+    _entry("TensoRF", None, 6.8, "one core, AVX2", "lego, 800x800, trained at 100x100", _PART_E, "measured by hand"),
+    _entry("OpenSplat", None, 0.6, "one core, AVX2", "lego, 800x800, trained at 100x100", _PART_E, "measured by hand"),
 ]
 
 # Peers on one core of the kind of machine that `speed_vs_error.py` was run on, process CPU seconds, one
