@@ -3,8 +3,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
-# Compiled programs, the small ones too, are kept in build/, so that tests compile each only once. A worker that crashes
-# is not replaced: pytest-xdist can wait for the new one for ever.
+# Compiled programs, the small ones too, are kept in build/, so that tests compile each only once; if JAX warns of one that
+# it cannot read, after a test was killed, call make clean. A worker that crashes is not replaced: pytest-xdist can wait
+# for the new one for ever.
 PYTEST := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/build/compiled JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 $(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile --max-worker-restart=0
 
 .PHONY: demo view test test-slow test-extra docs lint clean

@@ -141,14 +141,15 @@ def get_config():
                 "steps_per_dispatch": auto(int),  # training steps between which the host does nothing
                 "batching": "all_images",  # "all_images", or "single_image": each step draws its rays from one view
                 "parallel": "auto",  # "jit", "sharded", "pmap"; "auto": jit on one device, otherwise sharded
-                "max_steps": auto(int, 200_000),  # auto: by the size of the images; without limit if time is limited
+                # auto: by the size of the images and batch_size; without limit if time is limited
+                "max_steps": auto(int, 200_000),
                 # s of training, without compilation; 0: no limit. The learning rate then reaches its end when the time
                 # does, so that the run depends on the clock.
                 "max_seconds": 0.0,
                 "lr_init": 5e-4,  # Adam
                 "lr_final": 5e-5,  # reached at lr_steps
-                # The rate is lr_init (lr_final / lr_init)^((step / lr_steps)^lr_decay_power). 1: exponential decay, as in
-                # the paper; larger: the rate stays high for most of the run and then decreases quickly.
+                # The rate is lr_init (lr_final / lr_init)^((step / lr_steps)^lr_decay_power). 1: exponential decay, as
+                # in the paper; larger: the rate stays high for most of the run and then decreases quickly.
                 "lr_decay_power": 1.0,
                 "lr_steps": auto(int, 200_000),  # the run may end earlier or later; auto: max_steps
                 "warmup_steps": 0,  # the learning rate rises linearly from 0

@@ -25,8 +25,10 @@ def compiled_once(tmp_path_factory):
 @pytest.fixture(scope="module")
 def unoptimized(compiled_once):
     """Switches most optimizations off, here and in child processes: compiling is faster and runs are short."""
+    jax.clear_caches()  # JAX would take what it has compiled with the other option
     with _options(jax_disable_most_optimizations=True):
         yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Measures error against seconds: of training, of rendering, and how near both come to the machine's peak.
+"""Measures error against seconds, of training and of rendering, and where the time of a training step goes.
 
     JAXNERF_SCENES=... python experiments/speed/speed_vs_error.py --out=DIR \
         [--parts=training,rendering,limits,cost,parts] [--curves=grid,dense] \
@@ -160,7 +160,11 @@ def _others(heads, entries, **formats):
     """Returns the lines of published entries; formats are those of their numbers."""
     keys = ("name", "what", *formats, "hardware", "kind", "source")
     rows = [[formats.get(key, "{}").format(entry[key]) for key in keys] for entry in entries]
-    return ["Published by others, on their hardware; not measured here:", "", *common.markdown(heads, rows)]
+    return [
+        "Published by others, on their hardware, or measured by hand, as the kind says:",
+        "",
+        *common.markdown(heads, rows),
+    ]
 
 
 def _reached(runs, bar):

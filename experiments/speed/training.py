@@ -33,7 +33,7 @@ _NO_UPDATES = {
     "train.batch_size": 43,
 }
 # The learning rate that lego_mlp_fast.py had before Muon.
-_ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4}
+_ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4, "train.lr_decay_power": 1.0}
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
 CURVES = {
     "grid": _curve("lego_fast", (10, 15, 30, 60, 120, 300)),

@@ -28,7 +28,7 @@ from jaxnerf.runtime import cli
 
 DRIFT = 50  # steps
 # Taken from default.py, the paper's, for embedded_small.py, whose learning rate is sixteen times as high.
-_PAPER_ADAM = ("lr_init", "lr_final", "lr_steps", "warmup_steps", "beta2")
+_PAPER_ADAM = ("lr_init", "lr_final", "lr_decay_power", "lr_steps", "warmup_steps", "beta2")
 _DEVICES = "--xla_force_host_platform_device_count="
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs.", required=True)
 _STEPS = flags.DEFINE_integer("steps", 600, "Steps of every run.", lower_bound=DRIFT)

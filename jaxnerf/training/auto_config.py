@@ -23,7 +23,7 @@ from jaxnerf.training.dead_networks import CHECK_EVERY
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of the last of four levels
-# Levels of the hash grid. Contracted space, whose box is twice as large, gets one more, and so do images of at least
+# Levels of the hash grid. Contracted space, whose box is larger, gets one more, and so do images of at least
 # _FIVE_LEVELS_SIDE px a side. At 400 px a fifth level gains less than the rays that it costs in the first minutes.
 _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a hash grid's level per pixel of an image's side; finer images show what collisions of the hash cost.
@@ -34,7 +34,8 @@ _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the roo
 # Space is not contracted as far as the cameras, so that cells near them are small: large ones fill with fog. But the
 # cube is at most this many times as large as that which most images show: what they look at gets fewer cells then.
 _MAX_INNER_BOX = 3.0
-_MAX_STATED_BOX = 3.0  # times the box of contraction; a stated box that is larger is no better than contraction
+# Times twice the side of the cube that most images show; a stated box that is larger is no better than contraction.
+_MAX_STATED_BOX = 3.0
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
@@ -191,7 +192,7 @@ def _inferring(lines: list[str]) -> Callable[..., None]:
 
 
 def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
-    """Fills the sizes of grids, networks and training into a config; returns lines."""
+    """Fills the sizes of grids and networks into a config; returns lines."""
     lines: list[str] = []
     infer = _inferring(lines)
     section, ndc = config.occupancy, config.data.ndc
@@ -260,7 +261,7 @@ def _resolve_schedule(config: ConfigDict, views: Views, lines: list[str], platfo
         filling = devices.profile_of(platform).samples_per_step / config.occupancy.pool_samples_per_ray
         rays, why = 2 ** max(math.floor(math.log2(filling)), 0), "they keep this device busy"
     infer(train, "batch_size", rays, f"batch         {rays:,} rays per step: {why}")
-    planned = round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5 * (rays or train.batch_size) / train.batch_size)
+    planned = max(round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5 * rays / train.batch_size), 1)
     if train.get("max_seconds"):
         infer(
             train, "max_steps", UNLIMITED_STEPS, f"training      ends after train.max_seconds = {train.max_seconds:g}"
@@ -362,8 +363,12 @@ def _box(views, use_alpha, *, ndc, contracted):
         return *np.asarray(views.box, np.float64), "as the dataset states"
     look_at = _LookAt(views)
     if contracted:
-        half = min(max(look_at.inner_half_side, look_at.reach), _MAX_INNER_BOX * look_at.inner_half_side)
-        return look_at.center - 2 * half, look_at.center + 2 * half, f"not contracted within {half:.2g} of its centre"
+        seen = look_at.inner_half_side
+        half, why = max((seen, "as far as most images show"), (look_at.reach, "where the cameras are"))
+        if half > _MAX_INNER_BOX * seen:
+            half, why = _MAX_INNER_BOX * seen, f"{_MAX_INNER_BOX:g} times as far as most images show"
+        why = f"not contracted within {half:.2g} of its centre, {why}"
+        return look_at.center - 2 * half, look_at.center + 2 * half, why
     half = look_at.half_size.max()
     lower, upper = look_at.center - half, look_at.center + half
     if not use_alpha:

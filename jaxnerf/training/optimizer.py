@@ -172,7 +172,7 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
         def add(_, average):
             new = optax.apply_updates(params, updates)
             fraction = 1 - kept.prod()
-            return jax.tree.map(lambda old, new: old + fraction * (new - old), average, new)
+            return jax.tree.map(lambda old, new: old + fraction.astype(old.dtype) * (new - old), average, new)
 
         # A loop of at most one iteration changes the average in place; a branch would copy it.
         due = each | (count % _AVERAGE_EVERY == 0)

@@ -54,6 +54,12 @@ def claim(workdir: str | os.PathLike, config: ConfigDict) -> None:
         old, new = _flat(read_config(workdir)), _flat(config)
         keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
         fixed = [key for key in keys if not key.startswith(CHANGEABLE)]
+        unknown = [key for key in fixed if key not in old]
+        if unknown:
+            raise ValueError(
+                f"{workdir}: belongs to a run of another version, whose config lacks {', '.join(unknown[:3])}; resume "
+                "it with that version, or give another --workdir. It can still be evaluated, rendered and exported"
+            )
         if fixed:
             shown = ", ".join(f"{key} {old.get(key)!r} -> {new.get(key)!r}" for key in fixed[:3])
             more = f" and {len(fixed) - 3} more" if len(fixed) > 3 else ""

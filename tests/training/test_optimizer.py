@@ -165,6 +165,14 @@ def test_average_has_the_weights_of_polynomial_decay(power):
     assert_same(state.average, expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
+def test_the_average_has_the_type_of_the_parameters(dtype):
+    params = {"a": jnp.ones(3, dtype)}
+    optimizer = with_averaging(ADAM, 10.0)
+    _, state = jax.jit(optimizer.update)(params, optimizer.init(params), params)
+    assert state.average["a"].dtype == dtype and jnp.isfinite(state.average["a"]).all()
+
+
 def test_later_every_eighth_step_counts_for_eight():
     _, state = descend(with_averaging(ADAM, 10.0), steps=261)
     assert_same(state.average, descend(with_averaging(ADAM, 10.0), steps=256)[1].average, rtol=0, atol=0)

@@ -104,10 +104,19 @@ def test_a_config_to_resume_has_the_types_of_its_fields(trained, tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(saved))
     config = workdir.config_to_resume(tmp_path)
     assert config.train.max_reinits == 10 and config.train.max_steps == 20
+    workdir.claim(tmp_path, config)  # finished steps do not depend on this field
     config.hash_grid.resolutions = "auto"
     config.train.lr_init = 1
     with pytest.raises(TypeError):
         config.train.max_steps = 1.5
+
+
+def test_a_run_of_a_version_with_another_schedule_is_not_resumed(trained, tmp_path):
+    saved = json.loads((trained / "config.json").read_text())
+    del saved["train"]["lr_decay_power"]
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    with pytest.raises(ValueError, match="of another version, whose config lacks train.lr_decay_power; resume it"):
+        workdir.claim(tmp_path, workdir.config_to_resume(tmp_path))
 
 
 @pytest.mark.slow
