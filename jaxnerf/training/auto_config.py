@@ -262,12 +262,10 @@ def _resolve_schedule(config: ConfigDict, views: Views, lines: list[str], platfo
         rays, why = 2 ** max(math.floor(math.log2(filling)), 0), "they keep this device busy"
     infer(train, "batch_size", rays, f"batch         {rays:,} rays per step: {why}")
     planned = max(round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5 * rays / train.batch_size), 1)
+    steps, why = planned, f"{planned:,} steps of {train.batch_size:,} rays, for images of {side:.0f} x {side:.0f} px"
     if train.get("max_seconds"):
-        infer(
-            train, "max_steps", UNLIMITED_STEPS, f"training      ends after train.max_seconds = {train.max_seconds:g}"
-        )
-    why = f"{planned:,} steps of {train.batch_size:,} rays, for images of about {side:.0f} x {side:.0f} px"
-    infer(train, "max_steps", planned, f"training      {why}")
+        steps, why = UNLIMITED_STEPS, f"ends after train.max_seconds = {train.max_seconds:g}"
+    infer(train, "max_steps", steps, f"training      {why}")
     decay_steps, end = train.max_steps, f"step {train.max_steps:,}"
     if train.max_steps >= UNLIMITED_STEPS and jax.process_count() == 1:
         end = "the end"

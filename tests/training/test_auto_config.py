@@ -339,7 +339,7 @@ def test_larger_images_are_trained_on_longer(views):
     config.train.max_steps = 7
     got, _, lines = resolve(config, views)
     assert (got.train.max_steps, got.train.lr_steps) == (7, 7)
-    assert not any(line.startswith("training") and "steps, for images" in line for line in lines)
+    assert not any(line.startswith("training") and "rays, for images" in line for line in lines)
 
 
 @pytest.mark.parametrize("platform, auto_rays", [("cpu", 300), ("gpu", 2**14)])
