@@ -174,7 +174,8 @@ def get_config():
             "eval": {
                 "split": "test",
                 "chunk": auto(int),  # rays per rendered chunk
-                "sample_multiplier": 1.0,  # samples per ray, divided by those of training
+                # Samples per ray, divided by those of training. auto: 1.5, or 2.25 for images from 600 px a side on.
+                "sample_multiplier": auto(float, 1.0),
                 "bake_occupancy": False,  # render a hierarchical model with an occupancy grid of its visible density
                 "early_stop_eps": 1e-3,  # with a grid: transmittance below which a ray is terminated
                 "max_samples": auto(int),  # with a grid: size of the sample buffer

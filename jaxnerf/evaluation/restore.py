@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 from ml_collections import ConfigDict
 
 from jaxnerf.core.types import Rays, Rendering, SceneFn, Views
@@ -109,9 +108,9 @@ def _restore(workdir, config, data_dir, settings, *, crop):
 
     @functools.cache
     def template():
-        # Only the shapes matter, and zeros need no compilation.
         shapes = jax.eval_shape(lambda: create_state(trained, experiment.optimizer, experiment.seed))
-        return jax.tree.map(lambda leaf: jax.device_put(np.zeros(leaf.shape, leaf.dtype)), shapes)
+        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), shapes)
 
     def render(variables, rays, **options):
         return model.view(*variables, rays, **options)

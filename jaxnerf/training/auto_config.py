@@ -29,6 +29,9 @@ _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a hash grid's level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
+# Samples of images over those of training: no jitter averages over a step in rendering, so steps are shorter. With
+# five levels, whose features are twice as fine, they are shorter still.
+_SAMPLE_MULTIPLIER, _FINE_SAMPLE_MULTIPLIER = 1.5, 2.25
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 # Space is not contracted as far as the cameras, so that cells near them are small: large ones fill with fog. But the
@@ -223,6 +226,9 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     step_size = longest / min(finest, _MAX_STEPS_PER_SIDE)
     line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
     infer(section, "step_size", step_size, line, **use_box)
+    multiplier = _FINE_SAMPLE_MULTIPLIER if side >= _FIVE_LEVELS_SIDE else _SAMPLE_MULTIPLIER
+    line = f"images        {multiplier:g} times the samples of training, for images of {side:.0f} x {side:.0f} px"
+    infer(config.eval, "sample_multiplier", multiplier, line)
     open_box = not (use_alpha or section.contracted or ndc)
     resolution = min(finest, _MAX_OPEN_RESOLUTION if open_box else _MAX_RESOLUTION)
     infer(section, "resolution", resolution, f"grid          {resolution} cells along the longest side", **use_box)

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import jax
 import pytest
 
 import captures
@@ -54,6 +55,15 @@ def test_another_folder_of_the_same_dataset_replaces_that_of_the_run(scene, tmp_
         restore_run(tmp_path / "run").experiment.load_split("train")
     run = restore_run(tmp_path / "run", data_dir=str(moved / "scene"))
     assert len(run.experiment.load_split("train").offset) == 7
+
+
+def test_a_restored_run_keeps_only_what_it_renders_with(trained):
+    """The state of training, several times as large, is gone after it was read, and no array of its shapes remains."""
+    run = restore_run(trained)
+    before = {id(array) for array in jax.live_arrays()}
+    kept = run.variables(20)
+    new = [array for array in jax.live_arrays() if id(array) not in before]
+    assert 0 < sum(array.nbytes for array in new) <= sum(leaf.nbytes for leaf in jax.tree.leaves(kept))
 
 
 @pytest.mark.slow

@@ -49,6 +49,7 @@ AUTO_FIELDS = {
     "train.steps_per_dispatch": 8,
     "train.max_steps": 300,
     "train.lr_steps": 300,
+    "eval.sample_multiplier": 3,
     "eval.chunk": 512,
     "eval.max_samples": 2048,
 }
@@ -386,6 +387,16 @@ def test_the_hash_grids_table_follows_the_images_and_a_large_one_gets_more_rays(
     assert any(f"at most {rows:,} rows per level" in line for line in lines)
     config.field, config.fine.num_freqs = "mlp", 4  # has no table
     assert resolve(config, larger, platform="cpu").config.train.batch_size == 300
+
+
+@pytest.mark.parametrize("factor, multiplier", [(1, 1.5), (16, 1.5), (26, 2.25), (99, 2.25)])
+def test_frames_of_large_images_get_more_samples(views, factor, multiplier):
+    larger = dataclasses.replace(views, size=factor * views.size)
+    config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    config.eval.sample_multiplier = AUTO
+    got, _, lines = resolve(config, larger)
+    assert got.eval.sample_multiplier == multiplier
+    assert any(line.startswith(f"images        {multiplier:g} times the samples") for line in lines)
 
 
 def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
