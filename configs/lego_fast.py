@@ -22,5 +22,6 @@ def get_config():
     train.log_every, train.save_every = 200, 4000
     # More rays with fewer samples, most of them near surfaces, learn faster than fewer rays with all samples.
     config.occupancy.pool_samples_per_ray, config.occupancy.occlusion_start_step = 5.0, 300
-    config.eval.sample_multiplier, config.eval.early_stop_eps = "auto", 0.003
+    config.eval.sample_multiplier = "auto"
+    config.eval.early_stop_eps = 0.003  # within 0.01 dB of the PSNR at 0.001, and faster for large images
     return config

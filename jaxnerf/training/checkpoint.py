@@ -53,7 +53,7 @@ class Checkpoints:
                 ) from error
 
     def load(self, step: int, like: TrainState) -> TrainState:
-        """Returns the state at a step, with the shapes and shardings of `like`.
+        """Returns the state at a step, with the shapes and shardings of `like`, which may be one of ShapeDtypeStruct.
 
         Raises:
             ValueError: if the checkpoint does not fit, or is not what was saved; names it.
