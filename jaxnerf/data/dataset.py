@@ -20,7 +20,7 @@ from jaxnerf.data.readers import base, blender
 from jaxnerf.data.readers.base import fingerprint
 from jaxnerf.runtime.config_fields import AUTO, is_auto
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None, "mean": None}
 WORLDS = {
     "file": "cameras stay as in the file",
     "forward": "all cameras look in one direction, which becomes -z",
@@ -106,8 +106,8 @@ def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
             kind = "forward" if forward else "around"
             infer("world", kind, f"world         {kind}: {WORLDS[kind]}")
         if is_auto(data.background):
-            color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
-            infer("background", color, f"background    {color}")
+            color = "white" if image_files.has_alpha(capture.frames[0].image) else "mean"
+            infer("background", color, None if color == "mean" else f"background    {color}")  # auto_config says more
         infer("fingerprint", fingerprint(capture))
     infer("ndc", data.world == "forward", f"NDC           {'on' if data.world == 'forward' else 'off'}")
     return data, lines
@@ -185,10 +185,31 @@ def dataset_folder(name: str) -> pathlib.Path:
 
 
 def background_of(data: ConfigDict) -> tuple[float, float, float] | None:
-    """Returns the colour behind alpha and behind the scene, or None."""
+    """Returns the colour behind alpha, or None where alpha is dropped."""
     if data.background not in BACKGROUNDS:
         raise ValueError(f"data.background is {data.background!r}, expected one of {sorted(BACKGROUNDS)}; correct it")
     return BACKGROUNDS[data.background]
+
+
+def color_behind(data: ConfigDict) -> tuple[float, float, float] | None:
+    """Returns the colour behind the scene of a resolved data section; None: black."""
+    if data.background != "mean":
+        return background_of(data)
+    if is_auto(data.background_color):
+        raise ValueError(
+            "data.background_color is 'auto', and data.background 'mean'; resolve the config against a dataset, or set "
+            "red, green and blue"
+        )
+    return tuple(data.background_color)
+
+
+def mean_color(views: Views) -> tuple[float, float, float]:
+    """Returns the mean colour of the pixels in the views' mask, alpha dropped, in [0, 1]; of at most 2^20 of them."""
+    every = -(-len(views.pixels) // 2**20)
+    pixels = np.asarray(views.pixels[::every, :3])
+    if views.mask is not None and np.any(views.mask[::every]):
+        pixels = pixels[np.asarray(views.mask[::every])]
+    return tuple(float(value) for value in (pixels / np.iinfo(pixels.dtype).max).mean(axis=0))
 
 
 def held_out(count: int, every: int) -> Int[np.ndarray, " N"]:

@@ -110,7 +110,7 @@ def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
         camera = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], views.cameras)
         height, width = (int(side) for side in views.size[index])
         pinhole = Camera(to_world=poses[index], focal=camera.focal, center=camera.center, height=height, width=width)
-        image = rasterize(gaussians, pinhole, views.background)
+        image = rasterize(gaussians, pinhole, run.experiment.background)
         if camera.distortion is not None:
             pixels = undistort(camera, pixel_grid(height, width))[0] * camera.focal + camera.center - 0.5
             rows = np.asarray(pixels).reshape(-1, 2).T[::-1]

@@ -55,6 +55,8 @@ DEVICE_FIELDS = (
     "eval.max_samples",
 )
 
+_ADDED = {"data.background_color": ()}  # fields that workdirs of older versions lack, and what these versions did
+
 
 class Resolved(NamedTuple):
     """A resolved config.
@@ -88,6 +90,7 @@ def resolve(config: ConfigDict, views: Views | None = None, *, platform: str | N
     config = copy.deepcopy(config)
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
+    _resolve_background(config, views, lines)
     lines = lines + _resolve_sizes(config, views)
     _resolve_schedule(config, views, lines, platform or jax.default_backend())
     views = _resolve_near(config, views, lines)
@@ -163,6 +166,9 @@ def fill_from(config: ConfigDict, resolved: ConfigDict) -> ConfigDict:
             ours, theirs = ours[section], theirs.get(section, {})
         if field not in theirs and name in DEVICE_FIELDS:  # of an older version, which lacks some
             continue
+        if field not in theirs and name in _ADDED:
+            ours[field] = _ADDED[name]
+            continue
         if field not in theirs:
             raise ValueError(f"{name} is 'auto', and the config of the workdir has no such field; set a value")
         ours[field] = theirs[field]
@@ -192,6 +198,18 @@ def _inferring(lines: list[str]) -> Callable[..., None]:
                 lines.append(line)
 
     return infer
+
+
+def _resolve_background(config: ConfigDict, views: Views, lines: list[str]) -> None:
+    """Fills the colour behind a scene whose images have no alpha into a config.
+
+    Distant walls and sky are often bright and show little, so training leaves them partly transparent. With black
+    behind them, bright fog in front of single cameras took their place.
+    """
+    mean = config.data.background == "mean"
+    color = tuple(round(value, 3) for value in dataset.mean_color(views)) if mean else ()
+    line = f"background    {color} behind the scene, the mean colour of the training images"
+    _inferring(lines)(config.data, "background_color", color, line, used=mean)
 
 
 def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:

@@ -49,6 +49,7 @@ class Experiment(NamedTuple):
         seed: of everything random.
         pixel_offset: px, from a pixel's index to the point that its ray goes through.
         ndc: whether view_rays returns rays in normalised device coordinates.
+        background: [3] the colour behind the scene; None: black.
         train, eval: the config's sections.
         conventions: see `conventions`.
     """
@@ -67,6 +68,7 @@ class Experiment(NamedTuple):
     seed: int
     pixel_offset: float
     ndc: bool
+    background: tuple[float, float, float] | None
     train: SimpleNamespace
     eval: SimpleNamespace
     conventions: dict[str, Any]
@@ -115,6 +117,7 @@ def build(config: ConfigDict) -> Experiment:
         seed=config.seed,
         pixel_offset=config.data.pixel_offset,
         ndc=config.data.ndc,
+        background=dataset.color_behind(config.data),
         train=SimpleNamespace(**config.train),
         eval=SimpleNamespace(**config.eval),
         conventions=conventions(config.data),
@@ -142,7 +145,7 @@ def build_cameras(config: ConfigDict) -> CameraParameters | None:
         exposure=section.exposure,
         refine=section.refine,
         view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
-        background=dataset.background_of(config.data),
+        background=dataset.color_behind(config.data),
     )
 
 
@@ -256,7 +259,7 @@ def _context(config):
     return SamplerContext(
         make_field=functools.partial(_make_field, config, sections, box),
         sections=sections,
-        background=dataset.background_of(config.data),
+        background=dataset.color_behind(config.data),
     )
 
 

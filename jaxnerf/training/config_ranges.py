@@ -77,7 +77,8 @@ _CHOICES = {
 _OPTIONAL = (
     "cameras occupancy.uniform_fraction occupancy.near_gradient_distance occupancy.min_views train.preview_every "
     "train.max_to_keep train.max_nonfinite train.max_seconds eval.at_end eval.summary_seconds occupancy.update_chunk "
-    "hash_grid.compute_dtype train.steps_per_dispatch train.cpu_batch_size train.lr_decay_power"
+    "hash_grid.compute_dtype train.steps_per_dispatch train.cpu_batch_size train.lr_decay_power "
+    "data.background_color"
 ).split()
 
 # Sections that become the arguments of one function, which takes no others.
@@ -169,7 +170,16 @@ def _numbers(value):
 
 
 def _check_lists(fields):
-    """Checks the box and the levels."""
+    """Checks the colour behind the scene, the box and the levels."""
+    color = fields.get("data.background_color", ())
+    lengths = (3,) if fields["data.background"] == "mean" else (0, 3)
+    if not is_auto(color) and not (
+        len(color) in lengths and all(isinstance(each, int | float) and 0 <= each <= 1 for each in color)
+    ):
+        raise ValueError(
+            f"--config.data.background_color is {short_repr(color)}, expected red, green and blue in [0, 1], or () "
+            "where data.background is not 'mean'; correct it"
+        )
     for name in ("occupancy.lower", "occupancy.upper"):
         if not (is_auto(fields[name]) or (len(fields[name]) == 3 and len([*_numbers(fields[name])]) == 3)):
             found = short_repr(fields[name])

@@ -43,6 +43,7 @@ AUTO_FIELDS = {
     "occupancy.min_views": 2,
     "occupancy.update_chunk": 4096,
     "data.near": 0.5,
+    "data.background_color": (0.5, 0.4, 0.3),
     "cameras.num_images": 60,
     "train.batch_size": 512,
     "train.microbatch_size": 128,
@@ -162,6 +163,42 @@ def test_config_of_the_paper_is_resolved_and_logs_nothing_about_a_box(views):
     assert baked.occupancy == got.occupancy and any(line.startswith("box ") for line in lines)
 
 
+def test_rays_that_hit_nothing_have_the_mean_colour_of_images_without_alpha(views):
+    """Black behind a bright scene would be replaced by fog in front of the cameras."""
+    given, rgb = auto_config(), np.random.default_rng(0).integers(0, 256, (*views.pixels.shape[:1], 3), np.uint8)
+    given.data.background, rgb[..., 0] = "mean", 51
+    masked = np.arange(len(rgb)) % 2 == 0
+    rgb[~masked] = 255
+    shown = dataclasses.replace(views, pixels=rgb, mask=masked)
+    for value, expected in ((AUTO, rgb[masked].mean(axis=0) / 255), ((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))):
+        given.data.background_color = value
+        resolved = resolve(given, shown)
+        np.testing.assert_allclose(resolved.config.data.background_color, expected, atol=5e-4)
+        assert ("mean colour" in "".join(resolved.lines)) == (value == AUTO)
+        experiment = build(resolve_for_device(resolved.config)[0])
+        rays = view_rays(shown, 0, np.float32([[1.5, 1.5]]))
+        grid = experiment.model.grid_schedule.create(np.zeros(experiment.model.grid_schedule.shape, bool))
+        image = experiment.model.view(experiment.model.init(jax.random.key(0)), grid, rays)
+        np.testing.assert_allclose(image.rgb[0], experiment.background, atol=1e-6)
+        np.testing.assert_allclose(experiment.background, expected, atol=5e-4)
+
+
+@pytest.mark.parametrize("background, color", [("mean", ()), ("mean", (0.5, 0.5)), ("white", (0.5, 1.5, 0.5))])
+def test_a_background_colour_is_red_green_and_blue(views, background, color):
+    config = auto_config()
+    config.data.background, config.data.background_color = background, color
+    with pytest.raises(ValueError, match="data.background_color is .*expected red, green and blue"):
+        resolve(config, views)
+
+
+def test_a_workdir_of_a_version_without_a_background_colour_keeps_black(views):
+    config = auto_config()
+    older = resolve(config, views).config
+    with older.unlocked():
+        del older.data.background_color
+    assert fill_from(config, older).data.background_color == ()
+
+
 def test_explicit_values_do_not_change(views):
     given = auto_config()
     before = given.to_json_best_effort()
@@ -171,7 +208,7 @@ def test_explicit_values_do_not_change(views):
     names = ("contracted", "lower", "upper", "step_size", "resolution")
     names += ("near_gradient_distance", "min_views")
     expected = {"data.world", "data.fingerprint", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
-    expected |= {"data.near", "cameras.num_images", "losses.depth"}
+    expected |= {"data.near", "data.background_color", "cameras.num_images", "losses.depth"}
     assert changed == expected
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from jaxnerf.core.types import Views
-from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
@@ -130,8 +129,7 @@ def write_frames(
             distance = run.experiment.world_depth(posed, index, pixels, image.depth)
             planes = [np.asarray(distance, np.float32), output_images.to_8_bits(image.rgb)]
             if rgba:
-                background = dataset.BACKGROUNDS[run.experiment.conventions["background"]]
-                planes.append(output_images.straight_alpha(image.rgb, image.opacity, background))
+                planes.append(output_images.straight_alpha(image.rgb, image.opacity, run.experiment.background))
             for file, plane in zip(files[index], planes, strict=True):
                 output_images.write_image(file, plane)
             progress.show(done, f"frames of {target}")
