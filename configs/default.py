@@ -50,11 +50,12 @@ def get_config():
                 # near "auto": one small distance where the occupancy sampler contracts space; otherwise 0.
                 "near": auto(float),
                 "far": 0.0,
-                # The colour behind alpha and behind the scene: "white", "black", "none" (alpha is dropped, and black
-                # is behind the scene), "mean" (as "none", but background_color is behind the scene), or "auto": "white"
-                # for images with alpha, otherwise "mean".
+                # The colour behind alpha and behind the scene: "white", "black", "none" (alpha is dropped, and
+                # background_color is behind the scene) or "auto".
                 "background": "white",
-                "background_color": auto(tuple),  # red, green, blue in [0, 1]; auto: the mean of the training images
+                # Red, green, blue in [0, 1]; (): black. auto: the mean of the training images where space is
+                # contracted, otherwise black.
+                "background_color": auto(tuple),
                 "hold_out": 0,  # every n-th training view belongs to the split "held_out" instead; 0: none
                 "num_views": 0,  # number of training views to use, spread evenly over all of them; 0: all
                 "pixel_offset": 0.5,  # px; rays pass through pixel centres (0.5) or pixel corners (0)

@@ -42,6 +42,7 @@ def resolve_with_views(config, views):
 
 
 DATA = {"format": "blender", "factor": 1, "background": "none", "world": "file", "ndc": False, "fingerprint": ""}
+DATA["background_color"] = ()
 
 
 def fields(config):

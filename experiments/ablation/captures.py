@@ -30,7 +30,7 @@ from jaxnerf.training import metric_log
 
 VARIANTS = {
     "capture": {},
-    "black behind the scene": {"data.background": "none"},
+    "black behind the scene": {"data.background_color": ()},
     "depth off": {"losses.depth": 0.0},
     "depth 0.1 to the end": {"losses.depth": 0.1},
     "distortion 0.003": {"losses.distortion": 0.003},

@@ -20,7 +20,7 @@ from jaxnerf.data.readers import base, blender
 from jaxnerf.data.readers.base import fingerprint
 from jaxnerf.runtime.config_fields import AUTO, is_auto
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None, "mean": None}
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 WORLDS = {
     "file": "cameras stay as in the file",
     "forward": "all cameras look in one direction, which becomes -z",
@@ -106,8 +106,8 @@ def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
             kind = "forward" if forward else "around"
             infer("world", kind, f"world         {kind}: {WORLDS[kind]}")
         if is_auto(data.background):
-            color = "white" if image_files.has_alpha(capture.frames[0].image) else "mean"
-            infer("background", color, None if color == "mean" else f"background    {color}")  # auto_config says more
+            color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
+            infer("background", color, f"background    {color}")
         infer("fingerprint", fingerprint(capture))
     infer("ndc", data.world == "forward", f"NDC           {'on' if data.world == 'forward' else 'off'}")
     return data, lines
@@ -193,14 +193,14 @@ def background_of(data: ConfigDict) -> tuple[float, float, float] | None:
 
 def color_behind(data: ConfigDict) -> tuple[float, float, float] | None:
     """Returns the colour behind the scene of a resolved data section; None: black."""
-    if data.background != "mean":
+    color = data.get("background_color", ())  # configs of older versions lack it
+    if data.background != "none" or len(color) == 0:
         return background_of(data)
-    if is_auto(data.background_color):
+    if is_auto(color):
         raise ValueError(
-            "data.background_color is 'auto', and data.background 'mean'; resolve the config against a dataset, or set "
-            "red, green and blue"
+            "data.background_color is 'auto'; resolve the config against a dataset, or set red, green and blue"
         )
-    return tuple(data.background_color)
+    return tuple(color)
 
 
 def mean_color(views: Views) -> tuple[float, float, float]:

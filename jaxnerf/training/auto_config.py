@@ -90,8 +90,8 @@ def resolve(config: ConfigDict, views: Views | None = None, *, platform: str | N
     config = copy.deepcopy(config)
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
-    _resolve_background(config, views, lines)
     lines = lines + _resolve_sizes(config, views)
+    _resolve_background(config, views, lines)
     _resolve_schedule(config, views, lines, platform or jax.default_backend())
     views = _resolve_near(config, views, lines)
     left = [name for name in auto_fields(config) if name not in DEVICE_FIELDS]
@@ -201,15 +201,15 @@ def _inferring(lines: list[str]) -> Callable[..., None]:
 
 
 def _resolve_background(config: ConfigDict, views: Views, lines: list[str]) -> None:
-    """Fills the colour behind a scene whose images have no alpha into a config.
+    """Fills the colour behind the scene into a config.
 
-    Distant walls and sky are often bright and show little, so training leaves them partly transparent. With black
-    behind them, bright fog in front of single cameras took their place.
+    Distant walls and sky show little, so training leaves them partly transparent. With black behind them they are too
+    dark, and bright fog in front of single cameras takes their place.
     """
-    mean = config.data.background == "mean"
-    color = tuple(round(value, 3) for value in dataset.mean_color(views)) if mean else ()
+    unbounded = config.data.background == "none" and config.sampler == "occupancy" and config.occupancy.contracted
+    color = tuple(round(value, 3) for value in dataset.mean_color(views)) if unbounded else ()
     line = f"background    {color} behind the scene, the mean colour of the training images"
-    _inferring(lines)(config.data, "background_color", color, line, used=mean)
+    _inferring(lines)(config.data, "background_color", color, line, used=bool(unbounded))
 
 
 def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:

@@ -172,13 +172,12 @@ def _numbers(value):
 def _check_lists(fields):
     """Checks the colour behind the scene, the box and the levels."""
     color = fields.get("data.background_color", ())
-    lengths = (3,) if fields["data.background"] == "mean" else (0, 3)
     if not is_auto(color) and not (
-        len(color) in lengths and all(isinstance(each, int | float) and 0 <= each <= 1 for each in color)
+        len(color) in (0, 3) and all(isinstance(each, int | float) and 0 <= each <= 1 for each in color)
     ):
         raise ValueError(
-            f"--config.data.background_color is {short_repr(color)}, expected red, green and blue in [0, 1], or () "
-            "where data.background is not 'mean'; correct it"
+            f"--config.data.background_color is {short_repr(color)}, expected red, green and blue in [0, 1], or () for "
+            "black; correct it"
         )
     for name in ("occupancy.lower", "occupancy.upper"):
         if not (is_auto(fields[name]) or (len(fields[name]) == 3 and len([*_numbers(fields[name])]) == 3)):

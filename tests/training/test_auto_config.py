@@ -15,7 +15,7 @@ from ml_collections import config_flags
 from helpers import compiled
 from jaxnerf import Camera, Views
 from jaxnerf.configs import default, lego_fast, lego_mlp_fast
-from jaxnerf.data import synthetic
+from jaxnerf.data import dataset, synthetic
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
@@ -163,10 +163,10 @@ def test_config_of_the_paper_is_resolved_and_logs_nothing_about_a_box(views):
     assert baked.occupancy == got.occupancy and any(line.startswith("box ") for line in lines)
 
 
-def test_rays_that_hit_nothing_have_the_mean_colour_of_images_without_alpha(views):
+def test_rays_that_hit_nothing_have_the_mean_colour_of_an_unbounded_capture(views):
     """Black behind a bright scene would be replaced by fog in front of the cameras."""
     given, rgb = auto_config(), np.random.default_rng(0).integers(0, 256, (*views.pixels.shape[:1], 3), np.uint8)
-    given.data.background, rgb[..., 0] = "mean", 51
+    given.data.background, given.occupancy.contracted, rgb[..., 0] = "none", True, 51
     masked = np.arange(len(rgb)) % 2 == 0
     rgb[~masked] = 255
     shown = dataclasses.replace(views, pixels=rgb, mask=masked)
@@ -183,10 +183,21 @@ def test_rays_that_hit_nothing_have_the_mean_colour_of_images_without_alpha(view
         np.testing.assert_allclose(experiment.background, expected, atol=5e-4)
 
 
-@pytest.mark.parametrize("background, color", [("mean", ()), ("mean", (0.5, 0.5)), ("white", (0.5, 1.5, 0.5))])
-def test_a_background_colour_is_red_green_and_blue(views, background, color):
+@pytest.mark.parametrize("background, contracted", [("none", False), ("white", True)])
+def test_otherwise_black_or_the_colour_behind_alpha_is_behind_the_scene(views, background, contracted):
+    given = auto_config(contracted=contracted)
+    given.data.background = background
+    config = resolve(given, dataclasses.replace(views, pixels=views.pixels[:, :3])).config
+    expected = None if background == "none" else (1.0, 1.0, 1.0)
+    assert config.data.background_color == () and dataset.color_behind(config.data) == expected
+    config.data.background_color = (0.1, 0.2, 0.3)
+    assert dataset.color_behind(config.data) == ((0.1, 0.2, 0.3) if background == "none" else expected)
+
+
+@pytest.mark.parametrize("color", [(0.5, 0.5), (0.5, 1.5, 0.5), (0.5, "red", 0.5)])
+def test_a_background_colour_is_red_green_and_blue(views, color):
     config = auto_config()
-    config.data.background, config.data.background_color = background, color
+    config.data.background_color = color
     with pytest.raises(ValueError, match="data.background_color is .*expected red, green and blue"):
         resolve(config, views)
 
