@@ -51,10 +51,10 @@ def get_config():
                 "near": auto(float),
                 "far": 0.0,
                 # The colour behind alpha and behind the scene: "white", "black", "none" (alpha is dropped, and
-                # background_color is behind the scene) or "auto".
+                # background_color is behind the scene) or "auto": "white" for images with alpha, otherwise "none".
                 "background": "white",
-                # Red, green, blue in [0, 1]; (): black. auto: the mean of the training images where space is
-                # contracted, otherwise black.
+                # Behind the scene where background is "none": red, green, blue in [0, 1], or () for black. auto: the
+                # mean of the training images where the occupancy sampler contracts space, otherwise black.
                 "background_color": auto(tuple),
                 "hold_out": 0,  # every n-th training view belongs to the split "held_out" instead; 0: none
                 "num_views": 0,  # number of training views to use, spread evenly over all of them; 0: all

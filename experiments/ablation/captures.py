@@ -3,7 +3,7 @@
     JAXNERF_SCENES=... python experiments/ablation/captures.py --out=DIR [--data_dir=can] [--steps=3000] [--seeds=0] \
         [--only="capture,depth off"] [--page=FILE.md --table=NAME]
 
-Trains configs/capture.py for as many steps with one setting changed at a time, on the training views without every 8th,
+Trains configs/capture.py for --steps steps with one setting changed at a time, on the training views without every 8th,
 and scores those. The depth error is |t - D| / D at the observations of the dataset's sparse points in the held-out
 views: the median, and the fraction above 5 %. These points were found with the held-out images, too, so a gain of the
 depth loss is partly one on training data. Writes DIR/ablation.json and prints a table. The same command resumes what
@@ -41,7 +41,7 @@ VARIANTS = {
     "total_variation 0.1": {"losses.total_variation": 0.1},
     "total_variation 1": {"losses.total_variation": 1.0},
     "full gradients near cameras": {"occupancy.near_gradient_distance": 0.0},
-    "unseen cells valid": {"occupancy.min_views": 0},
+    "cells that no view sees stay": {"occupancy.min_views": 0},
     "exposure": {"cameras.exposure": True},
     "refine": {"cameras.refine": True},
 }

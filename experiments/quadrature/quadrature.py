@@ -34,7 +34,6 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf import Rays, render_hierarchical, render_rays
-from jaxnerf.data.dataset import background_of
 from jaxnerf.data.ray_batches import pixel_colors
 from jaxnerf.evaluation import restore
 from jaxnerf.fields import analytic
@@ -160,7 +159,7 @@ def measure_run(folder: str) -> dict:
     step = restore.newest_step(run, folder)
     params, _ = run.variables(step)
     rays, truth_of_images = test_rays(run.experiment, FLAGS.test_rays)
-    options = {"background": background_of(config.data), "in_disparity": config.sampling.in_disparity}
+    options = {"background": run.experiment.background, "in_disparity": config.sampling.in_disparity}
     segments, truth, difference = _reference(config, params, rays, options)
     rows, timed = [], {}
     names = ("coarse", "fine") if "coarse" in params else ("fine",)

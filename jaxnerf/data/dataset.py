@@ -28,6 +28,7 @@ WORLDS = {
 }
 _SYNTHETIC = {"fingerprint": "", "factor": 1, "background": "white", "world": "file", "ndc": False}
 _BLENDER_NEAR, _BLENDER_FAR = 2.0, 6.0  # of the NeRF paper's synthetic scenes, world units
+_MEAN_RUNS, _MEAN_RUN = 2**10, 2**10  # of pixels, of whose colours the mean is taken
 _HELD_OUT_OFFSET = 3  # not 0, as the first views of a dataset often differ from the others
 
 
@@ -49,8 +50,9 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
 
     data = default.get_config().data
     inferred = {name: AUTO for name in ("format", "background", "world", "ndc")}
-    if unknown := sorted(set(options) - set(data)):
-        raise ValueError(f"load_dataset: {unknown[0]} is no option, expected one of {', '.join(data)}; correct it")
+    known = [name for name in data if name != "background_color"]  # of renderings, not of images
+    if unknown := sorted(set(options) - set(known)):
+        raise ValueError(f"load_dataset: {unknown[0]} is no option, expected one of {', '.join(known)}; correct it")
     data.update(inferred | {"dir": str(dir)} | options)
     return load_split(data, split)
 
@@ -198,17 +200,25 @@ def color_behind(data: ConfigDict) -> tuple[float, float, float] | None:
         return background_of(data)
     if is_auto(color):
         raise ValueError(
-            "data.background_color is 'auto'; resolve the config against a dataset, or set red, green and blue"
+            "data.background_color is 'auto'; resolve the config against a dataset, or set red, green and blue, or () "
+            "for black"
         )
     return tuple(color)
 
 
 def mean_color(views: Views) -> tuple[float, float, float]:
-    """Returns the mean colour of the pixels in the views' mask, alpha dropped, in [0, 1]; of at most 2^20 of them."""
-    every = -(-len(views.pixels) // 2**20)
-    pixels = np.asarray(views.pixels[::every, :3])
-    if views.mask is not None and np.any(views.mask[::every]):
-        pixels = pixels[np.asarray(views.mask[::every])]
+    """Returns the mean colour of the views' pixels in [0, 1], alpha dropped.
+
+    Of more than 2^20 pixels some are chosen, in runs at random places, as pixels on disk are read by the page. Those
+    that a mask excludes do not count, unless it excludes all that were chosen.
+    """
+    total, chosen = len(views.pixels), np.arange(len(views.pixels))
+    if total > _MEAN_RUNS * _MEAN_RUN:
+        starts = np.sort(np.random.default_rng(0).integers(0, total - _MEAN_RUN, _MEAN_RUNS))
+        chosen = (starts[:, None] + np.arange(_MEAN_RUN)).reshape(-1)
+    if views.mask is not None and views.mask[chosen].any():
+        chosen = chosen[views.mask[chosen]]
+    pixels = views.pixels[chosen, :3]
     return tuple(float(value) for value in (pixels / np.iinfo(pixels.dtype).max).mean(axis=0))
 
 

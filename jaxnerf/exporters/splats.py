@@ -100,7 +100,10 @@ def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) ->
 
 
 def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
-    """Returns the mean PSNR of rasterized Gaussians over views of the split `eval.split`, and how many these are."""
+    """Returns the mean PSNR of rasterized Gaussians over views of the split `eval.split`, and how many these are.
+
+    Behind the Gaussians is the run's background, which the file does not hold.
+    """
     run = source.run
     views = refined_views(run, run.experiment.load_split(run.experiment.eval.split), "test", source.variables[0])
     poses = in_file(np.asarray(views.cameras.to_world), views.to_file)

@@ -1,5 +1,6 @@
 """Converts published weights into a workdir, which can be scored, rendered and trained further."""
 
+import copy
 import dataclasses
 import json
 import os
@@ -15,6 +16,7 @@ from ml_collections import ConfigDict
 from jaxnerf.data import dataset
 from jaxnerf.interop.published_weights import Network, read_weights
 from jaxnerf.runtime import atomic_files
+from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.training import auto_config, build, workdir
 from jaxnerf.training.checkpoint import Checkpoints
@@ -75,11 +77,14 @@ def convert(
 
 
 def _resolved(config: ConfigDict) -> ConfigDict:
-    """Returns the config resolved against its dataset, or the config itself if there is no dataset."""
+    """Returns the config resolved against its dataset, or as far as possible if there is no dataset."""
     try:
         if config.data.format != "synthetic":
             dataset.dataset_folder(config.data.dir)
     except ValueError:
+        config = copy.deepcopy(config)
+        if is_auto(config.data.background_color):
+            config.data.background_color = ()  # as it is inferred for all models without an occupancy grid
         return config
     return auto_config.resolve(config).config
 

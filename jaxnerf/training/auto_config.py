@@ -203,13 +203,21 @@ def _inferring(lines: list[str]) -> Callable[..., None]:
 def _resolve_background(config: ConfigDict, views: Views, lines: list[str]) -> None:
     """Fills the colour behind the scene into a config.
 
-    Distant walls and sky show little, so training leaves them partly transparent. With black behind them they are too
-    dark, and bright fog in front of single cameras takes their place.
+    Distant walls and sky have little texture, so training leaves them partly transparent. With black behind them they
+    are too dark, and bright fog in front of single cameras takes their place.
     """
-    unbounded = config.data.background == "none" and config.sampler == "occupancy" and config.occupancy.contracted
-    color = tuple(round(value, 3) for value in dataset.mean_color(views)) if unbounded else ()
-    line = f"background    {color} behind the scene, the mean colour of the training images"
-    _inferring(lines)(config.data, "background_color", color, line, used=bool(unbounded))
+    data = config.data
+    color = data.get("background_color", ())  # configs of older versions lack it
+    if is_auto(color):
+        data.background_color = ()
+        if data.background == "none" and config.sampler == "occupancy" and config.occupancy.contracted:
+            data.background_color = tuple(round(value, 3) for value in dataset.mean_color(views))
+            lines.append(f"behind        {data.background_color}, the mean colour of the training images")
+    elif len(color) and data.background != "none":
+        raise ValueError(
+            f"data.background_color is {tuple(color)} and data.background {data.background!r}, which is behind the "
+            "scene, too; set data.background to 'none', or data.background_color to ()"
+        )
 
 
 def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:

@@ -145,7 +145,7 @@ def build_cameras(config: ConfigDict) -> CameraParameters | None:
         exposure=section.exposure,
         refine=section.refine,
         view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
-        background=dataset.color_behind(config.data),
+        background=dataset.background_of(config.data),
     )
 
 

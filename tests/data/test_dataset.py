@@ -206,7 +206,7 @@ def test_load_dataset_takes_the_fields_of_the_data_section(tmp_path):
     assert views.size.tolist() == [[12, 16]] * 7 and views.background == (0, 0, 0)
     np.testing.assert_array_equal(views.to_file, np.eye(4))
     np.testing.assert_allclose([views.near[0], views.far[0]], [2.5, 6.5])
-    with pytest.raises(ValueError, match="scale is no option, expected one of background, background_color, dir"):
+    with pytest.raises(ValueError, match="scale is no option, expected one of background, dir"):
         load_dataset(tmp_path, scale=2)
     with pytest.raises(ValueError, match="split is 'all'"):
         load_dataset(tmp_path, split="all")

@@ -81,6 +81,18 @@ def test_rgba_over_the_background_is_the_colour(rendered):
     np.testing.assert_allclose(rgba[..., :3] * alpha + (1 - alpha), color, atol=1.01 / 255)
 
 
+def test_rgba_over_the_background_colour_is_the_colour(trained, path_file, tmp_path):
+    run = shutil.copytree(trained, tmp_path / "run")
+    content = json.loads((run / "config.json").read_text())
+    content["data"] |= {"background": "none", "background_color": [0.2, 0.5, 1.0]}
+    (run / "config.json").write_text(json.dumps(content))
+    (folder,) = render_path(run, path=str(path_file), rgba=True, kind="none", settings={"chunk": 100})
+    color, rgba = (iio.imread(folder / name / "0000.png") / 255 for name in ("color", "rgba"))
+    behind = (1 - rgba[..., 3:]) * [0.2, 0.5, 1.0]
+    assert behind.max() > 0.1, "some rays are transparent"
+    np.testing.assert_allclose(rgba[..., :3] * rgba[..., 3:] + behind, color, atol=1.01 / 255)
+
+
 def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch, capsys):
     folder = rendered[0]
     before = {file: file.stat().st_mtime_ns for file in folder.rglob("*") if "depth" not in str(file)}

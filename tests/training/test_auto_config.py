@@ -177,21 +177,49 @@ def test_rays_that_hit_nothing_have_the_mean_colour_of_an_unbounded_capture(view
         assert ("mean colour" in "".join(resolved.lines)) == (value == AUTO)
         experiment = build(resolve_for_device(resolved.config)[0])
         rays = view_rays(shown, 0, np.float32([[1.5, 1.5]]))
-        grid = experiment.model.grid_schedule.create(np.zeros(experiment.model.grid_schedule.shape, bool))
-        image = experiment.model.view(experiment.model.init(jax.random.key(0)), grid, rays)
-        np.testing.assert_allclose(image.rgb[0], experiment.background, atol=1e-6)
+        model, params = experiment.model, experiment.model.init(jax.random.key(0))
+        empty = model.grid_schedule.create(np.zeros(model.grid_schedule.shape, bool))
+        training = model.render(jax.random.split(jax.random.key(1), 1), params, empty, rays, 0)[-1]
+        for image in (model.view(params, empty, rays), training, model.cull(empty, rays)[1]):
+            np.testing.assert_allclose(image.rgb[0], experiment.background, atol=1e-6)
         np.testing.assert_allclose(experiment.background, expected, atol=5e-4)
 
 
-@pytest.mark.parametrize("background, contracted", [("none", False), ("white", True)])
-def test_otherwise_black_or_the_colour_behind_alpha_is_behind_the_scene(views, background, contracted):
+@pytest.mark.parametrize(
+    "background, contracted, sampler",
+    [("none", False, "occupancy"), ("none", True, "hierarchical"), ("white", True, "occupancy")],
+)
+def test_otherwise_black_or_the_colour_behind_alpha_is_behind_the_scene(views, background, contracted, sampler):
     given = auto_config(contracted=contracted)
-    given.data.background = background
+    given.data.background, given.sampler = background, sampler
     config = resolve(given, dataclasses.replace(views, pixels=views.pixels[:, :3])).config
     expected = None if background == "none" else (1.0, 1.0, 1.0)
     assert config.data.background_color == () and dataset.color_behind(config.data) == expected
-    config.data.background_color = (0.1, 0.2, 0.3)
-    assert dataset.color_behind(config.data) == ((0.1, 0.2, 0.3) if background == "none" else expected)
+    given.data.background_color = (0.1, 0.2, 0.3)
+    if background == "none":
+        assert dataset.color_behind(resolve(given, views).config.data) == (0.1, 0.2, 0.3)
+    else:
+        with pytest.raises(ValueError, match="set data.background to 'none', or data.background_color to"):
+            resolve(given, views)
+
+
+def test_the_mean_colour_of_many_pixels_is_that_of_all_that_the_mask_includes(views):
+    """Columns differ, so that a stride of whole rows would see one colour only."""
+    column = np.tile(np.arange(1024), 2048)
+    pixels = np.uint16(np.stack([64 * column, 65535 - 64 * column, np.full_like(column, 13107)], axis=-1))
+    many = dataclasses.replace(views, pixels=pixels, mask=None)
+    np.testing.assert_allclose(dataset.mean_color(many), [0.4995, 0.5005, 0.2], atol=0.002)
+    left = dataclasses.replace(many, mask=column < 512)
+    np.testing.assert_allclose(dataset.mean_color(left), [0.2495, 0.7505, 0.2], atol=0.002)
+    nothing = dataclasses.replace(many, mask=np.zeros(len(column), bool))
+    assert dataset.mean_color(nothing) == dataset.mean_color(many)
+
+
+def test_an_unresolved_background_colour_is_an_error():
+    data = default.get_config().data
+    data.background = "none"
+    with pytest.raises(ValueError, match="data.background_color is 'auto'; resolve the config"):
+        dataset.color_behind(data)
 
 
 @pytest.mark.parametrize("color", [(0.5, 0.5), (0.5, 1.5, 0.5), (0.5, "red", 0.5)])
