@@ -30,6 +30,9 @@ def test_links_and_included_files_exist(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
         assert re.match(r"[a-z]+:", target) or (page.parent / target).exists(), target
+    for target, place in re.findall(r"\]\(([^)#:\s]*)#([^)\s]+)\)", text):
+        headings = re.findall(r"^#+ (.*)$", (page.parent / target if target else page).read_text(), re.MULTILINE)
+        assert place in {re.sub(r"[^\w -]", "", head).strip().lower().replace(" ", "-") for head in headings}, place
     included = re.findall(r'^--8<-- "([^"]+)"$', page.read_text(), re.MULTILINE)
     assert len(included) == page.read_text().count("--8")
     for target in included:
