@@ -50,8 +50,8 @@ def orbit(count=14):
     )
 
 
-def source_of(scene=ball, *, say=lambda line: None, **settings):
-    """Returns the ExportSource of a scene."""
+def source_of(scene=ball, *, say=lambda line: None, background=None, **settings):
+    """Returns the ExportSource of a scene over a background colour."""
     views = orbit()
     render = functools.partial(render_rays, None, num_samples=96, median_depth=True)
     compiled = jax.jit(lambda rays: render(scene, rays))
@@ -60,6 +60,7 @@ def source_of(scene=ball, *, say=lambda line: None, **settings):
         world_depth=ray_batches.world_depth,
         ndc=False,
         pixel_offset=0.5,
+        background=background,
         model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid)),
         load_split=lambda split: views,
         eval=SimpleNamespace(split="test"),

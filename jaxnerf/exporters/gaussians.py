@@ -163,5 +163,5 @@ def _strip(drawn, top, bottom, width, background):
     weight = alpha * np.exp(-(before[:-1] - before[starts[pixel]]))
     rgb = np.stack([np.bincount(pixel, weight * drawn.rgb[source, i], size) for i in range(3)], axis=-1)
     if background is not None:
-        rgb += np.exp(-(before[starts[1:]] - before[starts[:-1]]))[:, None] * np.asarray(background)
+        rgb = rgb + np.exp(-(before[starts[1:]] - before[starts[:-1]]))[:, None] * np.asarray(background)
     return rgb

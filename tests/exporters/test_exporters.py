@@ -14,7 +14,7 @@ from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.exporters.depth import export_depth
 from jaxnerf.exporters.mesh import export_mesh, keep_large_pieces
 from jaxnerf.exporters.points import export_points, thinned
-from jaxnerf.exporters.splats import export_splats
+from jaxnerf.exporters.splats import export_splats, score
 
 IN_FILE = 2 * RADIUS  # the ball's radius there
 VOXEL = 2 * IN_FILE / 32
@@ -145,6 +145,15 @@ def test_splats_look_like_the_scene(images, tmp_path):
     drawn = gaussians.rasterize(read, image.camera)
     error = np.mean((np.clip(drawn, 0, 1) - image.rgb / 255.0) ** 2)
     assert -10 * np.log10(error) > 18
+
+
+def test_splats_are_scored_over_the_colour_behind_the_scene():
+    """The views are black, and far away Gaussians cover none of them."""
+    none = gaussians.Gaussians(
+        np.full((1, 3), 1e4), np.float64([[1, 0, 0, 0]]), np.full((1, 3), 1e-3), np.ones(1), np.zeros((1, 9, 3))
+    )
+    value, _ = score(source_of(background=(0.1, 0.1, 0.1)), none)
+    np.testing.assert_allclose(value, 20, atol=1e-3)
 
 
 def splats_of(data):
