@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxnerf.core.types import Camera
+from jaxnerf.core.types import Camera, Vector
 from jaxnerf.exporters.ply import write_ply
 from jaxnerf.fields.hash_grid import harmonics
 
@@ -70,9 +70,7 @@ def rotation_matrices(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def rasterize(
-    gaussians: Gaussians, camera: Camera, background: Float[np.ndarray, "3"] | None = None
-) -> Float[np.ndarray, "H W 3"]:
+def rasterize(gaussians: Gaussians, camera: Camera, background: Vector | None = None) -> Float[np.ndarray, "H W 3"]:
     """Draws Gaussians through a pinhole.
 
     Args:
