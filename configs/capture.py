@@ -16,6 +16,5 @@ def get_config():
     train.averaging_power = 0.0
     train.cpu_batch_size, train.max_seconds = 576, 600.0
     config.hash_grid.table_size = 2**17  # larger ones learn no faster where most space is seen, and take longer
-    config.losses.total_variation = "auto"
     config.eval.early_stop_eps = 0.02
     return config

@@ -123,8 +123,7 @@ def get_config():
                 "depth": schedule("auto"),
                 "opaque": schedule(0.0),  # squared transmittance of rays where the image is opaque
                 # Regularizers of the hash grid: mean square of each level's entries (arXiv:2304.06706), and mean
-                # squared difference of neighbouring vertices in the levels that are not hashed. The latter may be
-                # "auto": where space is contracted.
+                # squared difference of neighbouring vertices in the levels that are not hashed.
                 "hash_decay": schedule(0.0),
                 "total_variation": schedule(0.0),
             },

@@ -38,7 +38,7 @@ VARIANTS = {
     "opaque 0.01": {"losses.opaque": 0.01},
     "hash_decay 0.1": {"losses.hash_decay": 0.1},
     "hash_decay 1": {"losses.hash_decay": 1.0},
-    "total_variation off": {"losses.total_variation": 0.0},
+    "total_variation 0.1": {"losses.total_variation": 0.1},
     "total_variation 1": {"losses.total_variation": 1.0},
     "full gradients near cameras": {"occupancy.near_gradient_distance": 0.0},
     "cells that no view sees stay": {"occupancy.min_views": 0},

@@ -41,7 +41,6 @@ _MAX_INNER_BOX = 3.0
 _MAX_STATED_BOX = 3.0
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
-_SMOOTH_WEIGHT = 0.1  # of the total variation
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
 _MAX_OPEN_RESOLUTION = 96  # where no alpha empties most cells before training, so that all of them are updated
@@ -324,9 +323,6 @@ def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:
     observed = count >= _MIN_OBSERVATIONS
     line = f"depth         {count:,} observations of sparse points guide the start of training"
     infer(config.losses, "depth", _DEPTH_WEIGHT if observed else 0.0, line, used=observed)
-    smooth = everywhere and config.field == "hash_grid"
-    line = "smoothness    total variation of the hash grid's coarse levels"
-    infer(config.losses, "total_variation", _SMOOTH_WEIGHT if smooth else 0.0, line, used=smooth)
     if not is_auto(config.data.near):
         return views
     if not everywhere:

@@ -203,23 +203,6 @@ def test_otherwise_black_or_the_colour_behind_alpha_is_behind_the_scene(views, b
             resolve(given, views)
 
 
-@pytest.mark.parametrize(
-    "contracted, field, given, expected",
-    [
-        (True, "hash_grid", AUTO, 0.1),
-        (False, "hash_grid", AUTO, 0.0),
-        (True, "mlp", AUTO, 0.0),
-        (True, "hash_grid", 2.0, 2.0),
-    ],
-)
-def test_total_variation_is_on_where_space_is_contracted(views, contracted, field, given, expected):
-    config = auto_config(field=field, contracted=contracted)
-    config.losses.total_variation = given
-    resolved = resolve(config, views)
-    assert resolved.config.losses.total_variation == expected
-    assert ("total variation" in "".join(resolved.lines)) == (given == AUTO and expected > 0)
-
-
 def test_the_mean_colour_of_many_pixels_is_that_of_all_that_the_mask_includes(views):
     """Columns differ, so that a stride of whole rows would see one colour only."""
     column = np.tile(np.arange(1024), 2048)
