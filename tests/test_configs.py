@@ -41,8 +41,8 @@ def resolve_with_views(config, views):
     return config
 
 
-DATA = {"format": "blender", "factor": 1, "background": "none", "world": "file", "ndc": False, "fingerprint": ""}
-DATA["background_color"] = ()
+DATA = {"format": "blender", "factor": 1, "background": "none", "background_color": ()}
+DATA |= {"world": "file", "ndc": False, "fingerprint": ""}
 
 
 def fields(config):

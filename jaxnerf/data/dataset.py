@@ -209,8 +209,8 @@ def color_behind(data: ConfigDict) -> tuple[float, float, float] | None:
 def mean_color(views: Views) -> tuple[float, float, float]:
     """Returns the mean colour of the views' pixels in [0, 1], alpha dropped.
 
-    Of more than 2^20 pixels some are chosen, in runs at random places, as pixels on disk are read by the page. Those
-    that a mask excludes do not count, unless it excludes all that were chosen.
+    Of more than 2^20 pixels some are chosen: runs of them at random places, as single pixels of a file on disk would
+    take as long to read as all. Pixels that a mask excludes do not count, unless it excludes all that were chosen.
     """
     total, chosen = len(views.pixels), np.arange(len(views.pixels))
     if total > _MEAN_RUNS * _MEAN_RUN:
