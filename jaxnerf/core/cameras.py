@@ -263,7 +263,9 @@ def _growing(distort, distortion, point):
     _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),)))(
         fractions
     )
-    return ((slopes * point[None]).sum(axis=-1)[1:] > 0).all() | (norm(point) == 0)
+    # Not a sum along the axis of two, for which XLA calls a library on a CPU, pair by pair.
+    along = slopes[:, 0] * point[0] + slopes[:, 1] * point[1]
+    return (along[1:] > 0).all() | (norm(point) == 0)
 
 
 def _invert(distort, distortion, goal):

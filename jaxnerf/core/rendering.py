@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core import sampling, volume_rendering
 from jaxnerf.core.safe_math import norm
@@ -240,10 +240,20 @@ def segment_lengths(delta: Num[ArrayLike, "*batch samples"], rays: Rays) -> Floa
 
     Where the origin is NaN the length is NaN, too, so that the ray is visible whatever a scene returns for NaN.
     """
-    speed = norm(rays.directions)[..., None]
+    return lengths_at_speeds(delta, *(of_ray[..., None] for of_ray in speeds(rays)))
+
+
+def speeds(rays: Rays) -> tuple[Float[Array, "*batch"], Bool[Array, "*batch"]]:
+    """Returns the world units per t of rays [...], and whether their origins are NaN."""
+    return norm(rays.directions), jnp.isnan(rays.origins).any(axis=-1)
+
+
+def lengths_at_speeds(
+    delta: Num[ArrayLike, "*batch"], speed: Num[ArrayLike, "*#batch"], unknown: Bool[ArrayLike, "*#batch"]
+) -> Float[Array, "*batch"]:
+    """Returns segment_lengths [...] from the speeds of the samples' rays."""
     infinite = jnp.isinf(delta)
     length = jnp.where(infinite & (speed > 0), jnp.inf, jnp.where(infinite, 0, delta) * speed)
-    unknown = jnp.isnan(rays.origins).any(axis=-1)[..., None]
     return jnp.where(unknown & (delta > 0), jnp.nan, length)
 
 

@@ -78,11 +78,11 @@ def stepped_edges(
     if num_segments < 1:
         raise ValueError(f"stepped_edges: num_segments is {num_segments}, expected at least 1")
     shift = 0.0 if key is None else uniform(key, (*near.shape, 1))
-    count = jnp.arange(1, num_segments, dtype=near.dtype).reshape((1,) * near.ndim + (-1,))
+    count = jnp.arange(num_segments + 1, dtype=near.dtype).reshape((1,) * near.ndim + (-1,))
     step = jnp.broadcast_to(jnp.asarray(step_size, near.dtype), near.shape)
-    inner = near[..., None] + (count - shift) * step[..., None]
-    inner = jnp.minimum(inner, far[..., None])
-    return jnp.concatenate([near[..., None], inner, far[..., None]], axis=-1)
+    near, far, step = near[..., None], far[..., None], step[..., None]
+    inner = jnp.minimum(near + (count - shift) * step, far)
+    return jnp.where(count == 0, near, jnp.where(count == num_segments, far, inner))
 
 
 def samples_from_edges(key: Keys | None, edges: Num[ArrayLike, "*batch edges"], *, rule: str = "segments") -> Samples:

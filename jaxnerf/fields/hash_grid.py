@@ -148,7 +148,7 @@ class HashGrid(linen.Module):
         """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N]."""
         shape = x.shape[:-1]
         side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
-        place = [(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)]
+        place = _stored([(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)])
         levels = self.levels()
         # All levels share a table, so there is only one gradient to clear and one array to update.
         table = self.param("table", _near_zero, (levels[-1].rows.stop, self.features_per_level))
@@ -209,6 +209,15 @@ def interpolate(
     for row, weight in zip(_corner_rows(low, size, rows), corner_weights, strict=True):
         total = total + weight[:, None] * table.at[row].get(mode="promise_in_bounds")
     return total
+
+
+def _stored(values):
+    """Returns arrays [N]; XLA would otherwise compute them again, unvectorized, for each level and vertex on a CPU.
+
+    It does so for anything but reductions and the like, also behind an optimization_barrier.
+    """
+    own = jnp.eye(len(values), dtype=bool)[..., None]
+    return list(jnp.where(own, jnp.stack(values)[None], 0).sum(axis=1))
 
 
 def harmonics(directions: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 9"]:

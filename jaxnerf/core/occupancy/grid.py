@@ -388,5 +388,6 @@ def _contracted(places, shape):
     largest = jnp.maximum(jnp.maximum(*map(jnp.abs, along[:2])), jnp.abs(along[2]))
     safe = jnp.maximum(largest, 1)
     # The box ends at infinity, and a point there is in its last cell.
-    scale = jnp.minimum((2 - 1 / safe) / safe, _JUST_INSIDE / safe)
+    inverse = 1 / safe
+    scale = jnp.minimum((2 - inverse) * inverse, _JUST_INSIDE * inverse)
     return [(value * scale + 2) * (size / 4) for value, size in zip(along, shape, strict=True)]

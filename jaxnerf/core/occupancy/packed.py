@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
-from jaxnerf.core.safe_math import norm, scale_gradient
+from jaxnerf.core.safe_math import scale_gradient
 from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
 from jaxnerf.core.varying import vary_like
 
@@ -177,7 +177,7 @@ def visible_samples(
         slot = index * max_samples + jnp.arange(max_samples, dtype=jnp.int32)
         buffer = _fill(occupied, slot, slot < occupied.ends[-1])
         t = samples.t[buffer.ray, buffer.source]
-        density, rgb, _ = _evaluate(name, scene, rays, t, buffer.ray, buffer.used)
+        density, rgb = _evaluate(name, scene, rays, t, buffer.ray, buffer.used)
         place = jnp.where(buffer.used, buffer.ray * shape[-1] + buffer.source, outputs.shape[0])
         return outputs.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
 
@@ -371,7 +371,7 @@ def _evaluate(function, scene, rays, t, ray_index, used):
     with a gradient that is NaN. If no slot is used, that place is the near end of a ray, as in render_samples.
 
     Returns:
-        density [K] and rgb [K, 3], both 0 in unused slots; and Rays [K], those of the samples.
+        density [K] and rgb [K, 3], both 0 in unused slots.
     """
     first = ray_index[0]
     t = jnp.where(used, t, jnp.where(used[0], t[0], rays.near[first]))
@@ -381,16 +381,17 @@ def _evaluate(function, scene, rays, t, ray_index, used):
     x = jnp.where(used[:, None], x, jax.lax.stop_gradient(x))[None]
     density, rgb = scene(x, own.viewdirs[None])
     rendering.check_scene_output(function, density, rgb, x)
-    return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0), own
+    return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
 
 
 def _composite(function, scene, rays, placed, near_gradient_distance, *, rule, longest, median_depth=False):
     """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
     t, ray = placed.t, placed.ray_index
-    density, rgb, own = _evaluate(function, scene, rays, t, ray, placed.used)
-    length = jnp.where(placed.used, rendering.segment_lengths(placed.delta[:, None], own)[:, 0], 0)
+    density, rgb = _evaluate(function, scene, rays, t, ray, placed.used)
+    speed, unknown = (of_ray[ray] for of_ray in rendering.speeds(rays))
+    length = jnp.where(placed.used, rendering.lengths_at_speeds(placed.delta, speed, unknown), 0)
     if near_gradient_distance:
-        scale = jnp.minimum(norm(own.directions) * t / near_gradient_distance, 1) ** 2
+        scale = jnp.minimum(speed * t / near_gradient_distance, 1) ** 2
         density, rgb = scale_gradient(density, scale), scale_gradient(rgb, scale[:, None])
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
     weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=longest)
