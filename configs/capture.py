@@ -14,7 +14,7 @@ def get_config():
     train = config.train
     # lego_fast.py has other values here, chosen on lego alone.
     train.averaging_power = 0.0
-    train.cpu_batch_size, train.max_seconds = 576, 600.0
+    train.cpu_batch_size, train.max_seconds = 768, 600.0
     config.hash_grid.table_size = 2**17  # larger ones learn no faster where most space is seen, and take longer
     config.eval.early_stop_eps = 0.02
     return config

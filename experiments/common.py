@@ -1,7 +1,6 @@
 """Short runs that are trained once, compiled steps, timings, tables and plots: what the studies share."""
 
 import copy
-import functools
 import importlib
 import json
 import math
@@ -18,8 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from absl import flags
-from ml_collections import ConfigDict
 
+from jaxnerf.core.types import Views
 from jaxnerf.data import dataset
 from jaxnerf.runtime.atomic_files import partial_file, write_text
 from jaxnerf.runtime.devices import split_positions
@@ -31,6 +30,8 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 REFERENCE_GFLOPS = 93.0  # matrix product of the machine that the project's limits in seconds refer to
 _SCORED = "scored.json"  # in the workdir of a run that is trained to its end and scored
 _MATRIX_SIDE = 1024
+_MOST_SPLITS = 6  # kept in memory
+_splits: dict[tuple[str, str], Views] = {}
 PAGE = flags.DEFINE_string(
     "page", None, "Markdown file, such as docs/results/speed.md, in which the tables of this study are replaced."
 )
@@ -97,12 +98,12 @@ def finished(config, folder, *, split: str | None = None) -> dict[str, Any] | No
 
 def load_split(config, split: str):
     """Returns the Views of a split, read once for all runs on them."""
-    return _load_split(json.dumps(config.data.to_dict(), sort_keys=True), split)
-
-
-@functools.lru_cache(maxsize=6)
-def _load_split(data, split):
-    return dataset.load_split(ConfigDict(json.loads(data)), split)
+    key = json.dumps(config.data.to_dict(), sort_keys=True), split
+    if key not in _splits:
+        if len(_splits) == _MOST_SPLITS:
+            _splits.pop(next(iter(_splits)))
+        _splits[key] = dataset.load_split(config.data, split)
+    return _splits[key]
 
 
 def _plain(config):

@@ -36,14 +36,19 @@ _PARTS = (
 _OTHER = "gradient's norm, copies, counters"
 
 
-_SIZES = {"lego, 100 px": 8, "lego, 400 px": 2}  # factors by which the images are shrunk
+_RUNS = {
+    "lego, 100 px": ("lego_fast", {"data.factor": 8}),
+    "lego, 400 px": ("lego_fast", {"data.factor": 2}),
+    "fox, 200 px": ("capture", {"data.dir": "fox"}),
+    "can, 200 px": ("capture", {"data.dir": "can"}),
+}
 
 
 def measure_all(kept: dict[str, Any], save: Callable[[dict], None]) -> None:
-    """Measures the step of lego_fast at each size; what was kept is not measured again."""
-    for name, factor in _SIZES.items():
+    """Measures the step of each run; what was kept is not measured again."""
+    for name, run in _RUNS.items():
         if name not in kept:
-            kept[name] = measure(common.configuration("lego_fast", {"data.factor": factor}))
+            kept[name] = measure(common.configuration(*run))
             save(kept)
 
 
@@ -152,7 +157,7 @@ def parts_of_operations(text: str) -> dict[str, str]:
 
 
 def table(kept: dict[str, Any]) -> list[str]:
-    """Returns the lines of the table of several sizes: {name: result of measure}."""
+    """Returns the lines of the table of several runs: {name: result of measure}."""
     results = list(kept.values())
     names = list(dict.fromkeys(part for result in results for part in result["parts"]))
     rows = [
@@ -166,7 +171,8 @@ def table(kept: dict[str, Any]) -> list[str]:
     ]
     product = statistics.mean(result["gflops"] for result in results)
     caption = (
-        "Where the time of a training step of lego_fast goes, in ms, by the profiler, which slows a step down. "
+        "Where the time of a training step of lego_fast and of capture goes, in ms, by the profiler, which slows a "
+        "step down. "
         f"{common.describe_machine()}, matrix product {product:.0f} GFLOP/s."
     )
     return [caption, "", *common.markdown(("", *kept), rows)]

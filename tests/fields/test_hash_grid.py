@@ -156,6 +156,31 @@ def test_gradients_are_those_of_the_linear_pieces():
         np.testing.assert_allclose(slopes[axis], (dense(table, moved) - dense(table, points))[:, 0] / step, atol=1e-3)
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="concerns the compiler for CPUs")
+def test_positions_are_computed_once_and_not_for_each_vertex(field):
+    field, params, *_ = field
+
+    def loss(params, x):
+        density, rgb = field.apply(params, jnp.floor(x), x)
+        return density.sum() + rgb.sum()
+
+    text = jax.jit(jax.grad(loss)).lower(params, jnp.zeros((1, 640, 3))).compile().as_text()
+    assert text.count(" floor(") == 1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_component_of_a_position_that_is_not_finite_affects_no_other(field, value):
+    field, params, *_ = field
+    density = jax.jit(lambda x: field.apply(params, x, directions((1, 1)))[0])
+    x = inside((1, 6))
+    wrong, nearest = x.copy(), x.copy()
+    wrong[0, 2, 1], nearest[0, 2, 1] = value, BOX["upper" if value > 0 else "lower"][1]
+    expected = np.array(density(nearest))
+    if np.isnan(value):
+        expected[0, 2] = np.nan
+    np.testing.assert_array_equal(density(wrong), expected)
+
+
 def test_the_number_of_vertices_is_proportional_to_the_sides():
     assert vertices([2, 2, 2], 16) == (16, 16, 16)
     assert vertices([2, 3, 1], 13) == (9, 13, 5)
