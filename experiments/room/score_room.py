@@ -9,8 +9,8 @@ For the held-out views near the path ("val") and the far novel views ("test"), p
 - The median error of the depth, over pixels that show a surface which two training views see, in world units of the
   capture and in cells of the occupancy grid. A cell is measured along the ray at the true surface, so that it is
   larger where space is contracted. The depth is the expected one, of which fog and missing opacity are part.
-- The fraction of the compositing weight that lies in free space, more than a cell in front of the true surface: of
-  rays as they are rendered, and of rays that begin at the camera.
+- The fraction of the compositing weight that lies in free space, more than one and more than four cells in front of the
+  true surface. Rays begin at the camera.
 
 Depth and weights are those of the field in the occupied cells, as it is rendered.
 """
@@ -40,10 +40,11 @@ from jaxnerf.runtime import cli
 
 HEADS = (
     *("views", "PSNR, dB", "of seen surfaces", "colours aligned"),
-    *("depth error, units", "in cells", "weight in free space", "from the camera"),
+    *("depth error, units", "in cells", "weight in free space", "more than 4 cells in front"),
 )
 PLACES = {"val": "near the path", "test": "far novel"}
 _WITNESSES = 2  # training views that see a surface
+_FREE = {"free_weight": 1, "free_weight_4_cells": 4}  # cells from the surface at which free space ends
 _NUM_SAMPLES = 512  # positions on the part of a ray in free space
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder that training wrote.", required=True)
@@ -139,12 +140,12 @@ def _score_view(run, variables, optical_depths, views, index, truth, num_rays):
     rng = np.random.default_rng(index)
     chosen = rng.choice(height * width, min(num_rays, height * width), replace=False)
     some = jax.tree.map(lambda leaf: jnp.reshape(leaf, (height * width, *leaf.shape[2:]))[chosen], rays)
-    end = (true_t - cells / speed).reshape(-1)[chosen]
     opacity = float(np.asarray(image.opacity).reshape(-1)[chosen].sum())
-    fog = {
-        key: float(-np.expm1(-np.asarray(optical_depths(some, start, end))).sum() / max(opacity, 1e-6))
-        for key, start in (("free_weight", some.near), ("free_weight_from_camera", jnp.zeros_like(some.near)))
-    }
+    fog = {}
+    for key, distance in _FREE.items():
+        end = (true_t - distance * cells / speed).reshape(-1)[chosen]
+        depths = np.asarray(optical_depths(some, jnp.zeros_like(some.near), end))
+        fog[key] = float(-np.expm1(-depths).sum() / max(opacity, 1e-6))
     row = {
         "name": name,
         "psnr": metrics["psnr"],
@@ -206,7 +207,7 @@ def table(results: dict[str, dict[str, Any]]) -> list[str]:
     for split, found in results.items():
         cells = [f"{found[key]:.2f}" for key in ("psnr", "psnr_seen", "psnr_aligned")]
         cells += [f"{found['depth_error']:.3f}", f"{found['depth_error_cells']:.2f}"]
-        cells += [f"{100 * found[key]:.1f} %" for key in ("free_weight", "free_weight_from_camera")]
+        cells += [f"{100 * found[key]:.1f} %" for key in _FREE]
         rows.append((f"{PLACES[split]} ({found['views']})", *cells))
     return common.markdown(HEADS, rows)
 

@@ -72,7 +72,7 @@ def test_an_exact_run_has_no_error(written):
     assert list(found) == ["val", "test"]
     for split in found.values():
         assert split["psnr"] > 30 and split["psnr_aligned"] > 30 and split["views"] == 2  # but for edges
-        assert split["depth_error"] < 1e-4 and split["free_weight"] == split["free_weight_from_camera"] == 0
+        assert split["depth_error"] < 1e-4 and split["free_weight"] == split["free_weight_4_cells"] == 0
     lines = score_room.table(found)
     assert len(lines) == 4 and lines[2].startswith("| near the path (2) |") and "0.0 %" in lines[3]
 
@@ -86,8 +86,8 @@ def test_fog_and_wrong_depths_are_measured(written):
     assert found["depth_error"] == pytest.approx(0.05 * unit * speed, rel=0.2)
     assert found["depth_error_cells"] < 0.05 * speed * 1.4 / 0.1
     expected = (1 - np.exp(-0.1 * truth.depth[truth.split == "val"] / unit)).mean()
-    assert 0.6 * expected < found["free_weight_from_camera"] < 1.2 * expected  # rays are slanted, and a cell shorter
-    assert 0 < found["free_weight"] <= found["free_weight_from_camera"]
+    assert 0.6 * expected < found["free_weight"] < 1.2 * expected  # rays are slanted, and a cell shorter
+    assert 0 < found["free_weight_4_cells"] < 0.9 * found["free_weight"]
 
 
 def test_the_optical_depth_of_a_slope_is_its_integral():
