@@ -30,7 +30,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 REFERENCE_GFLOPS = 93.0  # matrix product of the machine that the project's limits in seconds refer to
 _SCORED = "scored.json"  # in the workdir of a run that is trained to its end and scored
 _MATRIX_SIDE = 1024
-_MOST_SPLITS = 6  # kept in memory
+_MOST_SPLITS = 6
 _splits: dict[tuple[str, str], Views] = {}
 PAGE = flags.DEFINE_string(
     "page", None, "Markdown file, such as docs/results/speed.md, in which the tables of this study are replaced."
@@ -96,14 +96,14 @@ def finished(config, folder, *, split: str | None = None) -> dict[str, Any] | No
     return kept["results"]
 
 
-def load_split(config, split: str):
-    """Returns the Views of a split, read once for all runs on them."""
+def load_split(config, split: str) -> Views:
+    """Returns the Views of a split; those used last are kept in memory."""
     key = json.dumps(config.data.to_dict(), sort_keys=True), split
-    if key not in _splits:
-        if len(_splits) == _MOST_SPLITS:
-            _splits.pop(next(iter(_splits)))
-        _splits[key] = dataset.load_split(config.data, split)
-    return _splits[key]
+    views = _splits.pop(key, None) or dataset.load_split(config.data, split)
+    if len(_splits) == _MOST_SPLITS:
+        _splits.pop(next(iter(_splits)))
+    _splits[key] = views
+    return views
 
 
 def _plain(config):

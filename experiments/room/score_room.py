@@ -10,7 +10,7 @@ For the held-out views near the path ("val") and the far novel views ("test"), p
   capture and in cells of the occupancy grid. A cell is measured along the ray at the true surface, so that it is
   larger where space is contracted. The depth is the expected one, of which fog and missing opacity are part.
 - The fraction of the compositing weight that lies in free space, more than one and more than four cells in front of the
-  true surface. Rays begin at the camera.
+  true surface.
 
 Depth and weights are those of the field in the occupied cells, as it is rendered.
 """
@@ -40,7 +40,7 @@ from jaxnerf.runtime import cli
 
 HEADS = (
     *("views", "PSNR, dB", "of seen surfaces", "colours aligned"),
-    *("depth error, units", "in cells", "weight in free space", "more than 4 cells in front"),
+    *("depth error, units", "in cells", "weight in free space", "more than 4 cells in front of the surface"),
 )
 PLACES = {"val": "near the path", "test": "far novel"}
 _WITNESSES = 2  # training views that see a surface
@@ -144,8 +144,8 @@ def _score_view(run, variables, optical_depths, views, index, truth, num_rays):
     fog = {}
     for key, distance in _FREE.items():
         end = (true_t - distance * cells / speed).reshape(-1)[chosen]
-        depths = np.asarray(optical_depths(some, jnp.zeros_like(some.near), end))
-        fog[key] = float(-np.expm1(-depths).sum() / max(opacity, 1e-6))
+        in_front = np.asarray(optical_depths(some, some.near, end))
+        fog[key] = float(-np.expm1(-in_front).sum() / max(opacity, 1e-6))
     row = {
         "name": name,
         "psnr": metrics["psnr"],

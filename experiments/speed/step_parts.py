@@ -26,6 +26,7 @@ _PARTS = (
     ("optimizer and averaging", "training/optimizer.py", ""),
     ("optimizer and averaging", "training/step.py", "descend"),
     ("interpolation in the hash grid", "fields/hash_grid.py", "interpolate"),
+    ("interpolation in the hash grid", "fields/hash_grid.py", "_stored"),
     ("networks", "fields/", ""),
     ("ray marching", "core/occupancy/ray_marching.py", ""),
     ("choice of samples", "core/occupancy/importance.py", ""),
@@ -171,8 +172,7 @@ def table(kept: dict[str, Any]) -> list[str]:
     ]
     product = statistics.mean(result["gflops"] for result in results)
     caption = (
-        "Where the time of a training step of lego_fast and of capture goes, in ms, by the profiler, which slows a "
-        "step down. "
+        "Where the time of a training step goes, in ms, by the profiler, which slows a step down. "
         f"{common.describe_machine()}, matrix product {product:.0f} GFLOP/s."
     )
     return [caption, "", *common.markdown(("", *kept), rows)]

@@ -263,7 +263,7 @@ def _growing(distort, distortion, point):
     _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),)))(
         fractions
     )
-    # Not a sum along the axis of two, for which XLA calls a library on a CPU, pair by pair.
+    # Not a sum along the axis of length 2: XLA calls a library for that on a CPU, which is slow for so short an axis.
     along = slopes[:, 0] * point[0] + slopes[:, 1] * point[1]
     return (along[1:] > 0).all() | (norm(point) == 0)
 

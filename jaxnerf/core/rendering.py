@@ -244,14 +244,14 @@ def segment_lengths(delta: Num[ArrayLike, "*batch samples"], rays: Rays) -> Floa
 
 
 def speeds(rays: Rays) -> tuple[Float[Array, "*batch"], Bool[Array, "*batch"]]:
-    """Returns the world units per t of rays [...], and whether their origins are NaN."""
+    """Returns the world units per t of rays [...], and whether their origins are NaN, for lengths_at_speeds."""
     return norm(rays.directions), jnp.isnan(rays.origins).any(axis=-1)
 
 
 def lengths_at_speeds(
     delta: Num[ArrayLike, "*batch"], speed: Num[ArrayLike, "*#batch"], unknown: Bool[ArrayLike, "*#batch"]
 ) -> Float[Array, "*batch"]:
-    """Returns segment_lengths [...] from the speeds of the samples' rays."""
+    """Returns segment_lengths [...] of samples, given what `speeds` returns for the ray of each."""
     infinite = jnp.isinf(delta)
     length = jnp.where(infinite & (speed > 0), jnp.inf, jnp.where(infinite, 0, delta) * speed)
     return jnp.where(unknown & (delta > 0), jnp.nan, length)

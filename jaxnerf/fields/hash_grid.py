@@ -212,9 +212,10 @@ def interpolate(
 
 
 def _stored(values):
-    """Returns arrays [N]; XLA would otherwise compute them again, unvectorized, for each level and vertex on a CPU.
+    """Returns the same arrays [N], written to memory once.
 
-    It does so for anything but reductions and the like, also behind an optimization_barrier.
+    On a CPU, XLA would otherwise compute them again in the loops of each level and vertex, which it then does not
+    vectorize. It never computes a reduction twice, hence a sum with zeros; an optimization_barrier does not help.
     """
     own = jnp.eye(len(values), dtype=bool)[..., None]
     return list(jnp.where(own, jnp.stack(values)[None], 0).sum(axis=1))

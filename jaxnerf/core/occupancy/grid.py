@@ -387,7 +387,7 @@ def _contracted(places, shape):
     along = [jnp.clip(place * (4 / size) - 2, -1e30, 1e30) for place, size in zip(places, shape, strict=True)]
     largest = jnp.maximum(jnp.maximum(*map(jnp.abs, along[:2])), jnp.abs(along[2]))
     safe = jnp.maximum(largest, 1)
-    # The box ends at infinity, and a point there is in its last cell.
     inverse = 1 / safe
+    # The box ends at infinity, and a point there is in its last cell.
     scale = jnp.minimum((2 - inverse) * inverse, _JUST_INSIDE * inverse)
     return [(value * scale + 2) * (size / 4) for value, size in zip(along, shape, strict=True)]
