@@ -27,7 +27,7 @@ NOTES = (
     "scored on 25 of its 200 test views",
     "at 100 x 100, so that its PSNR cannot be compared with the paper's, of 800 x 800. The poses that come with `can` "
     "contradict each other; with those",
-    "of `jaxnerf-cameras` the PSNR is [5 dB higher](docs/results/captures.md). "
+    "of `jaxnerf-cameras` the PSNR is [4 dB higher](docs/results/captures.md). "
     "[Speed against error](docs/results/speed.md) has commands, commit and machine.",
 )
 
