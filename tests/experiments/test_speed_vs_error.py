@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from captures import orbit, shoot, write_transforms
 from jaxnerf.core.sampling import inverse_cdf
 from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.training import workdir
@@ -71,6 +72,18 @@ def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, t
     monkeypatch.setattr(common, "matrix_gflops", lambda: 2 * common.REFERENCE_GFLOPS)
     point = training.run_to(3, config, tmp_path)
     assert (point["ended"], point["seconds"], point["comparable"]) == (ended, 2.0, 4.0)
+
+
+def test_views_of_a_config_with_fields_to_infer_are_read_once(tmp_path):
+    write_transforms(tmp_path, shoot(orbit(4)))
+    config = common.configuration("capture", {"data.dir": str(tmp_path)})
+    views = common.load_split(config, "train")
+    assert config.data.factor == "auto" and len(views.names) == 3  # the fourth is a test view
+    assert common.load_split(config, "train") is views
+    assert common.load_split(config, "test").names != views.names
+    for width in range(common._MOST_SPLITS):
+        common.load_split(common.changed(config, {"data.width": 100 + width}), "test")
+    assert common.load_split(config, "train") is not views
 
 
 def test_an_operation_is_not_charged_for_those_inside():

@@ -165,7 +165,7 @@ def test_positions_are_computed_once_and_not_for_each_vertex(field):
         return density.sum() + rgb.sum()
 
     text = jax.jit(jax.grad(loss)).lower(params, jnp.zeros((1, 640, 3))).compile().as_text()
-    assert text.count(" floor(") == 1
+    assert text.count(" floor(") in (1, 3)  # for all components together, or for each; without storing them 38
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
