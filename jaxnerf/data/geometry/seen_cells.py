@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 
 from jaxnerf.core import contraction
 from jaxnerf.core.cameras import project, undistort
@@ -24,6 +25,8 @@ _SLAB = 2**21  # corners of cells that are projected at once
 _SLOPES = 128  # directions along each side of an image that are looked up
 _STEEPEST = 10.0  # of these: 84 degrees from the axis
 _FREE_SAMPLES = 16  # between a camera and a surface
+_CLEARANCE = 0.75  # of the distance from a camera to the nearest matter: nothing is within that, in any direction
+_FEW_POINTS = 16  # nearest to a camera: fewer may be wrong matches
 _JUST_INSIDE = 2 * (1 - 1e-4)  # contracted space ends at 2, which is at infinity
 
 
@@ -33,8 +36,9 @@ def seen_cells(
     """Returns the cells that at least min_views views see, and those that are free.
 
     A view sees a cell if it sees one of its corners between near and far. A cell is free if it is in front of
-    `Views.free_until` for two of the views that see it, or for the only one: what a single camera shows close to it
-    has no parallax, so a field would put fog there that hides the scene from other cameras.
+    `Views.free_until` for two of the views that see it, or for the only one, or if it touches a sphere around a camera
+    of the radius `clear_radii`. What few cameras show close to a camera's place has little parallax, so a field would
+    put fog there that hides the scene from cameras beside that place.
 
     Args:
         views: of the split that is trained on; a masked pixel sees nothing.
@@ -49,8 +53,25 @@ def seen_cells(
     planes = -(-size // slabs)
     count = _view_counter(views, schedule, planes)
     parts = zip(*(map(np.asarray, count(first)) for first in range(0, size, planes)), strict=True)
-    num_seen, num_free = (np.concatenate(part)[:size] for part in parts)
-    return num_seen >= min_views, (num_free > 0) & (num_free >= np.minimum(num_seen, 2))
+    num_seen, num_free, clear = (np.concatenate(part)[:size] for part in parts)
+    return num_seen >= min_views, clear | (num_free > 0) & (num_free >= np.minimum(num_seen, 2))
+
+
+def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
+    """Returns the radius [V], in world units, of a sphere around each camera in which there is no matter.
+
+    A photographer stands there, and where nothing in the image is close, nothing beside the image is much closer, in
+    general. The radius is 0.75 times `Views.free_until`, or times the distance to the 16th nearest sparse point, seen
+    from there or not, if that is less. It is 0 where `free_until` is 0 or not known.
+    """
+    if views.free_until is None:
+        return np.zeros(len(views.offset), np.float32)
+    nearest = np.asarray(views.free_until)
+    if views.sparse is not None and len(views.sparse.positions) >= _FEW_POINTS:
+        centers = np.asarray(views.cameras.to_world)[:, :, 3]
+        distances, _ = cKDTree(views.sparse.positions).query(centers, [_FEW_POINTS])
+        nearest = np.minimum(nearest, distances[:, 0])
+    return np.float32(_CLEARANCE * nearest)
 
 
 def likely_empty_cells(
@@ -91,10 +112,13 @@ def likely_empty_cells(
 
 
 def _view_counter(views, schedule, planes):
-    """Returns a function of the first of some planes of cells: how many views see each, and how many see it free."""
+    """Returns a function of the first of some planes of cells.
+
+    It returns how many views see each cell, how many of these see it free, and whether it touches a clear sphere.
+    """
     shape, (lower, upper) = schedule.shape, np.float32([schedule.lower, schedule.upper]).reshape(2, 1, 1, 1, 3)
     free_until = np.zeros(len(views.offset), np.float32) if views.free_until is None else views.free_until
-    known = views.cameras.to_world, views.near, views.far, free_until
+    known = views.cameras.to_world, clear_radii(views), views.near, views.far, free_until
     stack = *(jnp.asarray(each, jnp.float32) for each in known), *_shown_slopes(views)
 
     @jax.jit
@@ -106,17 +130,17 @@ def _view_counter(views, schedule, planes):
         corners = jnp.moveaxis(lower + place * (upper - lower), -1, 0)
 
         def add(view, counts):
-            seen, behind = map(_any_corner, _sees(*(leaf[view] for leaf in stack), corners))
-            return counts[0] + seen, counts[1] + (seen & ~behind)
+            seen, behind, clear = map(_any_corner, _sees(*(leaf[view] for leaf in stack), corners))
+            return counts[0] + seen, counts[1] + (seen & ~behind), counts[2] | clear
 
         none = jnp.zeros((planes, *shape[1:]), jnp.int32)
-        return jax.lax.fori_loop(0, len(free_until), add, (none, none))
+        return jax.lax.fori_loop(0, len(free_until), add, (none, none, none > 0))
 
     return functools.partial(count, stack)
 
 
-def _sees(to_world, near, far, free_until, least, scale, shown, x):
-    """Returns whether a view sees positions x [3, ...], and whether these are behind the space that is free."""
+def _sees(to_world, clear_radius, near, far, free_until, least, scale, shown, x):
+    """Returns which of the positions x [3, ...] a view sees, sees behind its free space, and has around its camera."""
     offset = [x[axis] - to_world[axis, 3] for axis in range(3)]
     right, up, back = (sum(to_world[i, axis] * offset[i] for i in range(3)) for axis in range(3))
     depth = -back
@@ -126,7 +150,8 @@ def _sees(to_world, near, far, free_until, least, scale, shown, x):
     inside = (column >= 0) & (row >= 0) & (column < _SLOPES) & (row < _SLOPES)
     column, row = (jnp.where(inside, value, 0).astype(jnp.int32) for value in (column, row))
     seen = ahead & inside & shown[row, column]
-    return seen, seen & (depth >= free_until)
+    close = sum(value**2 for value in offset) < clear_radius**2
+    return seen, seen & (depth >= free_until), close
 
 
 def _shown_slopes(views):

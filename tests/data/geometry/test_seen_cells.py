@@ -10,7 +10,7 @@ from jaxnerf.core.cameras import project
 from jaxnerf.core.types import Camera, SparsePoints, Views
 from jaxnerf.data.active_pixels import active_region
 from jaxnerf.data.geometry.free_space import surface_range
-from jaxnerf.data.geometry.seen_cells import likely_empty_cells, seen_cells
+from jaxnerf.data.geometry.seen_cells import clear_radii, likely_empty_cells, seen_cells
 from jaxnerf.models.grid_schedule import make_grid_schedule
 
 SIZE, FOCAL = 48, 48.0  # px: each view covers 53 degrees
@@ -135,12 +135,41 @@ def test_the_space_in_front_of_the_stated_depth_is_free(contracted):
 
 def test_two_views_that_see_a_cell_must_agree_that_it_is_free():
     schedule = a_schedule()
-    x, views = centers(schedule), some_views((0.0, 0.5), free_until=np.float32([1.9, 0.0]))
+    x, views = centers(schedule), some_views((0.0, 0.5), free_until=np.float32([3.0, 0.0]))
     _, free = seen_cells(views, schedule, min_views=1)
-    near = (-x[..., 2] > 0.3) & (-x[..., 2] < 1.6)
+    near = (np.linalg.norm(x, axis=-1) > 2.6) & (-x[..., 2] < 2.8)  # and not within 2.25 of the first camera
     both, alone = (in_view(x, 0.0, -0.15) & seen & near for seen in (in_view(x, 0.5, -0.15), ~in_view(x, 0.5, 0.3)))
     assert both.any() and not free[both].any()  # the other view may show something there
     assert alone.any() and free[alone].all()
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_the_space_around_a_camera_is_free(contracted):
+    """Also beside it and behind it, where only other cameras see."""
+    schedule = a_schedule(contracted=contracted)
+    views = some_views((-0.5, 0.5), free_until=np.float32([0.8, 1.6]))
+    _, free = seen_cells(views, schedule, min_views=1)
+    x = centers(schedule)
+    distance = np.stack([np.linalg.norm(x - [eye, 0, 0], axis=-1) for eye in (-0.5, 0.5)])
+    radius = np.reshape([0.6, 1.2], (2, 1, 1, 1))
+    behind = x[..., 2] > 0.2
+    assert free[(distance < radius).any(axis=0)].all()
+    assert not free[behind & (distance > radius + 0.25).all(axis=0)].any()  # 0.25: more than half a cell's diagonal
+
+
+def test_the_nearest_points_bound_the_space_around_a_camera():
+    """Points that a camera does not see count, too, unless there are so few that they may be wrong."""
+    views = with_wall(some_views(free_until=np.float32([1.0, 8.0])))
+    to_wall = np.sort(np.linalg.norm(views.sparse.positions - views.cameras.to_world[1, :, 3], axis=-1))[15]
+    np.testing.assert_allclose(clear_radii(views), 0.75 * np.array([1.0, to_wall]), rtol=1e-6)
+    behind = np.float32([0.25, 0, 0.5]) + 1e-3 * np.arange(16, dtype=np.float32)[:, None]
+    for count, nearest in ((14, to_wall), (16, np.linalg.norm(behind[15] - views.cameras.to_world[1, :, 3]))):
+        positions = np.concatenate([views.sparse.positions, behind[:count]])
+        more = dataclasses.replace(views, sparse=dataclasses.replace(views.sparse, positions=positions))
+        assert clear_radii(more)[1] == pytest.approx(0.75 * nearest, rel=0.05)
+    few = dataclasses.replace(views.sparse, positions=views.sparse.positions[:15])
+    np.testing.assert_allclose(clear_radii(dataclasses.replace(views, sparse=few)), [0.75, 6.0])
+    np.testing.assert_array_equal(clear_radii(dataclasses.replace(views, free_until=None)), [0, 0])
 
 
 def test_surface_range_holds_the_wall_and_ignores_a_wrong_point():
