@@ -109,9 +109,6 @@ def get_config():
                 "uniform_fraction": 0.4,
                 "max_optical_depth": 6.0,  # training skips samples behind it, as estimated by the grid; 0: off
                 "occlusion_start_step": 400,  # training step from which max_optical_depth applies
-                # World units; the gradients of samples that are closer to the camera are reduced; 0: off. Otherwise
-                # fog forms in front of the cameras (arXiv:2305.02756).
-                "near_gradient_distance": auto(float),
                 "min_views": auto(int),  # training views that must see a cell; other cells are empty; 0: no limit
             },
             # Weight of each loss; 0: off. A weight may be a schedule ((step, weight), ...), linear between its points.

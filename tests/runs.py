@@ -37,7 +37,6 @@ PACKED = {
     "occupancy.update_every": 4,
     "occupancy.pool_samples_per_ray": 32,
     "occupancy.min_views": 0,
-    "occupancy.near_gradient_distance": 0.0,
     "hash_grid.resolutions": (8, 16),
     "hash_grid.table_size": 2048,
     "hash_grid.width": 16,

@@ -40,7 +40,6 @@ VARIANTS = {
     "hash_decay 1": {"losses.hash_decay": 1.0},
     "total_variation 0.1": {"losses.total_variation": 0.1},
     "total_variation 1": {"losses.total_variation": 1.0},
-    "full gradients near cameras": {"occupancy.near_gradient_distance": 0.0},
     "cells that no view sees stay": {"occupancy.min_views": 0},
     "exposure": {"cameras.exposure": True},
     "refine": {"cameras.refine": True},

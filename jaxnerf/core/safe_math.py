@@ -17,18 +17,6 @@ def _divide_jvp(primals, tangents):
     return quotient, tangents[0] * inverse - (quotient * inverse) * tangents[1]
 
 
-@jax.custom_jvp
-def scale_gradient(x: Float[ArrayLike, "*shape"], scale: Float[ArrayLike, "*#shape"]) -> Float[Array, "*shape"]:
-    """Returns x, whose derivative is multiplied by a scale."""
-    del scale
-    return jnp.asarray(x)
-
-
-@scale_gradient.defjvp
-def _scale_gradient_jvp(primals, tangents):
-    return jnp.asarray(primals[0]), primals[1] * tangents[0]
-
-
 def clamp(
     x: Float[ArrayLike, "*#shape"], lower: Float[ArrayLike, "*#shape"], upper: Float[ArrayLike, "*#shape"]
 ) -> Float[Array, "*#shape"]:

@@ -44,7 +44,6 @@ def from_context(context: SamplerContext) -> Model:
         uniform_fraction=section.get("uniform_fraction", 1.0),
         max_optical_depth=section["max_optical_depth"],
         occlusion_start_step=section["occlusion_start_step"],
-        near_gradient_distance=section.get("near_gradient_distance", 0.0),
         **view_options(context),
     )
 
@@ -71,7 +70,6 @@ def occupancy_model(
     uniform_fraction: float,
     max_optical_depth: float,
     occlusion_start_step: int,
-    near_gradient_distance: float,
     early_stop_eps: float,
     sample_multiplier: float,
     max_samples: int,
@@ -88,7 +86,6 @@ def occupancy_model(
         max_optical_depth: training skips samples behind this optical depth, as estimated by the grid;
             0: no limit.
         occlusion_start_step: the training step from which max_optical_depth applies.
-        near_gradient_distance: see `render_packed`.
         early_stop_eps: of images: transmittance below which a ray ends.
         sample_multiplier: samples of images over those of training.
         max_samples: of images: samples evaluated at once.
@@ -107,8 +104,7 @@ def occupancy_model(
         candidates = march_rays(None, grid, fixed, step_size=schedule.step_size, cell=schedule.cell)
         options = {"max_samples": buffer, "uniform_fraction": uniform_fraction, "max_optical_depth": limit}
         samples, occluded = importance_samples(keys, grid, fixed, candidates, **options)
-        options = {"longest": candidates.t.shape[-1], "near_gradient_distance": near_gradient_distance}
-        rendering = render_placed(scene(params), rays, samples, **options)
+        rendering = render_placed(scene(params), rays, samples, longest=candidates.t.shape[-1])
         return (_over_background(rendering, occluded, background),)
 
     return Model(

@@ -314,9 +314,6 @@ def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:
     """
     infer, section = _inferring(lines), config.occupancy
     everywhere = config.sampler == "occupancy" and section.contracted
-    distance = float(np.median(_LookAt(views).distance)) if everywhere else 0.0
-    line = f"near space    gradients are reduced within {distance:.3g} of a camera"
-    infer(section, "near_gradient_distance", distance, line, used=everywhere)
     line = "valid cells   those that a training view sees"
     infer(section, "min_views", 1 if everywhere else 0, line, used=everywhere)
     count = num_shared(views) if everywhere else 0
@@ -329,6 +326,7 @@ def _resolve_near(config: ConfigDict, views: Views, lines: list[str]) -> Views:
         config.data.near = 0.0
         return views
     unit = 1.0 if views.to_file is None else world.unit_of(views.to_file)
+    distance = float(np.median(_LookAt(views).distance))
     config.data.near = float(f"{_NEAR * distance * unit:.4g}")
     near = np.float32(config.data.near / unit)
     lines.append(f"near          {near:.3g} for all images, so that the space in front of each camera is trained")

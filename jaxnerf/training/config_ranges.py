@@ -45,9 +45,8 @@ _RANGES = (
             "coarse.skip_layer fine.skip_layer "
             "data.near data.far data.hold_out data.num_views sampling.num_fine sampling.importance_padding "
             "sampling.density_noise hash_grid.geometry_features occupancy.threshold "
-            "occupancy.near_gradient_distance occupancy.min_views "
-            "occupancy.max_optical_depth occupancy.occlusion_start_step train.max_seconds train.warmup_steps "
-            "train.muon train.averaging_power train.max_reinits train.preview_every "
+            "occupancy.min_views occupancy.max_optical_depth occupancy.occlusion_start_step train.max_seconds "
+            "train.warmup_steps train.muon train.averaging_power train.max_reinits train.preview_every "
             "cameras.refine_start_step eval.summary_seconds"
         ),
     ),
@@ -75,7 +74,7 @@ _CHOICES = {
 # Configs of older versions may lack these: they have a value where they are missing, or only training reads them, for
 # which `workdir.config_to_resume` has added the defaults.
 _OPTIONAL = (
-    "cameras occupancy.uniform_fraction occupancy.near_gradient_distance occupancy.min_views train.preview_every "
+    "cameras occupancy.uniform_fraction occupancy.min_views train.preview_every "
     "train.max_to_keep train.max_nonfinite train.max_seconds eval.at_end eval.summary_seconds occupancy.update_chunk "
     "hash_grid.compute_dtype train.steps_per_dispatch train.cpu_batch_size train.lr_decay_power "
     "data.background_color"

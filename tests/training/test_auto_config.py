@@ -39,7 +39,6 @@ AUTO_FIELDS = {
     "occupancy.upper": (1.0, 2.0, 3.5),
     "occupancy.step_size": 0.25,
     "occupancy.resolution": 32,
-    "occupancy.near_gradient_distance": 0.5,
     "occupancy.min_views": 2,
     "occupancy.update_chunk": 4096,
     "data.near": 0.5,
@@ -243,8 +242,7 @@ def test_explicit_values_do_not_change(views):
     config = resolve(given, views).config
     assert given.to_json_best_effort() == before and unresolved(given)
     changed = {name for name, value in fields(config).items() if value != fields(given)[name]}
-    names = ("contracted", "lower", "upper", "step_size", "resolution")
-    names += ("near_gradient_distance", "min_views")
+    names = ("contracted", "lower", "upper", "step_size", "resolution", "min_views")
     expected = {"data.world", "data.fingerprint", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
     expected |= {"data.near", "data.background_color", "cameras.num_images", "losses.depth"}
     assert changed == expected

@@ -87,7 +87,6 @@ class Tiny:
             experiment.model.grid_schedule,
             pool_samples_per_ray=16,
             uniform_fraction=1.0,
-            near_gradient_distance=0.0,
             max_optical_depth=3.0,  # a transmittance of 5 %
             occlusion_start_step=occlusion_start_step,
             early_stop_eps=0.0,
@@ -233,7 +232,6 @@ def toy():
         schedule,
         pool_samples_per_ray=1,
         uniform_fraction=1.0,
-        near_gradient_distance=0.0,
         max_optical_depth=1.0,
         occlusion_start_step=8,
         early_stop_eps=0.0,

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
-from jaxnerf.core.safe_math import scale_gradient
 from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
 from jaxnerf.core.varying import vary_like
 
@@ -48,7 +47,6 @@ def render_packed(
     *,
     max_samples: int,
     early_stop_eps: float = 0.0,
-    near_gradient_distance: float = 0.0,
     background: Background | None = None,
     median_depth: bool = False,
 ) -> Rendering:
@@ -69,10 +67,6 @@ def render_packed(
             transmittance is still above early_stop_eps. The remaining light of a terminated ray is assumed to
             look like the rest of the ray. If colours are in [0, 1], the colour is then within early_stop_eps of
             the exact one, and so is the opacity, which is 1. This mode is for rendering; it has no reverse mode.
-        near_gradient_distance: world units, of the camera; 0: off. The gradient of a sample at a smaller distance d is
-            multiplied by (d / near_gradient_distance)^2, as the number of samples that a camera places in a volume
-            near it grows with 1 / d^2 (arXiv:2305.02756). Otherwise fog forms in front of the cameras. Only without
-            early termination.
         background: see render_samples.
         median_depth: see render_samples; an early_stop_eps must then be at most 0.5.
 
@@ -102,7 +96,7 @@ def render_packed(
         num_dropped = occupied.count - jnp.clip(max_samples - _first(occupied), 0, occupied.count)
         placed = PlacedSamples(t, delta, buffer.ray, buffer.used, num_dropped)
         options = {"rule": samples.rule, "longest": samples.t.shape[-1], "median_depth": median_depth}
-        sums, packed = _composite("render_packed", scene, rays, placed, near_gradient_distance, **options)
+        sums, packed = _composite("render_packed", scene, rays, placed, **options)
     return _rendering(sums, num_dropped, rays.far, shape, background, packed)
 
 
@@ -112,7 +106,6 @@ def render_placed(
     placed: PlacedSamples,
     *,
     longest: int,
-    near_gradient_distance: float = 0.0,
     background: Background | None = None,
 ) -> Rendering:
     """Renders samples that are in a buffer already, such as those of `importance_samples`.
@@ -122,7 +115,6 @@ def render_placed(
         rays: Rays [B].
         placed: PlacedSamples [K] of these rays, of the rule "segments".
         longest: upper bound of the number of samples of a ray.
-        near_gradient_distance: see render_packed.
         background: see render_samples.
 
     Returns:
@@ -132,7 +124,7 @@ def render_placed(
     shape, scene = rays.near.shape, _without_gradient_if_empty(scene, rays)
     rays = _at_least_one(jax.tree.map(jnp.asarray, rays))
     options = {"rule": "segments", "longest": longest}
-    sums, packed = _composite("render_placed", scene, rays, placed, near_gradient_distance, **options)
+    sums, packed = _composite("render_placed", scene, rays, placed, **options)
     num_dropped = _at_least_one(placed.num_dropped)
     return _rendering(sums, num_dropped, rays.far, shape, background, packed)
 
@@ -384,15 +376,12 @@ def _evaluate(function, scene, rays, t, ray_index, used):
     return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
 
 
-def _composite(function, scene, rays, placed, near_gradient_distance, *, rule, longest, median_depth=False):
+def _composite(function, scene, rays, placed, *, rule, longest, median_depth=False):
     """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
     t, ray = placed.t, placed.ray_index
     density, rgb = _evaluate(function, scene, rays, t, ray, placed.used)
     speed, unknown = (of_ray[ray] for of_ray in rendering.speeds(rays))
     length = jnp.where(placed.used, rendering.lengths_at_speeds(placed.delta, speed, unknown), 0)
-    if near_gradient_distance:
-        scale = jnp.minimum(speed * t / near_gradient_distance, 1) ** 2
-        density, rgb = scale_gradient(density, scale), scale_gradient(rgb, scale[:, None])
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
     weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=longest)
     colours = [rgb[:, axis] * weights for axis in range(3)]

@@ -361,24 +361,3 @@ def test_long_rays_come_first_whatever_the_number_of_samples(most):
     count = np.random.default_rng(0).integers(0, 8, 100).astype(np.int32)
     order = packed_module._longest_first(jnp.asarray(count), most)
     np.testing.assert_array_equal(order, np.argsort(-count, kind="stable"))
-
-
-def test_gradients_near_the_camera_are_reduced(rays, samples):
-    """The rendering stays the same, and the gradient of a sample at distance d is (d / 4)^2 times as large."""
-
-    def total(offsets, reach):
-        def shifted(x, viewdirs):
-            return (scene(x, viewdirs)[0] + offsets[0], jax.nn.sigmoid(3 * x + viewdirs) + offsets[1])
-
-        options = {"max_samples": RAYS * SEGMENTS, "near_gradient_distance": reach}
-        return jaxnerf.render_packed(shifted, None, rays, samples, **options).rgb.sum()
-
-    zeros = jnp.zeros((1, RAYS * SEGMENTS)), jnp.zeros((1, RAYS * SEGMENTS, 3))
-    plain, slopes = jax.jit(jax.value_and_grad(lambda offsets: total(offsets, 0.0)))(zeros)
-    reduced, smaller = jax.jit(jax.value_and_grad(lambda offsets: total(offsets, 4.0)))(zeros)
-    assert plain == reduced
-    distance = np.asarray(samples.t * jnp.linalg.norm(rays.directions, axis=-1, keepdims=True)).reshape(1, -1)
-    scale = np.minimum(distance / 4, 1) ** 2
-    assert (scale < 0.9).any() and (scale == 1).any()
-    np.testing.assert_allclose(smaller[0], scale * slopes[0], rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(smaller[1], scale[..., None] * slopes[1], rtol=1e-5, atol=1e-7)
