@@ -61,17 +61,16 @@ def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
     """Returns the radius [V], in world units, of a sphere around each camera in which there is no matter.
 
     A photographer stands there, and where nothing in the image is close, nothing beside the image is much closer, in
-    general. The radius is 0.75 times `Views.free_until`, or times the distance to the 16th nearest sparse point, seen
-    from there or not, if that is less. It is 0 where `free_until` is 0 or not known.
+    general. The radius is 0.75 times the distance to the nearest matter: `Views.free_until`, or the distance to the
+    16th nearest sparse point, seen from there or not, if that is less. It is 0 where neither is known.
     """
-    if views.free_until is None:
-        return np.zeros(len(views.offset), np.float32)
-    nearest = np.asarray(views.free_until)
+    known = np.zeros(len(views.offset)) if views.free_until is None else np.asarray(views.free_until)
+    nearest = np.where(known > 0, known, np.inf)
     if views.sparse is not None and len(views.sparse.positions) >= _FEW_POINTS:
         centers = np.asarray(views.cameras.to_world)[:, :, 3]
         distances, _ = cKDTree(views.sparse.positions).query(centers, [_FEW_POINTS])
         nearest = np.minimum(nearest, distances[:, 0])
-    return np.float32(_CLEARANCE * nearest)
+    return np.float32(np.where(np.isinf(nearest), 0, _CLEARANCE * nearest))
 
 
 def likely_empty_cells(

@@ -169,7 +169,11 @@ def test_the_nearest_points_bound_the_space_around_a_camera():
         assert clear_radii(more)[1] == pytest.approx(0.75 * nearest, rel=0.05)
     few = dataclasses.replace(views.sparse, positions=views.sparse.positions[:15])
     np.testing.assert_allclose(clear_radii(dataclasses.replace(views, sparse=few)), [0.75, 6.0])
-    np.testing.assert_array_equal(clear_radii(dataclasses.replace(views, free_until=None)), [0, 0])
+    unknown = some_views(free_until=np.float32([0.0, 0.0]))
+    for free_until in (None, unknown.free_until):
+        alone = clear_radii(dataclasses.replace(views, free_until=free_until))
+        np.testing.assert_allclose(alone[1], 0.75 * to_wall, rtol=1e-6)
+        np.testing.assert_array_equal(clear_radii(dataclasses.replace(unknown, free_until=free_until)), [0, 0])
 
 
 def test_surface_range_holds_the_wall_and_ignores_a_wrong_point():
