@@ -43,7 +43,7 @@ SURFACE = {
     "update_grid": "key grid scene cells | threshold decay=0.6 smoothing=0.2 spread=True chunk=8192",
     "grid_from_scene": "key scene lower upper shape | threshold contracted=False num_updates=4 chunk=8192",
     "mask_scene": "scene grid |",
-    "render_packed": ("scene grid rays samples | max_samples early_stop_eps=0.0 background=None median_depth=False"),
+    "render_packed": "scene grid rays samples | max_samples early_stop_eps=0.0 background=None median_depth=False",
     "mse": "a b | mask=None",
     "psnr": "a b | mask=None",
     "ssim": "a b |",

@@ -222,15 +222,19 @@ def _stored(values):
 
 @jax.custom_jvp
 def _first_product(kernel, features):
-    """Returns the product [F, N] of kernel [D, F] and features [N, D]: small layers are faster with features first."""
+    """Returns the transposed product [F, N] of features [N, D] and a kernel [D, F].
+
+    The table yields one row per sample, but the layers that follow are faster with features first.
+    """
     return jnp.einsum("df,nd->fn", kernel, features)
 
 
 @_first_product.defjvp
 def _first_product_jvp(primals, tangents):
-    """Differentiates features [D, N]: with [N, D], the backward pass's products take three times as long on a CPU.
+    """Differentiates the product with the features transposed, as the backward pass is then faster on a CPU.
 
-    Without the barrier, XLA would turn the products back to [N, D]. Alone, the product itself is faster with them.
+    The barrier keeps XLA from merging the transpositions into the products. Without derivatives the transposition
+    would only cost time.
     """
     kernel, features = primals
     features, change = (jax.lax.optimization_barrier(each.T) for each in (features, tangents[1]))

@@ -170,7 +170,7 @@ def test_positions_are_computed_once_and_not_for_each_vertex(field):
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="concerns the compiler for CPUs")
 def test_products_of_the_backward_pass_have_features_first(field):
-    """With one row per sample they take three times as long."""
+    """Those with one row per sample are slower."""
     field, params, *_ = field
     count, features = 640, params["kernel"].shape[0]
 

@@ -54,7 +54,7 @@ def seen_cells(
     count = _view_counter(views, schedule, planes)
     parts = zip(*(map(np.asarray, count(first)) for first in range(0, size, planes)), strict=True)
     num_seen, num_free, clear = (np.concatenate(part)[:size] for part in parts)
-    return num_seen >= min_views, clear | (num_free > 0) & (num_free >= np.minimum(num_seen, 2))
+    return num_seen >= min_views, clear | ((num_free > 0) & (num_free >= np.minimum(num_seen, 2)))
 
 
 def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
