@@ -37,8 +37,7 @@ def main(argv):
     from jaxnerf.data.dataset import dataset_folder
     from jaxnerf.data.readers.validation import check_range
 
-    if None not in (_NEAR.value, _FAR.value):
-        check_range(_NEAR.value, _FAR.value)
+    check_range(0 if _NEAR.value is None else _NEAR.value, 3e38 if _FAR.value is None else _FAR.value)
     folder = dataset_folder(_DATA_DIR.value)
     try:
         from jaxnerf.capture_check import camera_plot

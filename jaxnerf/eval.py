@@ -82,6 +82,17 @@ def _check_flags(is_sharded):
     for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):
         if is_sharded and value:
             raise ValueError(f"--shard splits the views of one checkpoint, not --{name}; drop one of them")
+    # What --predictions and --watch cannot use.
+    of_one_checkpoint = {"step": _STEP.value, "error_budget": _ERROR_BUDGET.value}
+    of_a_run = of_one_checkpoint | {"chunk": _CHUNK.value, "bake_occupancy": _BAKE_OCCUPANCY.value}
+    unused = {
+        "predictions": (_PREDICTIONS.value, of_a_run | {"watch": _WATCH.value or None}),
+        "watch": (_WATCH.value, of_one_checkpoint | {"overwrite": _OVERWRITE.value or None}),
+    }
+    for name, (given, others) in unused.items():
+        for other, value in others.items():
+            if given and value is not None:
+                raise ValueError(f"--{name} does not use --{other}; drop one of them")
     if is_sharded and _ERROR_BUDGET.value is not None:
         raise ValueError("--error_budget measures times, so shards would choose different settings; drop --shard")
 

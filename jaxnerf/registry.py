@@ -182,7 +182,7 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
     Raises:
         ValueError: if another format has that name.
     """
-    READERS.add(name, Reader(read, detect or (lambda folder: False)))
+    READERS.add(name, Reader(read, detect or _never))
 
 
 def register_exporter(name: str, export: Callable[..., Any]) -> None:
@@ -197,3 +197,7 @@ def register_exporter(name: str, export: Callable[..., Any]) -> None:
         ValueError: if another exporter has that name.
     """
     EXPORTERS.add(name, export)
+
+
+def _never(folder):
+    return False

@@ -40,7 +40,7 @@ VARIANTS = {
     "hash_decay 1": {"losses.hash_decay": 1.0},
     "total_variation 0.1": {"losses.total_variation": 0.1},
     "total_variation 1": {"losses.total_variation": 1.0},
-    "cells that no view sees stay": {"occupancy.min_views": 0},
+    "cells that no view sees may be occupied": {"occupancy.min_views": 0},
     "exposure": {"cameras.exposure": True},
     "refine": {"cameras.refine": True},
 }
@@ -61,14 +61,19 @@ def main(argv: list[str]) -> None:
     out = pathlib.Path(_OUT.value)
     names = common.chosen("--only", _ONLY.value or list(VARIANTS), list(VARIANTS))
     kept = common.read_json(out / "ablation.json")
+    described = {"data_dir": _DATA_DIR.value, "steps": _STEPS.value}
+    if kept.setdefault("settings", described) != described:
+        raise ValueError(
+            f"{out / 'ablation.json'}: has runs of {kept['settings']}, not {described}; give another --out"
+        )
     for seed in common.seeds_of("--seeds", _SEEDS.value):
         for name in names:
-            row = kept.setdefault(name, {})
+            row = kept.setdefault("variants", {}).setdefault(name, {})
             if str(seed) not in row:
                 print(f"seed {seed}: {name}", file=sys.stderr, flush=True)
                 row[str(seed)] = _measure(name, seed, out / f"{name.replace(' ', '_')}-{seed}")
                 common.write_json(out / "ablation.json", kept)
-    common.publish(report(kept), _TABLE.value)
+    common.publish(report(kept.get("variants", {})), _TABLE.value)
 
 
 def _configuration(name, seed):

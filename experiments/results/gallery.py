@@ -3,7 +3,9 @@
     python experiments/results/gallery.py WORKDIR ... --out=docs/gallery [--frames=24] [--width=240]
 
 Each run was scored by `jaxnerf-eval` and rendered by `jaxnerf-render`; the newest of either is shown. The view is the
-one in the middle of the scored views. Writes OUT/RUN.jpg, OUT/RUN.webp and the page OUT/index.md, and replaces them.
+one in the middle of the scored views. Replaces OUT/RUN.jpg and OUT/RUN.webp and writes
+the page OUT/index.md. In a page that exists, the part between the marks <!-- runs --> and <!-- end of runs --> is
+replaced.
 """
 
 import pathlib
@@ -37,13 +39,14 @@ def main(argv: list[str]) -> None:
     if not folders:
         raise ValueError("no workdir is given; name those of runs that were scored and rendered")
     out.mkdir(parents=True, exist_ok=True)
-    lines = ["# Gallery", "", *common.provenance(), ""]
-    lines += ["Left to right: a view that was not trained on, its rendering, and the depth, where near is bright."]
-    lines += ["Below: frames along a path of `jaxnerf-render`.", ""]
-    for folder in folders:
-        lines += show(folder, out)
-    write_text(out / "index.md", "\n".join(lines))
-    print(f"wrote {out / 'index.md'}: {len(folders)} runs")
+    shown, page = [line for folder in folders for line in show(folder, out)], out / "index.md"
+    if not page.exists():
+        lines = ["# Gallery", "", *common.provenance(), ""]
+        lines += ["Left to right: a view that was not trained on, its rendering, and the depth, where near is bright."]
+        lines += ["Below: frames along a path of `jaxnerf-render`.", "", "<!-- runs -->", "<!-- end of runs -->", ""]
+        write_text(page, "\n".join(lines))
+    common.replace(page, shown, "runs")
+    print(f"wrote {page}: {len(folders)} runs")
 
 
 def show(folder: pathlib.Path, out: pathlib.Path) -> list[str]:

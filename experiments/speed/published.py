@@ -57,9 +57,9 @@ RENDERING = [  # seconds of an 800x800 frame, but where another size is said
     _entry("OpenSplat", None, 0.6, "one core, AVX2", "lego, 800x800, trained at 100x100", _PART_E, "measured by hand"),
 ]
 
-# Peers on one core of the kind of machine that `speed_vs_error.py` was run on, process CPU seconds, one
-# run each, by hand: TensoRF (VM decomposition, grid 32^3 to 100^3) in PyTorch, and OpenSplat's CPU build from COLMAP's
-# points. Curve of this project beside them: {peer: {seconds: PSNR}}.
+# Peers on one core of a machine with AVX2, process CPU seconds, one run each, by hand: TensoRF (VM decomposition, grid
+# 32^3 to 100^3) in PyTorch, and OpenSplat's CPU build from 10,000 points on the visual hull of lego and from COLMAP's
+# points of can. Curve of this project beside them: {peer: {seconds: PSNR}}.
 PEERS = {
     "grid without alpha": {"TensoRF": {15: 28.7, 30: 30.3, 60: 31.9, 120: 32.9}},
     "grid": {"OpenSplat": {25: 26.1, 52: 28.4, 109: 30.2}},

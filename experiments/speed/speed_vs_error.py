@@ -150,7 +150,9 @@ def published_tables() -> list[str]:
     return [
         *_others(heads, published.TRAINING, psnr="{:.2f}", seconds="{:,.0f}"),
         "",
-        "Other programs, run once each by hand on one core of such a machine, in CPU seconds of the process:",
+        "Other programs, in CPU seconds of the whole process, start-up included. They were run once each, by hand, on "
+        "one core of a machine with AVX2. TensoRF (PyTorch) does not use alpha. OpenSplat (its build for CPUs) starts "
+        "from 10,000 points on the visual hull of lego, and from COLMAP's points of `can`.",
         "",
         *common.markdown(("as the curve", "program", "PSNR of the same test views"), peers),
     ]

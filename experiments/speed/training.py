@@ -93,12 +93,13 @@ def measure(
         for seed in seeds if name in SEEDED else seeds[:1]:
             points = curve["runs"].setdefault(str(seed), [])
             for time_limit in sorted(seconds or plan["seconds"]):
-                if points and (time_limit <= points[-1]["time_limit"] or points[-1]["ended"]):
+                if any(_settles(point, time_limit) for point in points):
                     continue
                 point = run_to(time_limit, configuration(name, seed), folder / workdir_name(name, seed, time_limit))
                 if point is None:
                     return False
                 points.append(point)
+                points.sort(key=lambda point: point["time_limit"])
                 save(kept)
                 print(f"{name}, seed {seed}: {point['psnr']:.2f} dB in {point['seconds']:.0f} s", flush=True)
     return True
@@ -154,3 +155,8 @@ def medians(runs: dict[str, list[dict]]) -> list[dict]:
         found.append({key: statistics.median(point[key] for point in same) for key in numbers})
         found[-1]["seeds"] = [point["psnr"] for point in same]
     return found
+
+
+def _settles(point, time_limit):
+    """Returns whether a run of so many seconds need not be measured: it was, or a shorter one ended by itself."""
+    return point["time_limit"] == time_limit or (point["ended"] and point["time_limit"] < time_limit)

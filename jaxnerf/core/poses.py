@@ -29,13 +29,19 @@ def turntable(
         center: [3] world.
         radius: distance to the center, world units.
         elevation: radians above the plane through the center that is perpendicular to up.
-        up: [3] axis of the circle; unit length, not parallel to x + 0.1 y.
+        up: [3] axis of the circle, any length > 0.
 
     Returns:
         Poses [N, 3, 4].
+
+    Raises:
+        ValueError: on other shapes.
     """
     center, up = jnp.asarray(center, jnp.float32), jnp.asarray(up, jnp.float32)
-    first = normalize(jnp.cross(up, jnp.array([1.0, 0.1, 0.0])))
+    check_shapes("turntable", center=(center, "3"), up=(up, "3"))
+    up = normalize(up)
+    across = jnp.cross(up, jnp.array([1.0, 0.1, 0.0]))
+    first = normalize(jnp.where(norm(across) > 1e-3, across, jnp.cross(up, jnp.array([0.0, 1.0, 0.0]))))
     flat = radius * math.cos(elevation)
     axes = jnp.stack([flat * first, flat * jnp.cross(up, first)])
     middle = center + radius * math.sin(elevation) * up
@@ -155,7 +161,7 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Float[Array, "3 4"]:
         eye: [3] position of the camera, world.
         target: [3] the point in the center of the image, world.
         up: [3] upwards in the image, any length > 0. If it is parallel to the viewing direction, another axis
-            replaces it.
+            replaces it. No direction leads from a point to itself: a target at the eye makes the rotation 0.
 
     Returns:
         Pose [3, 4], camera to world.

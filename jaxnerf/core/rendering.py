@@ -14,7 +14,7 @@ from jaxnerf.core.types import Background, Keys, Rays, Rendering, Samples, Scene
 
 
 def points_on_rays(rays: Rays, t: Num[ArrayLike, "*batch samples"]) -> Float[Array, "*batch samples 3"]:
-    """Computes the points x(t) = o + t d on rays [...] for t [..., S], in world units."""
+    """Computes the points x(t) = o + t d on rays [...] for t [..., S], in world units; ValueError on other shapes."""
     check_shapes("points_on_rays", origins=(rays.origins, "... 3"), t=(t, "... S"))
     return rays.origins[..., None, :] + t[..., None] * rays.directions[..., None, :]
 

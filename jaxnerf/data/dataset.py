@@ -41,7 +41,11 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
     Args:
         dir: of a dataset in any registered format: Blender, transforms.json, COLMAP or LLFF, for example.
         split: "train", "test", or another split of the dataset.
-        **options: fields of the config's data section, see configs/default.py.
+        **options: fields of the config's data section, see configs/default.py. Where near or far is not set, each
+            view has its own, from the dataset.
+
+    Returns:
+        Views of the split.
 
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.

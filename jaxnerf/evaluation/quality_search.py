@@ -15,7 +15,7 @@ from jaxnerf.evaluation.restore import newest_step, restore_run
 
 # What the error is measured against.
 _EXACT = {"sample_multiplier": 4.0, "early_stop_eps": 0.0, "bake_occupancy": False}
-_SAMPLE_MULTIPLIERS = (1.0, 0.7, 0.5, 0.35, 0.25)
+_FRACTIONS = (1.0, 0.7, 0.5, 0.35, 0.25)  # of the run's own sample multiplier
 _EARLY_STOP_EPS = (1e-3, 1e-2, 3e-2, 1e-1)
 
 
@@ -66,7 +66,7 @@ def cheapest_settings(
     step: int | None = None,
     settings: dict[str, Any] | None = None,
     num_rays: int = 4096,
-    sample_multipliers: Sequence[float] = _SAMPLE_MULTIPLIERS,
+    sample_multipliers: Sequence[float] | None = None,
     early_stop_eps: Sequence[float] = _EARLY_STOP_EPS,
 ) -> tuple[Candidate, list[Candidate]]:
     """Returns the cheapest candidate within a budget, and all candidates.
@@ -85,7 +85,7 @@ def cheapest_settings(
             smaller chunks than `chunk` says, as it has more samples.
         num_rays: to render.
         sample_multipliers, early_stop_eps: values of the settings to try, in this order; the first are the most
-            exact.
+            exact. None: fractions of the run's own eval.sample_multiplier, from 1 down to a quarter.
 
     Returns:
         The Candidate, and all in the order in which they were rendered.
@@ -93,6 +93,9 @@ def cheapest_settings(
     Raises:
         ValueError: if none is within the budget; says how close the best comes.
     """
+    if sample_multipliers is None:
+        own = restore_run(workdir, config, data_dir=data_dir, settings=settings).experiment.eval.sample_multiplier
+        sample_multipliers = [own * fraction for fraction in _FRACTIONS]
     exact = restore_run(workdir, config, data_dir=data_dir, settings={**(settings or {}), **_EXACT})
     experiment = exact.experiment
     views = experiment.load_split(split or experiment.eval.split)

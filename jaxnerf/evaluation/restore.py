@@ -65,6 +65,9 @@ def restore_run(
         data_dir: the dataset's folder in place of the config's.
         settings: fields of the config's section `eval` to replace, by name.
 
+    Returns:
+        TrainedRun.
+
     Raises:
         ValueError: if there is no run, or no dataset in data_dir; names the folder.
     """

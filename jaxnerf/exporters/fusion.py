@@ -205,7 +205,7 @@ def _pixels_of(camera, x, shape):
 
 @jax.jit
 def _integrate(total, camera, planes, x, truncation):
-    """Returns total [C, N, 6] with what one view sees of vertices x [C, N, 3].
+    """Returns total [C, N, 7] with what one view sees of vertices x [C, N, 3].
 
     The sums are those of weights, of weights times distances, of training views, of the weights of colours, and of
     those times colours.

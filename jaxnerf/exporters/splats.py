@@ -104,8 +104,8 @@ def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
 
     Behind the Gaussians is the run's background, which the file does not hold.
     """
-    run = source.run
-    views = refined_views(run, run.experiment.load_split(run.experiment.eval.split), "test", source.variables[0])
+    run, split = source.run, source.run.experiment.eval.split
+    views = refined_views(run, run.experiment.load_split(split), split, source.variables[0])
     poses = in_file(np.asarray(views.cameras.to_world), views.to_file)
     count = min(_NUM_SCORED, len(views.size))
     values = []

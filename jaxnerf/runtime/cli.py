@@ -4,6 +4,7 @@ import ast
 import ctypes
 import gc
 import importlib
+import logging as std_logging
 import os
 import pathlib
 import re
@@ -48,7 +49,7 @@ def run(
     gc.set_threshold(50_000)
     signals.handle(signals.interrupt)
     plugins = flags.DEFINE_list(
-        "plugins", [], "Modules to import first: they register fields, samplers, losses or dataset readers."
+        "plugins", [], "Modules to import first: they register fields, samplers, losses, dataset readers or exporters."
     )
 
     def program(argv):
@@ -216,6 +217,7 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         rest = flags.FLAGS(argv)
         if not flags.FLAGS["verbosity"].present:
             logging.set_verbosity(logging.FATAL)  # orbax logs every file that it touches
+            std_logging.getLogger("jaxnerf").setLevel(std_logging.WARNING)
         return rest
     except flags.UnrecognizedFlagError as error:
         hint = "; give --config=NAME, which has such fields" if error.flagname.startswith("config.") else ""

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxnerf.runtime.atomic_files import open_regular, partial_file
 
+_logger = logging.getLogger(__name__)
 _CHECKSUM = "checksum"  # the name of an array in each file
 
 
@@ -48,11 +49,11 @@ def load_or_make(
         checksum = arrays.pop(_CHECKSUM, None)
         if checksum == _checksum(name, arrays) and is_valid(arrays):
             return arrays
-        logging.warning("%s holds unexpected arrays; they are computed again", path)
+        _logger.warning("%s holds unexpected arrays; they are computed again", path)
     except FileNotFoundError:
-        logging.info("%s does not exist yet; its arrays are computed", path)
+        _logger.info("%s does not exist yet; its arrays are computed", path)
     except Exception as error:  # a damaged zip file raises almost any exception
-        logging.warning("%s cannot be read (%s); its arrays are computed again", path or folder or "the cache", error)
+        _logger.warning("%s cannot be read (%s); its arrays are computed again", path or folder or "the cache", error)
     start = time.perf_counter()
     arrays = make()
     if path is not None and time.perf_counter() - start >= min_seconds:
@@ -103,4 +104,4 @@ def _store(path, arrays, checksum):
         with partial_file(path, mode=0o600) as partial, partial.open("wb") as file:
             np.savez_compressed(file, **arrays, **{_CHECKSUM: np.uint32(checksum)})
     except OSError as error:
-        logging.warning("%s cannot be written (%s); its arrays will be computed again", path, error)
+        _logger.warning("%s cannot be written (%s); its arrays will be computed again", path, error)

@@ -1,4 +1,7 @@
-"""Turns a resolved config into the functions of a run. Nothing else reads the sections of a resolved config."""
+"""Turns a resolved config into the functions of a run.
+
+Beside it, only `auto_config` and `restore_run`, which fill in and replace fields, read a resolved config.
+"""
 
 import dataclasses
 import functools

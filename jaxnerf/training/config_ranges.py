@@ -66,7 +66,7 @@ _RANGES = (
 _DTYPES = ("float32", "bfloat16", "float16", "float64")
 _CHOICES = {
     "coarse.compute_dtype fine.compute_dtype": _DTYPES,
-    "hash_grid.compute_dtype": (*_DTYPES, AUTO),
+    "hash_grid.compute_dtype": ("float32", "bfloat16", AUTO),
     "coarse.density_activation fine.density_activation": ("relu", "softplus"),
     "sampling.rule": ("segments", "gauss", "points"),
 }

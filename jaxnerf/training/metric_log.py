@@ -19,6 +19,7 @@ from jaxnerf.runtime.devices import devices_of
 from jaxnerf.training.dead_networks import dead_networks
 from jaxnerf.training.state import TrainState
 
+_logger = logging.getLogger(__name__)
 _READ_AGAIN = ("step", "seconds", "rays", "compile_seconds")  # by a run that resumes, its evaluation or its summary
 
 
@@ -71,7 +72,7 @@ def read_rows(workdir: str | os.PathLike) -> list[dict[str, Any]]:
     path = pathlib.Path(workdir) / "metrics.jsonl"
     rows, damaged, _ = _parse(path)
     if damaged:
-        logging.warning("%s: skipped %d lines from line %d on", path, len(damaged), damaged[0])
+        _logger.warning("%s: skipped %d lines from line %d on", path, len(damaged), damaged[0])
     return rows
 
 

@@ -50,7 +50,7 @@ def view_run(
     first = newest_step(run, workdir, step)
     variables = run.variables(first)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
-    viewer = Viewer(workdir, run, views)
+    viewer = Viewer(workdir, run, views, data_dir=data_dir)
     viewer.show(first, variables, score_of(workdir, first))  # compiles before anyone can connect
     port = viewer.listen(host, port)
     print(f"viewer        {address(host, port)} shows {workdir}, step {first}; Ctrl-C ends it", file=sys.stderr)

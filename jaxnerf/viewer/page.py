@@ -366,7 +366,8 @@ class Page:
 
         def render():
             try:
-                written = render_path(self._viewer.workdir, path=str(path), step=step, overwrite=overwrite)
+                options = {"step": step, "data_dir": self._viewer.data_dir, "overwrite": overwrite}
+                written = render_path(self._viewer.workdir, path=str(path), **options)
                 self._path_status.content = f"video: {written[-1]}"
             finally:
                 done.set()

@@ -53,6 +53,7 @@ class Viewer:
         run: TrainedRun,
         views: Views,
         *,
+        data_dir: str | None = None,
         fraction: float = 1.0,
         changed: Callable[[], None] = lambda: None,
     ):
@@ -62,10 +63,11 @@ class Viewer:
             workdir: of the run.
             run: see `restore_with_grid`.
             views: of the split "train", with refined cameras.
+            data_dir: the dataset's folder in place of the config's, for videos.
             fraction: see `RenderLoop`.
             changed: called when a browser connects or disconnects.
         """
-        self.workdir, self.run, self.views = pathlib.Path(workdir), run, views
+        self.workdir, self.run, self.views, self.data_dir = pathlib.Path(workdir), run, views, data_dir
         self.renderer, self.state, self.score = FrameRenderer(run, views), None, ""
         self.rendering_video = threading.Lock()  # held while a video is rendered; there is one at a time
         self._changed, self._lock, self._pages = changed, threading.Lock(), {}

@@ -180,3 +180,17 @@ def test_the_reference_is_the_datasets_image_over_its_background():
     pixels = views.pixels[576 : 2 * 576].reshape(24, 24, 4) / 65535
     expected = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
     np.testing.assert_allclose(reference(views, 1), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--watch", "--step=20"), "--watch does not use --step"),
+        (("--watch", "--error_budget=0.1"), "--watch does not use --error_budget"),
+        (("--predictions=images", "--chunk=100"), "--predictions does not use --chunk"),
+        (("--predictions=images", "--nobake_occupancy"), "--predictions does not use --bake_occupancy"),
+    ],
+)
+def test_flags_that_would_be_ignored_are_errors(flags, named):
+    process = start("eval", "--workdir=nowhere", *flags)
+    assert named in process.communicate(timeout=120)[1] and process.returncode == 1

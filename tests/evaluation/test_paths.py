@@ -91,6 +91,18 @@ def test_a_turntable_is_a_circle_at_its_elevation():
     assert (poses[:, 2, 1] > 0).all(), "up is up"
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (1.0, 0.1, 0.0), (-1.0, 2.0, 0.5)])
+def test_a_turntable_needs_only_the_direction_of_up(up):
+    poses, longer = (
+        np.asarray(poses_module.turntable(8, center=UP, radius=3.0, elevation=0.4, up=scale * np.array(up)))
+        for scale in (1, 20)
+    )
+    assert_rigid(poses)
+    np.testing.assert_allclose(poses, longer, atol=2e-6)
+    above = (poses[:, :, 3] - UP) @ np.array(up) / np.linalg.norm(up)
+    np.testing.assert_allclose(above, 3 * math.sin(0.4), rtol=1e-5)
+
+
 def test_an_ellipse_has_its_half_axes():
     middle, axes = np.array([0.0, 1.0, 2.0]), np.array([[3.0, 0, 0], [0, 0.5, 0]])
     poses = np.asarray(poses_module.ellipse(16, middle=middle, axes=axes, target=np.zeros(3), up=UP))

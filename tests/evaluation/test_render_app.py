@@ -131,6 +131,10 @@ def test_frames_of_other_settings_are_not_mixed(rendered, run, path_file, tmp_pa
         run, path=str(other), size=(4, 6), name="other", kind="none", settings={"chunk": 100}, overwrite=True
     )
     assert iio.imread(folder / "color" / "0001.png").shape == (6, 4, 3)
+    origin = json.loads((folder / "path.json").read_text())
+    (folder / "path.json").write_text(json.dumps(origin | {"parameters": "of a run that was trained again"}))
+    with pytest.raises(ValueError, match="rendered with parameters"):
+        render_path(run, path=str(other), size=(4, 6), name="other", kind="none")
     (folder / "path.json").write_text("{")
     with pytest.raises(ValueError, match="path.json: cannot be read"):
         render_path(run, path=str(other), size=(4, 6), name="other", kind="none")

@@ -57,6 +57,14 @@ def test_the_page_shows_the_middle_view_and_some_frames(run, tmp_path):
     np.testing.assert_allclose(video.mean(axis=(1, 2, 3)), [0, 80, 160], atol=4)
 
 
+def test_what_else_a_page_says_stays(run, tmp_path):
+    text = "# Gallery\n\nMine.\n\n<!-- runs -->\nold\n<!-- end of runs -->\n\nBelow.\n"
+    (tmp_path / "index.md").write_text(text)
+    assert make_gallery(run, f"--out={tmp_path}")[0] == 0
+    page = (tmp_path / "index.md").read_text()
+    assert "Mine." in page and page.endswith("Below.\n") and "## mine" in page and "old" not in page
+
+
 def test_a_run_that_was_not_rendered_is_named(run, tmp_path):
     (run / "renders").rename(tmp_path / "elsewhere")
     code, errors = make_gallery(run, f"--out={tmp_path / 'gallery'}")

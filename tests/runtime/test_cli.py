@@ -131,6 +131,17 @@ def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):
     assert err.startswith("error: --plugins: cannot import 'broken' (ZeroDivisionError") and err.count("\n") == 1
 
 
+def test_a_cache_that_cannot_be_used_is_reported(tmp_path, monkeypatch):
+    cache = tmp_path / "cache" / "jaxnerf"
+    cache.mkdir(parents=True)
+    cache.chmod(0o777)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache.parent))
+    load = "user_cache.load_or_make(None, 'name', lambda: {'x': numpy.ones(1)}, is_valid=lambda found: True)"
+    (tmp_path / "loads.py").write_text(f"import numpy\nfrom jaxnerf.runtime import user_cache\n\n{load}\n")
+    code, _, err = call(tmp_path, "--plugins=loads", "--count=1")
+    assert code == 0 and "jaxnerf can be written by other users" in err
+
+
 def test_a_wrong_count_is_reported_in_one_line(tmp_path):
     code, out, err = call(tmp_path, "--count=0")
     assert code == 2 and not out

@@ -17,7 +17,7 @@ from jaxnerf.runtime.atomic_files import open_regular
 
 # What Pillow decodes by itself. Left to choose by a file's content, it would start Ghostscript for an EPS.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _ORIENTATION = 0x0112  # the EXIF tag
 _UPRIGHT = {  # value of the tag -> function that makes the image upright
     2: np.fliplr,

@@ -24,6 +24,7 @@ from jaxnerf.runtime.atomic_files import open_regular, partial_file
 from jaxnerf.runtime.fingerprint import file_sha256, fingerprint
 from jaxnerf.runtime.user_cache import private_folder
 
+_logger = logging.getLogger(__name__)
 _LARGE = 2**28  # bytes from which pixels are mapped
 _SLOW = 0.5  # seconds of decoding from which smaller arrays are cached, too
 _MAX_SIZE = 2**35  # bytes of all cached files; the least recently used are deleted first
@@ -82,7 +83,7 @@ def fill_pixels(
             if time.perf_counter() - start > _SLOW:
                 _write(path, lambda put: put(0, pixels), shape, dtype)
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
-        logging.warning("pixels cannot be cached in %s (%s); they are held in memory", path, error)
+        _logger.warning("pixels cannot be cached in %s (%s); they are held in memory", path, error)
     return _in_memory(fill, shape, dtype) if pixels is None else pixels
 
 
@@ -111,16 +112,16 @@ def _open(path, shape, dtype, mapped):
     except OSError:
         raise
     except Exception as error:  # numpy parses the header as Python, so a damaged one raises almost any exception
-        logging.warning("%s cannot be read (%s); it is written again", path, error)
+        _logger.warning("%s cannot be read (%s); it is written again", path, error)
         return None
     if pixels.shape != tuple(shape) or pixels.dtype != dtype:
-        logging.warning("%s holds an unexpected array; it is written again", path)
+        _logger.warning("%s holds an unexpected array; it is written again", path)
         return None
     checksums = _checksums(path.name, pixels)
     with path.open("rb") as file:
         file.seek(-len(checksums), os.SEEK_END)
         if file.read() != checksums:
-            logging.warning("%s is damaged; it is written again", path)
+            _logger.warning("%s is damaged; it is written again", path)
             return None
     os.utime(path)  # marks it as used, for _free_space
     return pixels

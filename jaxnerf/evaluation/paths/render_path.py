@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxnerf.core.types import Views
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path, video
-from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
+from jaxnerf.evaluation.restore import newest_step, refined_views, render_settings, restore_run
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.metric_log import Progress
@@ -71,16 +70,15 @@ def render_path(
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
     run = restore_run(workdir, data_dir=data_dir, settings=settings)
     step = newest_step(run, workdir, step)
-    views = run.experiment.load_split("train")
-    if run.experiment.cameras is not None:
-        views = refined_views(run, views, "train", run.variables(step)[0])
+    variables = run.variables(step)
+    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     path = camera_path.make_path(_select_kind(path, views), views, num_frames=num_frames, closed=closed)
     path = camera_path.resize(path, *size)
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
     atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(overwrite, shard, target)
-    shards.claim_folder(target, _origin(run, step, views, path, closed), overwrite=overwrite)
-    missing = write_frames(target, run, step, views, path, rgba=rgba, shard=shard)
+    shards.claim_folder(target, _origin(run, step, variables, views, path, closed), overwrite=overwrite)
+    missing = _write_frames(target, run, variables, views, path, rgba=rgba, shard=shard)
     written = [target]
     if missing:
         print(f"shard {shard[0]}/{shard[1]} is done, {missing} frames of others are missing", file=sys.stderr)
@@ -93,16 +91,7 @@ def render_path(
     return written
 
 
-def write_frames(
-    target: pathlib.Path,
-    run: TrainedRun,
-    step: int,
-    views: Views,
-    path: camera_path.CameraPath,
-    *,
-    rgba: bool = False,
-    shard: tuple[int, int] = shards.WHOLE,
-) -> int:
+def _write_frames(target, run, variables, views, path, *, rgba, shard):
     """Renders those frames of a shard that are not in a folder yet; see `render_path`.
 
     Returns:
@@ -120,7 +109,7 @@ def write_frames(
     readable = output_images.readable([files[index] for index in frames], [(path.height, path.width)] * len(frames))
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     if todo:
-        render = functools.partial(run.render_image, run.variables(step))
+        render = functools.partial(run.render_image, variables)
         posed, progress = camera_path.posed_views(views, path), Progress(len(frames))
         for done, index in enumerate(todo, len(frames) - len(todo) + 1):
             pixels = camera_path.path_pixels(posed, path, index, offset=run.experiment.pixel_offset)
@@ -153,13 +142,19 @@ def _select_kind(kind, views):
     return kind
 
 
-def _origin(run, step, views, path, closed):
+def _origin(run, step, variables, views, path, closed):
     """Returns everything that the frames depend on, for path.json."""
     origin = {"path": path.source, "frames": len(path.poses), "width": path.width, "height": path.height}
     if path.source == "interpolate":
         origin["closed"] = closed
-    cameras = fingerprint(views.cameras, views.near, views.far, views.to_file, *views.names)
-    return {**origin, "step": step, **render_settings(run), "cameras": cameras}
+    return {
+        **origin,
+        "step": step,
+        **render_settings(run),
+        "config": fingerprint(run.identity),
+        "parameters": fingerprint(variables[0]),
+        "cameras": fingerprint(views.cameras, views.near, views.far, views.to_file, *views.names),
+    }
 
 
 def _write_depth_images(files):
