@@ -7,6 +7,7 @@ from jaxtyping import Float
 from jaxnerf.capture_check.findings import Finding, named, percent
 from jaxnerf.capture_check.tracks import Tracks
 from jaxnerf.core.cameras import project
+from jaxnerf.data.dataset import BLENDER_RANGE
 from jaxnerf.data.geometry.bounds import depths, with_bounds
 from jaxnerf.data.readers.base import Capture
 
@@ -14,7 +15,6 @@ _MIN_POINTS = 30  # to judge ranges
 _INSIDE = 0.5  # fraction of the points between near and far, below which training fails
 _CUT = 0.9  # the same, below which a part of the scene is cut off
 _LOOSE = 20.0  # times the farthest depth, or the nearest divided by it: samples are spread thin
-_BLENDER = (2.0, 6.0)  # near and far that training takes for Blender datasets
 _FIELDS = "config.data.near, config.data.far"
 _MODEL_ERROR = 0.01  # of the longer side; a good model has a tenth of that
 _BEHIND = 0.02  # fraction of a model's points
@@ -27,7 +27,7 @@ def ranges(capture: Capture, near: float | None, far: float | None) -> tuple[Flo
     """
     stated = None
     if capture.format == "blender":
-        bounds, stated = np.tile(_BLENDER, (len(capture.frames), 1)), _FIELDS
+        bounds, stated = np.tile(BLENDER_RANGE, (len(capture.frames), 1)), _FIELDS
     else:
         if all(frame.bounds is not None for frame in capture.frames):
             stated = f"the last two columns of {capture.source}"

@@ -27,7 +27,7 @@ WORLDS = {
     "around": "the point that the cameras look at becomes the origin, their distance 1",
 }
 _SYNTHETIC = {"fingerprint": "", "factor": 1, "background": "white", "world": "file", "ndc": False}
-_BLENDER_NEAR, _BLENDER_FAR = 2.0, 6.0  # of the NeRF paper's synthetic scenes, world units
+BLENDER_RANGE = (2.0, 6.0)  # near and far of the NeRF paper's synthetic scenes, world units
 _MEAN_RUNS, _MEAN_RUN = 2**10, 2**10  # of pixels, of whose colours the mean is taken
 _HELD_OUT_OFFSET = 3  # not 0, as the first views of a dataset often differ from the others
 
@@ -146,7 +146,7 @@ def load_split(data: ConfigDict, split: str, *, max_views: int | None = None) ->
     folder = dataset_folder(data.dir)
     reading = {"split": source, "factor": data.factor, "background": background_of(data), "select": select}
     if data.format == "blender":
-        near, far = near or _BLENDER_NEAR, data.far or _BLENDER_FAR
+        near, far = near or BLENDER_RANGE[0], data.far or BLENDER_RANGE[1]
         return blender.load_blender(folder, near=near, far=far, **reading)
     capture = base.read_capture(folder, data.format)
     if data.fingerprint not in ("", found := fingerprint(capture)):

@@ -18,6 +18,9 @@ MAX_RESOLUTION, MAX_SIZE, MAX_POINTS = 1024, 4096, 10_000_000
 FORMATS = ("ply", "glb", "obj")
 
 
+_PIXELS_PER_VOXEL = 1.25
+
+
 class ExportSettings(NamedTuple):
     """What the flags of the program set. An exporter reads those that concern it.
 
@@ -44,6 +47,11 @@ class ExportSettings(NamedTuple):
     closed: bool = False
     max_faces: int = 0
     min_piece: float = 0.005
+
+    @property
+    def image_size(self) -> int:
+        """The longer side of the depth images, px."""
+        return self.size or round(_PIXELS_PER_VOXEL * self.resolution)
 
 
 class ExportSource(NamedTuple):

@@ -14,7 +14,6 @@ from jaxnerf.exporters.surfaces import export_box, render_depth_images
 from jaxnerf.runtime import atomic_files, memory
 
 _BYTES_PER_VOXEL = 16  # of the dense field, its index and what marching cubes keeps
-_PIXELS_PER_VOXEL = 1.25
 
 
 def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
@@ -24,8 +23,7 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
         ValueError: if no surface is in the box, or the field does not fit into memory.
     """
     settings = source.settings
-    size = settings.size or round(_PIXELS_PER_VOXEL * settings.resolution)
-    images = render_depth_images(source, size, all_around=True)
+    images = render_depth_images(source, settings.image_size, all_around=True)
     box = export_box(source, images)
     _, shape = grid_shape(box, settings.resolution)
     check_memory(_BYTES_PER_VOXEL * float(np.prod(shape)), memory.available(), "give a smaller --resolution or --box")

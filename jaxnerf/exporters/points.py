@@ -9,8 +9,6 @@ from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.ply import write_ply
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 
-_PIXELS_PER_VOXEL = 1.25
-
 
 def export_points(source: ExportSource, folder: pathlib.Path) -> None:
     """Writes points.ply: the points that pixels of the depth images show, thinned to one in each cell of a grid.
@@ -19,7 +17,7 @@ def export_points(source: ExportSource, folder: pathlib.Path) -> None:
         ValueError: if no surface is in the box.
     """
     settings = source.settings
-    images = render_depth_images(source, settings.size or round(_PIXELS_PER_VOXEL * settings.resolution))
+    images = render_depth_images(source, settings.image_size)
     box = export_box(source, images)
     points, normals, rgb = surface_points(images, box)[:3]
     chosen = thinned(points, settings.num_points)

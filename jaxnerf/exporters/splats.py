@@ -18,7 +18,6 @@ from jaxnerf.exporters.gaussians import Gaussians, harmonics, rasterize, write_g
 from jaxnerf.exporters.points import surface_points, thinned
 from jaxnerf.exporters.surfaces import export_box, in_file, render_depth_images, sphere_directions
 
-_PIXELS_PER_VOXEL = 1.25
 _NUM_DIRECTIONS = 32  # from which the colour of a point is evaluated
 _NUM_NEIGHBORS = 4
 _WIDTH, _THICKNESS = 0.6, 0.15  # standard deviations along and across the surface, in distances to the neighbours
@@ -38,7 +37,7 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
         ValueError: if no surface is in the box.
     """
     settings = source.settings
-    images = render_depth_images(source, settings.size or round(_PIXELS_PER_VOXEL * settings.resolution))
+    images = render_depth_images(source, settings.image_size)
     points, normals, _, extinction, field_x = surface_points(images, export_box(source, images))
     chosen = thinned(points, settings.num_points)
     points, normals, extinction, field_x = (each[chosen] for each in (points, normals, extinction, field_x))

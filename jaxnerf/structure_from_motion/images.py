@@ -9,6 +9,7 @@ from pathlib import Path
 
 from PIL import ImageOps
 
+from jaxnerf.data.geometry.path_poses import natural_order
 from jaxnerf.data.images.image_files import image_size, open_image, read_image
 from jaxnerf.runtime.atomic_files import partial_file, read_bytes
 
@@ -40,12 +41,7 @@ def find_images(folder: Path) -> tuple[list[Path], str]:
             f"{folder}: holds {len(found) or 'no'} image{'s' * (len(found) != 1)}{also}, expected at least "
             f"{MIN_IMAGES} ({kinds}) directly in it; convert other formats, or correct --images"
         )
-    return sorted(found, key=lambda path: natural_key(path.name)), counts
-
-
-def natural_key(name: str) -> list[tuple[int, str]]:
-    """Returns a key that sorts numbers inside names by value: frame_2 before frame_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [found[index] for index in natural_order([path.name for path in found])], counts
 
 
 def copy_name(path: Path) -> str:

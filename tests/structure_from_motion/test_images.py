@@ -13,7 +13,6 @@ from jaxnerf.structure_from_motion.images import (
     find_images,
     group_by_size,
     image_pairs,
-    natural_key,
     resolve_matching,
 )
 
@@ -43,11 +42,6 @@ def test_too_few_images_are_reported(tmp_path, count):
     (tmp_path / "x.heic").write_bytes(b"")
     with pytest.raises(ValueError, match=rf"holds {count or 'no'} images and other files \(1 .heic\), expected at l"):
         find_images(tmp_path)
-
-
-def test_natural_keys_compare_for_any_names():
-    names = ["2", "10", "a", "a2b", "a10b", "", "²", "a b"]
-    assert sorted(names[::-1], key=natural_key)[:2] == ["", "2"]
 
 
 def test_copies_are_exact_named_without_white_space_and_made_once(tmp_path):

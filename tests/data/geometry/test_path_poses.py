@@ -168,3 +168,9 @@ def test_names_are_sorted_by_the_value_of_their_numbers():
     assert [names[index] for index in path_poses.natural_order(names)] == [
         *("9", "12", "a 3", "a 03b", "b/img_1", "img_2", "img_10"),
     ]
+
+
+def test_any_names_have_a_natural_order():
+    names = ["b", "a b", "²", "a10b", "a2b", "a", "10", "2", ""]
+    found = [names[index] for index in path_poses.natural_order(names)]
+    assert found == ["", "2", "10", "a", "a2b", "a10b", "a b", "b", "²"]
