@@ -20,11 +20,12 @@ from jaxnerf.models.grid_schedule import make_grid_schedule
 BOX = (-1.5, -1.5, -1.0), (1.5, 1.5, 1.3)  # holds the embedded scene
 KEY = jax.random.key(0)
 DENSITY = 1e4  # everywhere
+STEP_SIZE = 0.1
 
 
 def a_schedule(density=DENSITY, box=BOX, **options):
     field = Field(None, lambda params, x, viewdirs: (jnp.full(x.shape[:-1], density), x))
-    given = {"resolution": 8, "step_size": 0.1, "threshold": 0.01, "update_every": 16, "cells_per_update": 2**18}
+    given = {"resolution": 8, "step_size": STEP_SIZE, "threshold": 0.01, "update_every": 16, "cells_per_update": 2**18}
     return make_grid_schedule(*box, field=field, **{**given, **options})
 
 
@@ -32,7 +33,7 @@ def a_schedule(density=DENSITY, box=BOX, **options):
 def updates_of_cells(num_steps, num_cells, **options):
     """Returns [num_steps, num_cells], how often each of some cells was updated up to each step; and the others.
 
-    Each update moves the running mean a fifth of the way to the density.
+    Each update lets a fifth less light through, as no light passes the density.
     """
     schedule = a_schedule(**options)
     cells = np.random.default_rng(0).permutation(np.prod(schedule.shape))[:num_cells].astype(np.int32)
@@ -43,7 +44,7 @@ def updates_of_cells(num_steps, num_cells, **options):
 
     first = schedule.create(np.ones(schedule.shape, bool))
     mean = jax.jit(lambda grid: jax.lax.scan(step, grid, jnp.arange(num_steps)))(first)[1]
-    counts = np.log1p(-np.minimum(np.float64(mean) / DENSITY, 1 - 1e-6)) / np.log(0.8)
+    counts = np.float64(mean) * STEP_SIZE / -np.log(0.8)
     return counts.round().astype(int)[:, cells], np.delete(counts, cells, axis=1)
 
 

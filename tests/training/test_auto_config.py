@@ -493,6 +493,19 @@ def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
             assert cells == min(resolutions[-1], 128 if contracted else 96) and steps == min(resolutions[-1], 144)
 
 
+@pytest.mark.parametrize("factor, use_alpha, expected", [(2, True, 128), (32, True, 256), (32, False, 96)])
+def test_large_images_with_alpha_have_a_finer_occupancy_grid(views, factor, use_alpha, expected):
+    larger = dataclasses.replace(
+        views,
+        size=factor * views.size,
+        cameras=dataclasses.replace(views.cameras, focal=16 * np.asarray(views.cameras.focal)),
+        pixels=np.concatenate([views.pixels[:, :3], views.pixels[:, :1]], axis=-1),
+    )
+    box = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3}
+    config = auto_config(use_alpha=use_alpha, contracted=False, **box)
+    assert resolve(config, larger).config.occupancy.resolution == expected
+
+
 @pytest.mark.parametrize("zoom, expected", [(1.0, "cameras"), (4.0, "three times"), (0.2, "images")])
 def test_space_is_not_contracted_around_the_cameras(views, zoom, expected):
     cameras = dataclasses.replace(views.cameras, focal=np.float32(zoom * np.asarray(views.cameras.focal)))

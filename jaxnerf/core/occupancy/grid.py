@@ -17,6 +17,9 @@ from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, check_shape
 from jaxnerf.core.varying import vary_like
 
 _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
+_ABSORBED = 0.01  # the fraction of light that matter of the threshold's density absorbs between samples
+_LEAST_LIGHT = 1e-30  # transmitted by any cell, so that density_mean is finite
+_SMALLEST_THRESHOLD = 1e-30  # 1 / world unit, so that a threshold of 0 has a spacing
 
 
 @pytree(static=("contracted",))
@@ -28,7 +31,8 @@ class OccupancyGrid:
         upper: [3] world units, its upper corner.
         valid: [X, Y, Z] bool; False for cells that are always empty, as determined from alpha.
         density_max: [X, Y, Z] 1 / world unit, the largest density that recent updates found.
-        density_mean: [X, Y, Z] 1 / world unit, the running mean of the densities found; -1 in empty cells.
+        density_mean: [X, Y, Z] 1 / world unit, of uniform matter that transmits as much light, over the spacing of
+            samples, as the densities found do in the running mean; -1 in empty cells.
         occupied: [X, Y, Z] bool; a scene is evaluated only in these cells.
         contracted: whether the box's outer half holds all of space outside its inner half.
     """
@@ -107,9 +111,9 @@ def update_grid(
         scene: see render_samples.
         cells: [M] int32, flat indices x first, each at most once; indices past the last cell are ignored.
         threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there empties cells
-            that absorb less than 1 % of the light.
+            that absorb less than 1 % of the light. That spacing, 0.01 / threshold, is the one of density_mean.
         decay: the factor of density_max at an update that finds less.
-        smoothing: the weight of an update in density_mean.
+        smoothing: the weight of an update in the mean transmittance from which density_mean follows.
         spread: bool, may be traced. Once the field has formed, neighbours of dense cells only cost samples.
         chunk: cells evaluated at once.
 
@@ -131,7 +135,11 @@ def update_grid(
     found = jax.lax.map(density_at, x, batch_size=min(chunk, cells.size)).astype(grid.density_max.dtype)
     largest, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
     largest = largest.at[cells].set(jnp.maximum(decay * largest[cells], found)).reshape(grid.density_max.shape)
-    mean = mean.at[cells].add(smoothing * (found - mean[cells])).reshape(grid.density_mean.shape)
+    # Light passes beside the matter in a cell. A mean of densities would make a cell opaque that is half empty.
+    spacing = _ABSORBED / jnp.maximum(threshold, _SMALLEST_THRESHOLD)
+    spacing = jnp.broadcast_to(spacing, grid.occupied.shape).reshape(-1)[cells]
+    through = (1 - smoothing) * jnp.exp(-spacing * mean[cells]) + smoothing * jnp.exp(-spacing * found)
+    mean = mean.at[cells].set(-jnp.log(jnp.maximum(through, _LEAST_LIGHT)) / spacing).reshape(grid.density_mean.shape)
     dense = ~(largest <= threshold)  # NaN counts as dense, so that it is visible
     occupied = jnp.where(spread, widen(dense), dense) & grid.valid
     return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
@@ -246,34 +254,12 @@ def has_nan(rays: Rays) -> Bool[Array, "*batch"]:
     return jnp.isnan(rays.origins.sum(axis=-1) + rays.directions.sum(axis=-1) + rays.near + rays.far)
 
 
-def mask_samples(
-    grid: OccupancyGrid, rays: Rays, samples: Samples, *, max_optical_depth: Float[ArrayLike, ""] = jnp.inf
-) -> tuple[Samples, Bool[Array, "*batch"]]:
-    """Masks the samples in empty cells and those that dense cells occlude.
-
-    Occlusion is estimated for training from the grid alone: no scene is evaluated.
-
-    Args:
-        grid: OccupancyGrid. The estimate uses density_mean; density_max would occlude density that is still forming.
-        rays: Rays [...].
-        samples: Samples [..., S].
-        max_optical_depth: a sample is occluded if the estimated optical depth in front of it exceeds this.
-
-    Returns:
-        Samples [..., S] with delta 0 where they are masked; and occluded [...], whether samples of a ray in
-        occupied cells are masked.
-    """
-    occupied, optical_depth = estimate_optical_depth(grid, rays, samples)
-    occluded = volume_rendering.exclusive_sum(optical_depth) > max_optical_depth
-    kept = occupied & ~occluded
-    masked = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
-    return masked, (occupied & occluded).any(axis=-1)
-
-
 def estimate_optical_depth(
     grid: OccupancyGrid, rays: Rays, samples: Samples
 ) -> tuple[Bool[Array, "*batch samples"], Float[Array, "*batch samples"]]:
     """Estimates the optical depth of samples from the grid's density_mean; no scene is evaluated.
+
+    density_max would make cells opaque in which density is still forming.
 
     Args:
         grid: OccupancyGrid.

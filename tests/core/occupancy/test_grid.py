@@ -13,17 +13,17 @@ from jaxnerf.core.occupancy.grid import (
     clip_rays_to_box,
     create_grid,
     drop_thin_density,
+    estimate_optical_depth,
     is_occupied,
     keep_cells,
     mark_cells,
-    mask_samples,
     update_grid,
 )
 
 SIZES = (16, 12, 14)  # cells of the box that is updated
 LOWER, UPPER = np.float32([-3.0, -2.0, -2.5]), np.float32([3.0, 2.5, 2.0])
 is_occupied = compiled(is_occupied)
-mask_samples = compiled(mask_samples)
+estimate_optical_depth = compiled(estimate_optical_depth)
 
 
 def fog(x, viewdirs):
@@ -140,8 +140,7 @@ def test_a_density_that_is_nan_keeps_its_cell_occupied():
     rays = one_ray((-2.9, 0.1, 0.1), (1.0, 0.0, 0.0))
     samples = jaxnerf.samples_from_points(np.float32([[1.5, 2.0, 3.6, 4.0]]), last_delta=0.1)
     np.testing.assert_array_equal(is_occupied(got, rays, samples.t), [[False, False, True, True]])
-    masked, _ = mask_samples(got, rays, samples)
-    np.testing.assert_array_equal(masked.delta > 0, [[False, False, True, True]])
+    np.testing.assert_array_equal(estimate_optical_depth(got, rays, samples)[0], [[False, False, True, True]])
 
 
 def test_grid_from_scene_finds_the_dense_cells():
@@ -160,27 +159,33 @@ def test_grid_from_scene_finds_the_dense_cells():
     np.testing.assert_allclose(grid.density_mean[inner], 4 * np.exp(-2 * away[inner] ** 2), atol=0.7)
 
 
-def plain_mask(grid, rays, samples, max_optical_depth):
-    """Returns which samples are kept [B, S] and which rays are occluded [B], sample by sample, in float64."""
+def test_a_half_empty_cell_transmits_half_of_the_light():
+    halved = lambda x, viewdirs: (jnp.where(x[..., 0] % 1 < 0.5, 1e6, 0.0), jnp.zeros_like(x))  # noqa: E731
+    options = {"threshold": 0.02, "num_updates": 200}
+    grid = jaxnerf.grid_from_scene(jax.random.key(0), halved, np.zeros(3), np.full(3, 4.0), (4, 4, 4), **options)
+    spacing = 0.01 / 0.02
+    np.testing.assert_allclose(np.exp(-spacing * grid.density_mean), 0.5, atol=0.12)
+    solid = lambda x, viewdirs: (jnp.full(x.shape[:-1], jnp.inf), jnp.zeros_like(x))  # noqa: E731
+    full = jaxnerf.grid_from_scene(jax.random.key(0), solid, grid.lower, grid.upper, (4, 4, 4), **options)
+    assert np.isfinite(full.density_mean).all() and (full.density_mean * spacing > 60).all()
+
+
+def plain_optical_depth(grid, rays, samples):
+    """Returns which samples are occupied [B, S] and their optical depth [B, S], sample by sample, in float64."""
     shape = np.array(grid.density_mean.shape)
-    kept, occluded = np.zeros(samples.t.shape, bool), np.zeros(samples.t.shape[0], bool)
-    for ray in range(len(kept)):
-        depth = 0.0
-        for index in range(kept.shape[1]):
-            t, delta = float(samples.t[ray, index]), float(samples.delta[ray, index])
-            x = np.float64(rays.origins[ray]) + t * np.float64(rays.directions[ray])
-            cell = np.floor((x - grid.lower) / (np.float64(grid.upper) - grid.lower) * shape).astype(int)
-            there = (cell >= 0).all() and (cell < shape).all() and grid.occupied[tuple(cell)] and delta > 0
-            if there and depth > max_optical_depth:
-                occluded[ray] = True
-            kept[ray, index] = there and depth <= max_optical_depth
-            if there:
-                depth += grid.density_mean[tuple(cell)] * delta * np.linalg.norm(rays.directions[ray])
-    return kept, occluded
+    occupied, depth = np.zeros(samples.t.shape, bool), np.zeros(samples.t.shape)
+    for ray, index in np.ndindex(*samples.t.shape):
+        t, delta = float(samples.t[ray, index]), float(samples.delta[ray, index])
+        x = np.float64(rays.origins[ray]) + t * np.float64(rays.directions[ray])
+        cell = np.floor((x - grid.lower) / (np.float64(grid.upper) - grid.lower) * shape).astype(int)
+        inside = (cell >= 0).all() and (cell < shape).all() and delta > 0
+        if inside and grid.occupied[tuple(cell)]:
+            occupied[ray, index] = True
+            depth[ray, index] = grid.density_mean[tuple(cell)] * delta * np.linalg.norm(rays.directions[ray])
+    return occupied, depth
 
 
-@pytest.mark.parametrize("max_optical_depth", [np.inf, 2.0, 0.5])
-def test_samples_are_masked_as_by_a_plain_loop(max_optical_depth):
+def test_the_optical_depth_is_that_of_a_plain_loop():
     grid = checked_grid()
     density = np.random.default_rng(1).exponential(size=(6, 5, 8)) * (
         np.random.default_rng(2).uniform(size=(6, 5, 8)) < 0.8
@@ -192,23 +197,18 @@ def test_samples_are_masked_as_by_a_plain_loop(max_optical_depth):
     samples = jaxnerf.samples_from_edges(
         None, np.minimum(np.linspace(1, 8, 61, dtype=np.float32), rays.far[:, None] - rays.near[:, None])
     )
-    got, occluded = mask_samples(grid, rays, samples, max_optical_depth=np.float32(max_optical_depth))
-    kept, expected_occluded = plain_mask(grid, rays, samples, max_optical_depth)
-    np.testing.assert_array_equal(got.delta, np.where(kept, samples.delta, 0))
-    np.testing.assert_array_equal(got.t, samples.t)
-    np.testing.assert_array_equal(occluded, expected_occluded)
-    if max_optical_depth == np.inf:
-        assert not occluded.any()
-        np.testing.assert_array_equal(kept, is_occupied(grid, rays, samples.t) & (samples.delta > 0))
-    else:
-        assert 0.1 < occluded.mean() < 0.95
+    got, depth = estimate_optical_depth(grid, rays, samples)
+    occupied, expected = plain_optical_depth(grid, rays, samples)
+    np.testing.assert_array_equal(got, occupied)
+    np.testing.assert_array_equal(got, is_occupied(grid, rays, samples.t) & (samples.delta > 0))
+    np.testing.assert_allclose(depth, expected, rtol=1e-5)
+    assert 0.05 < occupied.mean() < 0.95
 
 
 def test_a_t_that_is_nan_is_kept_and_shows():
     """In training as in images: a broken ray must not look like an empty one."""
     samples = jaxnerf.samples_from_points(np.float32([[np.nan, 1.0]]), last_delta=0.1)
-    masked, _ = mask_samples(full_grid(), one_ray((0, 0, 0), (1, 0, 0)), samples)
-    assert np.isnan(masked.delta[0, 0])
+    assert estimate_optical_depth(full_grid(), one_ray((0, 0, 0), (1, 0, 0)), samples)[0][0, 0]
 
 
 def test_wrong_arguments():
