@@ -93,7 +93,7 @@ def measure(
         for seed in seeds if name in SEEDED else seeds[:1]:
             points = curve["runs"].setdefault(str(seed), [])
             for time_limit in sorted(seconds or plan["seconds"]):
-                if any(_settles(point, time_limit) for point in points):
+                if any(_covers(point, time_limit) for point in points):
                     continue
                 point = run_to(time_limit, configuration(name, seed), folder / workdir_name(name, seed, time_limit))
                 if point is None:
@@ -157,6 +157,6 @@ def medians(runs: dict[str, list[dict]]) -> list[dict]:
     return found
 
 
-def _settles(point, time_limit):
+def _covers(point, time_limit):
     """Returns whether a run of so many seconds need not be measured: it was, or a shorter one ended by itself."""
     return point["time_limit"] == time_limit or (point["ended"] and point["time_limit"] < time_limit)
