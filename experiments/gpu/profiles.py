@@ -35,7 +35,7 @@ PEAKS = {
 }
 SECTOR = 32  # bytes: the least that a read or an atomic addition at a random place moves
 
-FULL_SIZE = {"data.factor": 1, "hash_grid.table_size": 2**19}  # the table of arXiv:2201.05989
+FULL_SIZE = {"data.factor": 1}
 # The steps never end a run of limited time, and the learning rate follows the time.
 TIMED = {"train.max_steps": 10**7, "train.lr_steps": 10**7}
 
