@@ -37,6 +37,8 @@ CHANGEABLE = (
     "train.preview_every",
     "eval.",
 )
+# Fields that older versions had, and the value with which they trained as this one does.
+_REMOVED = {"occupancy.near_gradient_distance": 0.0}
 _FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training writes to
 SECTIONS = ("data", "coarse", "fine", "sampling", "hash_grid", "occupancy", "losses", "train", "eval")
 
@@ -59,6 +61,12 @@ def claim(workdir: str | os.PathLike, config: ConfigDict) -> None:
             raise ValueError(
                 f"{workdir}: belongs to a run of another version, whose config lacks {', '.join(unknown[:3])}; resume "
                 "it with that version, or give another --workdir. It can still be evaluated, rendered and exported"
+            )
+        gone = [key for key, value in _REMOVED.items() if old.get(key, value) != value]
+        if gone:
+            raise ValueError(
+                f"{workdir}: belongs to a run of another version, whose {gone[0]} no longer exists; resume it with "
+                "that version, or give another --workdir. It can still be evaluated, rendered and exported"
             )
         if fixed:
             shown = ", ".join(f"{key} {old.get(key)!r} -> {new.get(key)!r}" for key in fixed[:3])

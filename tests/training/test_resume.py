@@ -119,6 +119,19 @@ def test_a_run_of_a_version_with_another_schedule_is_not_resumed(trained, tmp_pa
         workdir.claim(tmp_path, workdir.config_to_resume(tmp_path))
 
 
+def test_a_run_whose_training_no_longer_exists_is_not_resumed(trained, tmp_path):
+    saved = json.loads((trained / "config.json").read_text())
+    for distance in (0.0, 0.2):  # off, and on
+        saved["occupancy"]["near_gradient_distance"] = distance
+        (tmp_path / "config.json").write_text(json.dumps(saved))
+        config = workdir.config_to_resume(tmp_path)
+        if distance:
+            with pytest.raises(ValueError, match="whose occupancy.near_gradient_distance no longer exists; resume it"):
+                workdir.claim(tmp_path, config)
+        else:
+            workdir.claim(tmp_path, config)
+
+
 @pytest.mark.slow
 def test_resumed_run_does_not_exceed_its_limit_of_seconds(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
