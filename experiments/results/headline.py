@@ -18,15 +18,16 @@ from jaxnerf.runtime import cli
 WORK = {
     "grid": "lego, 100 px",
     "grid without alpha": "lego, 100 px, alpha not used",
+    "grid 400": "lego, 400 px",
+    "grid 800": "lego, 800 px, its full size",
     "capture fox": "fox, phone images, 216 px wide",
     "capture fern": "fern, forward-facing, 201 px wide",
     "capture can": "can, phone images, 180 px wide",
 }
 NOTES = (
     "Seconds of training exclude set-up and compilation; those of others are CPU seconds of the whole process. Lego is "
-    "scored on 25 of its 200 test views",
-    "at 100 x 100, so that its PSNR cannot be compared with the paper's, of 800 x 800. The poses that come with `can` "
-    "contradict each other; with those",
+    "scored on 25 of its 200 test views;",
+    "the paper's PSNR is that of 800 x 800. The poses that come with `can` contradict each other; with those",
     "of `jaxnerf-cameras` the PSNR is [4 dB higher](docs/results/captures.md). "
     "[Speed against error](docs/results/speed.md) has commands, commit and machine.",
 )

@@ -50,7 +50,11 @@ def main(argv: list[str]) -> None:
             f"{_WORKDIR.value}: has the sampler {config.sampler!r}, expected 'occupancy'; give another run"
         )
     run = restore_run(_WORKDIR.value)
-    step = newest_step(run, _WORKDIR.value)
+    step, first = newest_step(run, _WORKDIR.value), config.occupancy.occlusion_start_step
+    if run.experiment.cameras is not None:
+        raise ValueError(f"{_WORKDIR.value}: trained cameras, too, which this program ignores; give another run")
+    if step < first:
+        raise ValueError(f"{_WORKDIR.value}: ends at step {step}, before samples are skipped at {first}; train longer")
     _, data = run.experiment.prepare(run.experiment.load_split("train"))
     draw = jax.jit(run.experiment.draw)
     batches = [draw(step + index, jnp.arange(_RAYS), data) for index in range(_BATCHES.value)]
@@ -94,7 +98,7 @@ def measure(model: Any, variables: tuple, batches: list[tuple], step: int, draws
     return {
         "samples": float(np.mean(used)),
         "psnr": float(decibels(error)),
-        "psnr_of_mean": float(decibels(error - variance)),
+        "psnr_of_mean": float(decibels(max(error - variance, 0))),
         "noise": float(decibels(variance)),
     }
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from ml_collections import ConfigDict
 
 from jaxnerf.core.types import SparsePoints, Views
@@ -211,7 +211,12 @@ def color_behind(data: ConfigDict) -> tuple[float, float, float] | None:
 
 
 def mean_color(views: Views) -> tuple[float, float, float]:
-    """Returns the mean colour of the views' pixels in [0, 1], alpha dropped.
+    """Returns the mean colour of the views' pixels in [0, 1], alpha dropped; see `sample_pixels`."""
+    return tuple(float(value) for value in sample_pixels(views)[:, :3].mean(axis=0))
+
+
+def sample_pixels(views: Views) -> Float[np.ndarray, "N C"]:
+    """Returns pixels of all views in [0, 1].
 
     Of more than 2^20 pixels some are chosen: runs of them at random places, as single pixels of a file on disk would
     take as long to read as all. Pixels that a mask excludes do not count, unless it excludes all that were chosen.
@@ -222,8 +227,8 @@ def mean_color(views: Views) -> tuple[float, float, float]:
         chosen = (starts[:, None] + np.arange(_MEAN_RUN)).reshape(-1)
     if views.mask is not None and views.mask[chosen].any():
         chosen = chosen[views.mask[chosen]]
-    pixels = views.pixels[chosen, :3]
-    return tuple(float(value) for value in (pixels / np.iinfo(pixels.dtype).max).mean(axis=0))
+    pixels = views.pixels[chosen]
+    return pixels / np.iinfo(pixels.dtype).max
 
 
 def held_out(count: int, every: int) -> Int[np.ndarray, " N"]:

@@ -99,8 +99,8 @@ def make_grid_schedule(
         )
     sides = [high - low for low, high in zip(lower, upper, strict=True)]
     shape = tuple(max(round(side / max(sides) * resolution), 1) for side in sides)
-    density = threshold / step_size
-    empty_below = density / _stretches(shape) if contracted else density
+    density, spacing = threshold / step_size, step_size * (_stretches(shape) if contracted else 1)
+    empty_below = threshold / spacing
 
     def create(valid, empty=None):
         # A cell starts at ten times the threshold, so about half a dozen updates empty it.
@@ -135,6 +135,7 @@ def make_grid_schedule(
                 functools.partial(field.apply, params["fine"]),
                 chosen,
                 threshold=empty_below,
+                spacing=spacing,
                 spread=young,
                 chunk=update_chunk,
             )

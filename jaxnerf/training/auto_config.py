@@ -43,7 +43,8 @@ _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
-_FINE_RESOLUTION = 256  # the same with five levels and alpha: cells of 128 would be six pixels wide
+# The same with five levels: with 128, a cell would be six pixels wide. That pays where alpha empties most cells.
+_FINE_RESOLUTION, _MAX_ALPHA = 256, 0.5
 _MAX_OPEN_RESOLUTION = 96  # where no alpha empties most cells before training, so that all of them are updated
 
 # These depend on the device, so they are inferred at every start and stay "auto" in the workdir.
@@ -258,7 +259,8 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     infer(config.eval, "sample_multiplier", multiplier, line)
     open_box = not (use_alpha or section.contracted or ndc)
     most = _MAX_OPEN_RESOLUTION if open_box else _MAX_RESOLUTION
-    if use_alpha and side >= _FIVE_LEVELS_SIDE:
+    fine = use_alpha and not section.contracted and config.sampler == "occupancy" and side >= _FIVE_LEVELS_SIDE
+    if fine and dataset.sample_pixels(views)[:, 3].mean() < _MAX_ALPHA:
         most = _FINE_RESOLUTION
     resolution = min(finest, most)
     infer(section, "resolution", resolution, f"grid          {resolution} cells along the longest side", **use_box)

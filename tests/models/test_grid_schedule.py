@@ -117,6 +117,31 @@ def test_updates_that_together_cover_all_cells_have_the_same_size():
     assert (counts[-1] >= 1).all()
 
 
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("threshold", [0.003, 0.03])
+def test_half_empty_cells_transmit_half_of_the_light_over_a_step(contracted, threshold):
+    def halved(params, x, viewdirs):
+        bits = jax.lax.bitcast_convert_type(x[..., 0], jnp.int32) >> 10
+        return jnp.where(bits % 2 == 0, 1e9, 0.0), x  # as good as random, also far away
+
+    options = {"threshold": threshold, "update_every": 1, "cells_per_update": 2**18, "contracted": contracted}
+    schedule = make_grid_schedule(
+        (-2.0,) * 3, (2.0,) * 3, resolution=8, step_size=0.1, field=Field(None, halved), **options
+    )
+    cells = jnp.arange(np.prod(schedule.shape))
+
+    def step(grid, index):
+        grid = schedule.update(jax.random.fold_in(KEY, index), index, {"fine": None}, grid, cells)
+        return grid, grid.density_mean
+
+    means = jax.lax.scan(step, schedule.create(np.ones(schedule.shape, bool)), jnp.arange(300))[1][20:]
+    middles = np.abs((np.indices(schedule.shape) + 0.5) / 2 - 2).max(axis=0)  # of the cells, from -2 to 2
+    spacing = 0.1 / np.minimum(2 - middles, 1) ** 2 if contracted else 0.1
+    through = np.exp(-spacing * np.float64(means)).mean(axis=0)
+    np.testing.assert_allclose(through.mean(), 0.5, atol=0.02)
+    np.testing.assert_allclose(through, 0.5, atol=0.2)
+
+
 def test_an_update_depends_on_its_key_alone():
     schedule = make_grid_schedule(
         *BOX,

@@ -493,13 +493,17 @@ def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
             assert cells == min(resolutions[-1], 128 if contracted else 96) and steps == min(resolutions[-1], 144)
 
 
-@pytest.mark.parametrize("factor, use_alpha, expected", [(2, True, 128), (32, True, 256), (32, False, 96)])
-def test_large_images_with_alpha_have_a_finer_occupancy_grid(views, factor, use_alpha, expected):
+@pytest.mark.parametrize(
+    "factor, use_alpha, alpha, expected",
+    [(2, True, 0, 128), (32, True, 0, 256), (32, False, 0, 96), (32, True, 1, 128)],
+)
+def test_large_images_with_alpha_have_a_finer_occupancy_grid(views, factor, use_alpha, alpha, expected):
+    opaque = np.iinfo(views.pixels.dtype).max
     larger = dataclasses.replace(
         views,
         size=factor * views.size,
         cameras=dataclasses.replace(views.cameras, focal=16 * np.asarray(views.cameras.focal)),
-        pixels=np.concatenate([views.pixels[:, :3], views.pixels[:, :1]], axis=-1),
+        pixels=np.concatenate([views.pixels[:, :3], np.full_like(views.pixels[:, :1], opaque * alpha)], axis=-1),
     )
     box = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3}
     config = auto_config(use_alpha=use_alpha, contracted=False, **box)

@@ -31,8 +31,8 @@ class OccupancyGrid:
         upper: [3] world units, its upper corner.
         valid: [X, Y, Z] bool; False for cells that are always empty, as determined from alpha.
         density_max: [X, Y, Z] 1 / world unit, the largest density that recent updates found.
-        density_mean: [X, Y, Z] 1 / world unit, of uniform matter that transmits as much light, over the spacing of
-            samples, as the densities found do in the running mean; -1 in empty cells.
+        density_mean: [X, Y, Z] 1 / world unit, density of uniform matter whose transmittance over one spacing of
+            samples is the running mean of those found; -1 in empty cells.
         occupied: [X, Y, Z] bool; a scene is evaluated only in these cells.
         contracted: whether the box's outer half holds all of space outside its inner half.
     """
@@ -95,6 +95,7 @@ def update_grid(
     cells: Int[ArrayLike, " cells"],
     *,
     threshold: Float[ArrayLike, ""] | Float[ArrayLike, "X Y Z"],
+    spacing: Float[ArrayLike, ""] | Float[ArrayLike, "X Y Z"] | None = None,
     decay: Float[ArrayLike, ""] = 0.6,
     smoothing: Float[ArrayLike, ""] = 0.2,
     spread: Bool[ArrayLike, ""] = True,
@@ -111,9 +112,12 @@ def update_grid(
         scene: see render_samples.
         cells: [M] int32, flat indices x first, each at most once; indices past the last cell are ignored.
         threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there empties cells
-            that absorb less than 1 % of the light. That spacing, 0.01 / threshold, is the one of density_mean.
+            that absorb less than 1 % of the light.
+        spacing: world units, of samples, a number or [X, Y, Z]; None: 0.01 / threshold, where a threshold of 0
+            counts as 1e-30. density_mean is at most 69 / spacing.
         decay: the factor of density_max at an update that finds less.
-        smoothing: the weight of an update in the mean transmittance from which density_mean follows.
+        smoothing: the weight of an update in the mean transmittance from which density_mean follows. After n updates
+            that find opaque matter the transmittance is (1 - smoothing)^n; one that finds none adds smoothing.
         spread: bool, may be traced. Once the field has formed, neighbours of dense cells only cost samples.
         chunk: cells evaluated at once.
 
@@ -135,11 +139,13 @@ def update_grid(
     found = jax.lax.map(density_at, x, batch_size=min(chunk, cells.size)).astype(grid.density_max.dtype)
     largest, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
     largest = largest.at[cells].set(jnp.maximum(decay * largest[cells], found)).reshape(grid.density_max.shape)
-    # Light passes beside the matter in a cell. A mean of densities would make a cell opaque that is half empty.
-    spacing = _ABSORBED / jnp.maximum(threshold, _SMALLEST_THRESHOLD)
+    # Light passes beside the matter in a cell. A mean of densities would make a half-empty cell opaque.
+    if spacing is None:
+        spacing = _ABSORBED / jnp.maximum(threshold, _SMALLEST_THRESHOLD)
     spacing = jnp.broadcast_to(spacing, grid.occupied.shape).reshape(-1)[cells]
     through = (1 - smoothing) * jnp.exp(-spacing * mean[cells]) + smoothing * jnp.exp(-spacing * found)
-    mean = mean.at[cells].set(-jnp.log(jnp.maximum(through, _LEAST_LIGHT)) / spacing).reshape(grid.density_mean.shape)
+    found = -jnp.log(jnp.clip(through, _LEAST_LIGHT, 1)) / spacing  # a negative density would be an empty cell
+    mean = mean.at[cells].set(found.astype(mean.dtype)).reshape(grid.density_mean.shape)
     dense = ~(largest <= threshold)  # NaN counts as dense, so that it is visible
     occupied = jnp.where(spread, widen(dense), dense) & grid.valid
     return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
@@ -259,7 +265,7 @@ def estimate_optical_depth(
 ) -> tuple[Bool[Array, "*batch samples"], Float[Array, "*batch samples"]]:
     """Estimates the optical depth of samples from the grid's density_mean; no scene is evaluated.
 
-    density_max would make cells opaque in which density is still forming.
+    density_max would make cells opaque while their density is still forming.
 
     Args:
         grid: OccupancyGrid.
@@ -276,7 +282,7 @@ def estimate_optical_depth(
     # A plain norm, as it is computed again for every sample; an estimate need not be accurate at lengths of 1e-20.
     x, y, z = (at_least_float32(rays.directions[..., axis])[0] for axis in range(3))
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
-    # The bound keeps sums finite: the mean of a cell may be infinite.
+    # The bound keeps sums finite: the mean of a cell of an older checkpoint may be infinite.
     optical_depth = jnp.where(mean > 0, jnp.minimum(mean * samples.delta * size, volume_rendering.OPAQUE), 0)
     unknown = jnp.isnan(samples.t) | (has_length & has_nan(rays)[..., None])
     return ~(mean < 0) | unknown, optical_depth

@@ -9,7 +9,7 @@ import pytest
 
 import jaxnerf
 from helpers import compiled
-from jaxnerf.core.occupancy.grid import is_occupied
+from jaxnerf.core.occupancy.grid import estimate_optical_depth, is_occupied
 from jaxnerf.core.occupancy.importance import divide_slots, importance_samples
 from jaxnerf.core.occupancy.packed import render_placed
 
@@ -102,6 +102,30 @@ def test_occluded_candidates_are_skipped(grid, rays, candidates):
     assert np.asarray(occluded).all()
     t, _ = by_ray(samples, 0)
     assert t.max() < WALL + 0.08
+
+
+@pytest.mark.parametrize("limit", [np.inf, 2.0, 0.5])
+def test_the_skipped_candidates_are_those_of_a_plain_loop(grid, rays, candidates, limit):
+    density = np.random.default_rng(1).exponential(size=grid.density_mean.shape) * np.linspace(0, 6, 16)[:, None]
+    density[12, 12] = np.inf  # as older checkpoints may have it
+    heights = np.float32([(0, (index + 0.5) / RAYS, 0.5) for index in range(RAYS)])
+    rays = dataclasses.replace(rays, origins=heights, directions=np.tile(np.float32([1, 0, 0]), (RAYS, 1)))
+    grid = dataclasses.replace(grid, density_mean=jnp.where(grid.occupied, np.float32(density), -1))
+    kept, depths = (np.asarray(part) for part in estimate_optical_depth(grid, rays, candidates))
+    expected, skipped = np.zeros(RAYS, bool), kept.copy()
+    for index in range(RAYS):
+        before = 0.0
+        for step in range(STEPS):
+            skipped[index, step] = kept[index, step] and before > limit
+            before += float(depths[index, step])
+        expected[index] = skipped[index].any()
+    samples, occluded = place(
+        jax.random.key(0), grid, rays, candidates, max_samples=STEPS * RAYS, max_optical_depth=limit
+    )
+    np.testing.assert_array_equal(occluded, expected)
+    number = np.bincount(np.asarray(samples.ray_index)[np.asarray(samples.used)], minlength=RAYS)
+    np.testing.assert_array_equal(number, (kept & ~skipped).sum(axis=1))
+    assert expected.any() == (limit < np.inf) and not expected.all()
 
 
 def test_a_ray_that_is_nan_has_samples_and_empty_rays_have_none(grid, rays, candidates):
