@@ -24,10 +24,13 @@ WORK = {
     "capture fern": "fern, forward-facing, 201 px wide",
     "capture can": "can, phone images, 180 px wide",
 }
+# Names in published.TRAINING, of figures for all 200 test views on other hardware.
+PUBLISHED = {"grid 800": ("NeRF paper", "JaxNeRF, 1M steps", "NGP paper")}
 NOTES = (
-    "Seconds of training exclude set-up and compilation; those of others are CPU seconds of the whole process. Lego is "
-    "scored on 25 of its 200 test views;",
-    "the paper's PSNR is that of 800 x 800. The poses that come with `can` contradict each other; with those",
+    "Seconds of training exclude set-up and compilation. Those of others are CPU seconds of the whole process, or were "
+    "published and not measured here.",
+    "Lego is scored on 25 of its 200 test views, in published figures on all. The poses that come with `can` "
+    "contradict each other; with those",
     "of `jaxnerf-cameras` the PSNR is [4 dB higher](docs/results/captures.md). "
     "[Speed against error](docs/results/speed.md) has commands, commit and machine.",
 )
@@ -50,9 +53,20 @@ def table(measured: dict) -> list[str]:
             points = training.medians(runs)
             ours = {point["seconds"]: point["psnr"] for point in points}
             cells = [f"{peer}: {_scores(scores)}" for peer, scores in peers.items()]
+            found = [entry for entry in published.TRAINING if entry["name"] in PUBLISHED.get(name, ())]
+            cells += [f"{entry['name']}: {entry['psnr']:.1f} dB ({_duration(entry)})" for entry in found]
             rows.append((work, _scores(ours), f"{points[-1]['seconds_per_frame']:.2f} s", "; ".join(cells) or "-"))
     heads = ("dataset, one CPU core", "PSNR (seconds of training)", "a frame", "others (CPU seconds)")
     return [*common.markdown(heads, rows), "", *NOTES]
+
+
+def _duration(entry):
+    """Returns how long a published training took, and on what."""
+    seconds, hardware = entry["seconds"], entry["hardware"]
+    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= size:
+            return f"{seconds / size:g} {unit}" + (f" on {hardware}" if hardware != "not said" else "")
+    return f"{seconds:g} s"
 
 
 def _scores(scores):
