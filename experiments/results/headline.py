@@ -31,7 +31,7 @@ NOTES = (
     "published and not measured here.",
     "Lego is scored on 25 of its 200 test views, in published figures on all. The poses that come with `can` "
     "contradict each other; with those",
-    "of `jaxnerf-cameras` the PSNR is [4 dB higher](docs/results/captures.md). "
+    "of `jaxnerf-cameras` the PSNR is [more than 3 dB higher](docs/results/captures.md). "
     "[Speed against error](docs/results/speed.md) has commands, commit and machine.",
 )
 
