@@ -20,7 +20,8 @@ _glorot = linen.initializers.glorot_uniform()
 _COMPUTE_DTYPES = {"float32": None, "bfloat16": jnp.bfloat16}
 _PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, Eq. 4
 _LARGEST_EXPONENT = 15.0  # a density that is opaque within 1e-5 world units
-_MIN_SLOPE = 1e-3  # the sigmoid has it where its value is 0.001 from 0 or 1: a quarter of an 8-bit level
+# The sigmoid has this slope at this logit, where its value is 0.001 from 1: a quarter of an 8-bit level.
+_END_SLOPE, _END_LOGIT = 1e-3, 6.9
 
 
 def hash_grid_field(**options: Any) -> Field:
@@ -74,13 +75,15 @@ def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
 
 @jax.custom_jvp
 def color_activation(logits: Float[ArrayLike, "*shape"]) -> Float[Array, "*shape"]:
-    """Computes the sigmoid, with a derivative of at least 0.001.
+    """Computes the sigmoid, with a derivative that vanishes slowly at both ends.
 
     The logits of a scene that is mostly white or black grow within some hundred steps until the sigmoid is exactly
     1 or 0 in float32, also where the scene is not white or black. Its own derivative s (1 - s) is then 0, and colour
-    is never learnt. The lower bound changes neither the values nor the sign of a derivative, and applies only where
-    the value is within 0.001 of 0 or 1. A wider range, (1 + 2 e) s - e (arXiv:2103.13415), does not help: its
-    derivative vanishes, too.
+    is never learnt. Where the value is within 0.001 of 0 or 1, the derivative is therefore at least
+    0.001 (6.9 / logit)^2. With a constant bound, a few colours that should be above 1 would push their logits, and with
+    them all weights, to any size: the gradient of a weight is the derivative times an activation, which grows with
+    the logit. The values and the signs of derivatives stay. A wider range, (1 + 2 e) s - e (arXiv:2103.13415), does
+    not help: its derivative vanishes, too.
 
     Args:
         logits: [...].
@@ -94,7 +97,8 @@ def color_activation(logits: Float[ArrayLike, "*shape"]) -> Float[Array, "*shape
 @color_activation.defjvp
 def _color_activation_jvp(primals, tangents):
     value = color_activation(*primals)
-    return value, jnp.maximum(value * (1 - value), _MIN_SLOPE) * tangents[0]
+    least = _END_SLOPE * (_END_LOGIT / jnp.maximum(jnp.abs(primals[0]), _END_LOGIT)) ** 2
+    return value, jnp.maximum(value * (1 - value), least) * tangents[0]
 
 
 class HashGrid(linen.Module):

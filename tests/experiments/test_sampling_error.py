@@ -14,7 +14,7 @@ from studies import study
 sampling_error = study("speed/sampling_error")
 
 
-def test_the_spread_of_draws_and_the_error_of_their_mean_are_told_apart():
+def test_the_spread_of_draws_is_not_counted_as_error_of_their_mean():
     rays = rays_past_origin(0, 256)
     batch = Batch(rays=rays, rgb=np.full((256, 3), 0.5, np.float32))
     keys = jax.random.split(jax.random.key(0), 256)
