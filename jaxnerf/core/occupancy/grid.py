@@ -144,8 +144,8 @@ def update_grid(
         spacing = _ABSORBED / jnp.maximum(threshold, _SMALLEST_THRESHOLD)
     spacing = jnp.broadcast_to(spacing, grid.occupied.shape).reshape(-1)[cells]
     through = (1 - smoothing) * jnp.exp(-spacing * mean[cells]) + smoothing * jnp.exp(-spacing * found)
-    found = -jnp.log(jnp.clip(through, _LEAST_LIGHT, 1)) / spacing  # a negative density would be an empty cell
-    mean = mean.at[cells].set(found.astype(mean.dtype)).reshape(grid.density_mean.shape)
+    uniform = -jnp.log(jnp.clip(through, _LEAST_LIGHT, 1)) / spacing  # a negative density would be an empty cell
+    mean = mean.at[cells].set(uniform.astype(mean.dtype)).reshape(grid.density_mean.shape)
     dense = ~(largest <= threshold)  # NaN counts as dense, so that it is visible
     occupied = jnp.where(spread, widen(dense), dense) & grid.valid
     return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
