@@ -23,16 +23,16 @@ from jaxnerf.training.dead_networks import CHECK_EVERY
 
 _CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of the last of four levels
-# Levels of the hash grid. Contracted space, whose box is larger, gets one more, and so do images of at least
-# _FIVE_LEVELS_SIDE px a side. At 400 px a fifth level gains less than the rays that it costs in the first minutes.
+# Levels of the hash grid. Contracted space, whose box is larger, gets one more, and so do fine occupancy grids (below)
+# and images of at least _FIVE_LEVELS_SIDE px a side.
 _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a hash grid's level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
-# Samples of images over those of training: no jitter averages over a step in rendering, so steps are shorter. With
-# five levels, whose features are twice as fine, they are shorter still.
-_SAMPLE_MULTIPLIER, _FINE_SAMPLE_MULTIPLIER = 1.5, 2.25
+_SAMPLE_MULTIPLIER = 1.5  # samples of images over those of training: no jitter averages over a step in rendering
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
+# But a step is at most as long as a cell: training sees only the cells in the middles of steps, and skips the others.
+_STEPS_PER_CELL = 1.125
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 # Space is not contracted as far as the cameras, so that cells near them are small: large ones fill with fog. But the
 # cube is at most this many times as large as that which most images show: what they look at gets fewer cells then.
@@ -43,7 +43,8 @@ _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
-# The same with five levels: with 128, a cell would be six pixels wide. That pays where alpha empties most cells.
+# A fine grid, where alpha empties most cells and pixels are smaller than half a cell: a cell is as large as two of the
+# vertices that detail needs.
 _FINE_RESOLUTION, _MAX_ALPHA = 256, 0.5
 _MAX_OPEN_RESOLUTION = 96  # where no alpha empties most cells before training, so that all of them are updated
 
@@ -247,23 +248,23 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
         raise ValueError(
             f"occupancy.lower is {section.lower} and occupancy.upper {section.upper}, expected lower < upper"
         )
-    side = _side(views)
-    more = int(section.contracted or side >= _FIVE_LEVELS_SIDE)  # half of a contracted box holds the surroundings
-    vertices = int(np.clip(round(longest / (_CELL_PER_PIXEL * footprint)), _FINEST[0], _FINEST[1] << more))
+    side, detail = _side(views), round(longest / (_CELL_PER_PIXEL * footprint))
+    fine = use_alpha and not section.contracted and config.sampler == "occupancy" and detail > 2 * _MAX_RESOLUTION
+    fine = fine and dataset.sample_pixels(views)[:, 3].mean() < _MAX_ALPHA
+    # Half of a contracted box holds the surroundings.
+    more = int(section.contracted or fine or side >= _FIVE_LEVELS_SIDE)
+    vertices = int(np.clip(detail, _FINEST[0], _FINEST[1] << more))
     finest = min(vertices, _FINEST[1])
-    step_size = longest / min(finest, _MAX_STEPS_PER_SIDE)
-    line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
-    infer(section, "step_size", step_size, line, **use_box)
-    multiplier = _FINE_SAMPLE_MULTIPLIER if side >= _FIVE_LEVELS_SIDE else _SAMPLE_MULTIPLIER
-    line = f"images        {multiplier:g} times the samples of training, for images of {side:.0f} x {side:.0f} px"
-    infer(config.eval, "sample_multiplier", multiplier, line)
+    line = f"images        {_SAMPLE_MULTIPLIER:g} times the samples of training"
+    infer(config.eval, "sample_multiplier", _SAMPLE_MULTIPLIER, line)
     open_box = not (use_alpha or section.contracted or ndc)
     most = _MAX_OPEN_RESOLUTION if open_box else _MAX_RESOLUTION
-    fine = use_alpha and not section.contracted and config.sampler == "occupancy" and side >= _FIVE_LEVELS_SIDE
-    if fine and dataset.sample_pixels(views)[:, 3].mean() < _MAX_ALPHA:
-        most = _FINE_RESOLUTION
-    resolution = min(finest, most)
+    resolution = min(detail // 2, _FINE_RESOLUTION) if fine else min(finest, most)
     infer(section, "resolution", resolution, f"grid          {resolution} cells along the longest side", **use_box)
+    coarse = section.resolution <= _MAX_RESOLUTION
+    step_size = longest / (min(finest, _MAX_STEPS_PER_SIDE) if coarse else _STEPS_PER_CELL * section.resolution)
+    line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
+    infer(section, "step_size", step_size, line, **use_box)
     octaves = int(np.clip(round(1 + math.log2(2 * math.pi / (4 * footprint))), 1, 16))
     for name, used in (("coarse", config.sampler == "hierarchical"), ("fine", config.field == "mlp")):
         line = f"octaves       {octaves} in {name}; the shortest wave is four pixels long"

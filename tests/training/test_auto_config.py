@@ -462,14 +462,11 @@ def test_the_hash_grids_table_follows_the_images_and_a_large_one_gets_more_rays(
     assert resolve(config, larger, platform="cpu").config.train.batch_size == 300
 
 
-@pytest.mark.parametrize("factor, multiplier", [(1, 1.5), (16, 1.5), (26, 2.25), (99, 2.25)])
-def test_frames_of_large_images_get_more_samples(views, factor, multiplier):
-    larger = dataclasses.replace(views, size=factor * views.size)
+def test_images_get_more_samples_than_training(views):
     config = auto_config(lower=(-1.0,) * 3, upper=(1.0,) * 3)
     config.eval.sample_multiplier = AUTO
-    got, _, lines = resolve(config, larger)
-    assert got.eval.sample_multiplier == multiplier
-    assert any(line.startswith(f"images        {multiplier:g} times the samples") for line in lines)
+    got, _, lines = resolve(config, views)
+    assert got.eval.sample_multiplier == 1.5 and "images        1.5 times the samples of training" in lines
 
 
 def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
@@ -494,20 +491,20 @@ def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
 
 
 @pytest.mark.parametrize(
-    "factor, use_alpha, alpha, expected",
-    [(2, True, 0, 128), (32, True, 0, 256), (32, False, 0, 96), (32, True, 1, 128)],
+    "zoom, use_alpha, alpha, cells, steps",
+    [(8, True, 0, 128, 144), (12, True, 0, 140, 157.5), (16, True, 0, 186, 209.25), (32, True, 0, 256, 288)]
+    + [(32, False, 0, 96, 144), (32, True, 1, 128, 144)],
 )
-def test_large_images_with_alpha_have_a_finer_occupancy_grid(views, factor, use_alpha, alpha, expected):
+def test_small_pixels_with_alpha_have_a_finer_occupancy_grid(views, zoom, use_alpha, alpha, cells, steps):
     opaque = np.iinfo(views.pixels.dtype).max
     larger = dataclasses.replace(
         views,
-        size=factor * views.size,
-        cameras=dataclasses.replace(views.cameras, focal=16 * np.asarray(views.cameras.focal)),
+        cameras=dataclasses.replace(views.cameras, focal=zoom * np.asarray(views.cameras.focal)),
         pixels=np.concatenate([views.pixels[:, :3], np.full_like(views.pixels[:, :1], opaque * alpha)], axis=-1),
     )
     box = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3}
-    config = auto_config(use_alpha=use_alpha, contracted=False, **box)
-    assert resolve(config, larger).config.occupancy.resolution == expected
+    section = resolve(auto_config(use_alpha=use_alpha, contracted=False, **box), larger).config.occupancy
+    assert section.resolution == cells and 2 / section.step_size == pytest.approx(steps)
 
 
 @pytest.mark.parametrize("zoom, expected", [(1.0, "cameras"), (4.0, "three times"), (0.2, "images")])
