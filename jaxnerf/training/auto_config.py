@@ -43,8 +43,8 @@ _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
-# A fine grid, where alpha empties most cells and pixels are smaller than half a cell: a cell is as large as two of the
-# vertices that detail needs.
+# A fine grid has a cell for two of the vertices that detail needs, if that makes more than _MAX_RESOLUTION cells and
+# alpha empties most of them.
 _FINE_RESOLUTION, _MAX_ALPHA = 256, 0.5
 _MAX_OPEN_RESOLUTION = 96  # where no alpha empties most cells before training, so that all of them are updated
 
