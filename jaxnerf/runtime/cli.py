@@ -222,11 +222,10 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
     except flags.UnrecognizedFlagError as error:
         hint = "; give --config=NAME, which has such fields" if error.flagname.startswith("config.") else ""
         _leave(2, f"{error}{hint}")
-    except AttributeError as error:
-        _leave(2, f"the config has no such field ({error}); {CONFIGS / 'default.py'} lists all fields")
+    except (AttributeError, KeyError) as error:
+        _leave(2, f"the config has no such field: {_unquoted(error)}; {CONFIGS / 'default.py'} lists all fields")
     except (
         flags.Error,
-        KeyError,
         TypeError,
         ValueError,
         OSError,
@@ -235,6 +234,15 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         NameError,
     ) as error:
         _leave(2, error)
+
+
+def _unquoted(error):
+    """Returns the text of an error of ml_collections, which often is the text of another one in quotation marks."""
+    try:
+        text = str(ast.literal_eval(str(error)))
+    except (SyntaxError, ValueError):
+        text = str(error)
+    return text.replace("\n", ", ").replace("Did you", "did you").removesuffix("?")
 
 
 def _help(module: str) -> str:

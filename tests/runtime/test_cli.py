@@ -148,6 +148,19 @@ def test_a_wrong_count_is_reported_in_one_line(tmp_path):
     assert "count" in err and "expected auto, or an integer of at least 1" in err and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "field, message",
+    [("occupancy.sizes", "'sizes'"), ("qqq.step_size", "'qqq'")]
+    + [("occupancy.resolutions", '\'resolutions\', did you mean "resolution" instead of "resolutions"')],
+)
+def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
+    command = [sys.executable, "-m", "jaxnerf.train", "--config=smoke", f"--workdir={tmp_path}", f"--config.{field}=3"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and not done.stdout
+    assert done.stderr.startswith(f"error: the config has no such field: {message}; ")
+    assert done.stderr.endswith("default.py lists all fields\n") and done.stderr.count("\n") == 1
+
+
 def test_help_lists_the_flags_of_the_program(tmp_path):
     code, out, _ = call(tmp_path, "--help")
     assert code == 0
