@@ -10,6 +10,7 @@ import pathlib
 import re
 import signal
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -223,7 +224,10 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         hint = "; give --config=NAME, which has such fields" if error.flagname.startswith("config.") else ""
         _leave(2, f"{error}{hint}")
     except (AttributeError, KeyError) as error:
-        _leave(2, f"the config has no such field: {_unquoted(error)}; {CONFIGS / 'default.py'} lists all fields")
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        if "ml_collections" in pathlib.Path(place.filename).parts:
+            _leave(2, f"the config has no such field: {_unquoted(error)}; {CONFIGS / 'default.py'} lists all fields")
+        _leave(2, f"--config: {place.filename}, line {place.lineno}: {type(error).__name__}: {error}; correct the file")
     except (
         flags.Error,
         TypeError,

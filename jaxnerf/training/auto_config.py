@@ -31,8 +31,9 @@ _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
 _SAMPLE_MULTIPLIER = 1.5  # samples of images over those of training: no jitter averages over a step in rendering
 _MAX_STEPS_PER_SIDE = 144  # along the longest side: finer images need finer features rather than finer steps
-# But a step is at most as long as a cell: training sees only the cells in the middles of steps, and skips the others.
-_STEPS_PER_CELL = 1.125
+# But a step is at most as long as a cell, since training skips the cells that no middle of a step is in. With more than
+# _MAX_RESOLUTION cells it is a little shorter, which gains 0.1 dB at 400 px.
+_FINE_STEPS_PER_CELL = 1.125
 _TRAIN_STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 # Space is not contracted as far as the cameras, so that cells near them are small: large ones fill with fog. But the
 # cube is at most this many times as large as that which most images show: what they look at gets fewer cells then.
@@ -261,8 +262,8 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     most = _MAX_OPEN_RESOLUTION if open_box else _MAX_RESOLUTION
     resolution = min(detail // 2, _FINE_RESOLUTION) if fine else min(finest, most)
     infer(section, "resolution", resolution, f"grid          {resolution} cells along the longest side", **use_box)
-    coarse = section.resolution <= _MAX_RESOLUTION
-    step_size = longest / (min(finest, _MAX_STEPS_PER_SIDE) if coarse else _STEPS_PER_CELL * section.resolution)
+    per_cell = _FINE_STEPS_PER_CELL if section.resolution > _MAX_RESOLUTION else 1
+    step_size = longest / max(min(finest, _MAX_STEPS_PER_SIDE), per_cell * section.resolution)
     line = f"step size     {step_size:.4g}; a pixel covers {footprint:.4g} world units"
     infer(section, "step_size", step_size, line, **use_box)
     octaves = int(np.clip(round(1 + math.log2(2 * math.pi / (4 * footprint))), 1, 16))

@@ -161,6 +161,16 @@ def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
     assert done.stderr.endswith("default.py lists all fields\n") and done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("fault", ['{}["nothing"]', "sys.nothing"])
+def test_a_fault_in_a_config_file_is_told_from_an_unknown_field(tmp_path, fault):
+    file = tmp_path / "mine.py"
+    file.write_text(f"import sys\n\n\ndef get_config():\n    return {fault}\n")
+    command = [sys.executable, "-m", "jaxnerf.train", f"--config={file}", f"--workdir={tmp_path}"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and not done.stdout
+    assert done.stderr.startswith(f"error: --config: {file}, line 5: ") and done.stderr.count("\n") == 1
+
+
 def test_help_lists_the_flags_of_the_program(tmp_path):
     code, out, _ = call(tmp_path, "--help")
     assert code == 0

@@ -507,6 +507,13 @@ def test_small_pixels_with_alpha_have_a_finer_occupancy_grid(views, zoom, use_al
     assert section.resolution == cells and 2 / section.step_size == pytest.approx(steps)
 
 
+@pytest.mark.parametrize("cells, steps", [(16, 32), (128, 128), (512, 576)])
+def test_a_step_is_at_most_as_long_as_a_cell_of_any_size(views, cells, steps):
+    config = auto_config(use_alpha=False, contracted=False, lower=(-1.0,) * 3, upper=(1.0,) * 3)
+    config.occupancy.resolution = cells
+    assert 2 / resolve(config, views).config.occupancy.step_size == pytest.approx(steps)
+
+
 @pytest.mark.parametrize("zoom, expected", [(1.0, "cameras"), (4.0, "three times"), (0.2, "images")])
 def test_space_is_not_contracted_around_the_cameras(views, zoom, expected):
     cameras = dataclasses.replace(views.cameras, focal=np.float32(zoom * np.asarray(views.cameras.focal)))
