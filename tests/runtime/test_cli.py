@@ -162,7 +162,7 @@ def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
 
 
 @pytest.mark.parametrize("fault", ['{}["nothing"]', "sys.nothing"])
-def test_a_fault_in_a_config_file_is_told_from_an_unknown_field(tmp_path, fault):
+def test_a_fault_in_a_config_file_is_not_an_unknown_field(tmp_path, fault):
     file = tmp_path / "mine.py"
     file.write_text(f"import sys\n\n\ndef get_config():\n    return {fault}\n")
     command = [sys.executable, "-m", "jaxnerf.train", f"--config={file}", f"--workdir={tmp_path}"]
