@@ -1,9 +1,11 @@
 """The measurements of run.py: each returns a dict of numbers and of rows for the page."""
 
+import collections
 import functools
 import math
 import os
 import pathlib
+import re
 import subprocess
 import sys
 import time
@@ -197,6 +199,54 @@ def _built(context, overrides):
     cells, data = experiment.prepare(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.seed, cells)
     return experiment, state, jax.device_put(data), resolved
+
+
+def kernels(context: Context) -> dict[str, Any]:
+    """Traces training steps and adds up the time of each operation of the compiled step.
+
+    On an accelerator operations are kernels; an operation that the compiler captured in a graph has its kernels' names.
+    The source of a fused operation is that of one of its parts.
+    """
+    config = context.config("lego_fast", profiles.FULL_SIZE)
+    step = common.compile_step(config)
+    state, count = step.state, 2 if context.tiny else 32
+    for _ in range(2 if context.tiny else 512):  # until the grid knows what is empty
+        state, _ = step.run(state, step.data, step.positions)
+    jax.block_until_ready(state)
+    folder = context.folder / "trace"
+    with jax.profiler.trace(str(folder)):
+        started = time.perf_counter()
+        for _ in range(count):
+            state, metrics = step.run(state, step.data, step.positions)
+        jax.block_until_ready((state, metrics))
+        wall = (time.perf_counter() - started) / count
+    sources = dict(re.findall(r'(?m)^ *(?:ROOT )?%?([\w.-]+) = .*?op_name="([^"]*)"', step.run.as_text()))
+    (path,) = folder.glob("**/*.xplane.pb")
+    total, calls = collections.Counter(), collections.Counter()
+    for event in _device_events(jax.profiler.ProfileData.from_file(str(path))):
+        name = str(dict(event.stats).get("hlo_op", event.name))
+        total[name] += event.duration_ns / 1e6 / count
+        calls[name] += 1 / count
+    rows = [
+        {"operation": name, "source": "/".join(sources.get(name, "").split("/")[-4:]), "calls": calls[name], "ms": ms}
+        for name, ms in total.most_common(40)
+    ]
+    return {
+        "ms per step": 1e3 * wall,
+        "ms in operations": sum(total.values()),
+        "operations a step": sum(calls.values()),
+        "rows": rows,
+    }
+
+
+def _device_events(profile):
+    """Yields the events of the accelerator's streams; on a CPU those of the compiled operations."""
+    planes = [plane for plane in profile.planes if plane.name.startswith("/device:")]
+    for plane in planes or profile.planes:
+        for line in plane.lines:
+            if planes and not line.name.startswith("Stream"):
+                continue
+            yield from (event for event in line.events if planes or "hlo_op" in dict(event.stats))
 
 
 def lego(context: Context, *, seconds: float, name: str = "", **overrides: Any) -> dict[str, Any]:

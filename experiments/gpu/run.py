@@ -50,6 +50,7 @@ PIECES = {
     "determinism": Piece(pieces.determinism, 2, "The same steps twice"),
     "ceilings": Piece(pieces.ceilings, 0.5, "What the device reaches"),
     "step": Piece(pieces.step_parts, 2, "The training step and its parts, lego 800 x 800"),
+    "kernels": Piece(pieces.kernels, 1, "Where the time of a training step goes, lego 800 x 800"),
     **{
         f"lego_{seconds}": Piece(_lego(seconds), seconds / 60 + 1.5, f"Lego 800 x 800 after {seconds} s")
         for seconds in (15, 30, 60, 120, 300)
