@@ -177,13 +177,15 @@ def describe_machine() -> str:
 
 
 def commit() -> str:
-    """Returns the commit of the working tree, with "-dirty" after it where files differ.
+    """Returns the commit of the working tree, with "-dirty" after it where files differ; "unknown" outside git.
 
-    Outside git it is that of the environment variable JAXNERF_COMMIT, or "unknown".
+    The environment variable JAXNERF_COMMIT replaces it, for a copy of the tree without its history.
     """
+    if os.environ.get("JAXNERF_COMMIT"):
+        return os.environ["JAXNERF_COMMIT"]
     command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
-    return found.stdout.strip() or os.environ.get("JAXNERF_COMMIT", "unknown")
+    return found.stdout.strip() or "unknown"
 
 
 def matrix_gflops(repeats: int = 12) -> float:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
+from jaxnerf.core.loops import short_loop
 from jaxnerf.core.safe_math import at_least_float32, divide
 from jaxnerf.core.types import check_shapes
 from jaxnerf.core.varying import vary_like
@@ -413,8 +414,7 @@ def running_sum_since(starts: Bool[ArrayLike, " K"], x: Float[Array, " K"], long
         before = [jax.lax.dynamic_slice_in_dim(leaf, at, x.size) for leaf in before]
         return jnp.where(starts, x, x + before[0]), starts | before[1]
 
-    # A loop: unrolled, XLA makes a kernel of each round, which computes some of the earlier rounds again.
-    return jax.lax.fori_loop(0, rounds, add_before, vary_like((x, starts), x, starts))[0]
+    return short_loop(rounds, add_before, vary_like((x, starts), x, starts))[0]
 
 
 def _sample_index(x):

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, Num, UInt
 
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
+from jaxnerf.core.loops import search_sorted
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Batch, Rays, Vector, Views, pytree
 
@@ -47,12 +48,12 @@ class PixelRuns:
 
     def ids(self, positions: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
         """Returns the ids at positions in [0, size)."""
-        run = jnp.searchsorted(self.before, positions, side="right") - 1
+        run = search_sorted(self.before, positions, side="right") - 1
         return jnp.asarray(self.first)[run] + positions - jnp.asarray(self.before)[run]
 
     def count_below(self, bounds: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
         """Returns the number of ids below each bound."""
-        run = jnp.maximum(jnp.searchsorted(self.first, bounds) - 1, 0)
+        run = jnp.maximum(search_sorted(self.first, bounds, side="left") - 1, 0)
         ends = jnp.append(self.before[1:], self.size)
         within = bounds - jnp.asarray(self.first)[run]
         return jnp.clip(jnp.asarray(self.before)[run] + within, 0, ends[run])
@@ -247,7 +248,7 @@ def _draw(seed, step, positions, views, active_pixels, batching, observed):
     sparse = jax.tree.map(jnp.asarray, views.sparse)
     first, last = 0, sparse.view.size
     if batching == "single_image":
-        first, last = jnp.searchsorted(sparse.view, jnp.stack([view, view + 1]))
+        first, last = search_sorted(sparse.view, jnp.stack([view, view + 1]), side="left")
     chosen = jax.vmap(lambda key: jax.random.randint(key, (), first, jnp.maximum(last, first + 1)))(pixel_keys)
     chosen = jnp.where((positions % _OBSERVED_EVERY == 0) & (last > first), chosen, -1)
     view, (column, row) = sparse.view[chosen], jnp.floor(sparse.pixel[chosen]).astype(jnp.int32).T

@@ -169,14 +169,20 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
         steps = count - jnp.arange(_AVERAGE_EVERY)  # for which these parameters count, only the first if `each`
         kept = jnp.where((steps < count) & each, 1, (steps - 1) / (steps + power))
 
-        def add(_, average):
+        due = each | (count % _AVERAGE_EVERY == 0)
+
+        def add(average, fraction):
             new = optax.apply_updates(params, updates)
-            fraction = 1 - kept.prod()
             return jax.tree.map(lambda old, new: old + fraction.astype(old.dtype) * (new - old), average, new)
 
-        # A loop of at most one iteration changes the average in place; a branch would copy it.
-        due = each | (count % _AVERAGE_EVERY == 0)
-        average = jax.lax.fori_loop(0, due.astype(jnp.int32), add, state.average)
+        def if_due(average, fraction):
+            # A loop of at most one iteration changes the average in place; a branch would copy it.
+            return jax.lax.fori_loop(0, due.astype(jnp.int32), lambda _, average: add(average, fraction), average)
+
+        def always(average, fraction):  # on an accelerator the host reads the condition of a loop, which takes longer
+            return add(average, jnp.where(due, fraction, 0))
+
+        average = jax.lax.platform_dependent(state.average, 1 - kept.prod(), cpu=if_due, default=always)
         return updates, Averaging(count, average, inner)
 
     return optax.GradientTransformationExtraArgs(init, update)

@@ -137,3 +137,19 @@ def test_steps_of_one_dispatch_transfer_nothing_and_are_the_same_bit_for_bit(vie
         assert int(current.step) == 8
         results.append(jax.device_get((current, jax.tree.map(lambda value: np.ravel(value)[-1], metrics))))
     jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+@pytest.mark.slow
+def test_what_only_accelerators_compile_gives_the_same_step(views, monkeypatch):
+    """Loops are unrolled there, and the average has no branch: values differ from those of a CPU by rounding alone."""
+    monkeypatch.setattr(optimizer, "_AVERAGE_ALL", 3)
+    results = []
+    for branch in ("cpu", "default"):
+        with monkeypatch.context() as patch:
+            patch.setattr(jax.lax, "platform_dependent", lambda *args, branch=branch, **of: of[branch](*args))
+            step, (state, data, positions) = train_step(views, "cpu", **{"train.averaging_power": 10.0})
+            run = jax.jit(step)
+            for _ in range(6):
+                state, metrics = run(state, data, positions)
+        results.append(jax.device_get((state.params, state.opt_state.average, metrics)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), *results)

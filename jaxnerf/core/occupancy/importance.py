@@ -3,10 +3,10 @@
 This is the importance sampling of arXiv:2003.08934 (Section 5.2) with the grid in place of the coarse network.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxnerf.core.loops import short_loop
 from jaxnerf.core.occupancy.grid import OccupancyGrid, estimate_optical_depth
 from jaxnerf.core.occupancy.packed import PlacedSamples
 from jaxnerf.core.sampling import uniform
@@ -138,6 +138,5 @@ def _count_up_to(ascending, row, value):
         inside = place < size
         return jnp.where(inside & (ascending[row, jnp.minimum(place, size) - 1] <= value), place, found)
 
-    # A loop: unrolled, XLA makes a kernel of each step, which computes some of the earlier steps again.
     none = vary_like(jnp.zeros(row.shape, jnp.int32), ascending, row, value)
-    return jax.lax.fori_loop(0, size.bit_length(), search, none)
+    return short_loop(size.bit_length(), search, none)

@@ -34,15 +34,22 @@ def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> B
     # Up to rounding, no point of a ray is further than a coarse cell from one of these positions.
     count = math.ceil(math.hypot(*sides) / (1.99 * _COARSE * min(cell)))
 
-    def read(index, hit):
+    def occupied_at(index):
         t, places = inside.near + length * ((index + 0.5) / count), []
         for axis, (size, wide) in enumerate(zip(cell, coarse.shape, strict=True)):
             place = (rays.origins[..., axis] + t * rays.directions[..., axis] - grid.lower[axis]) / size
             places.append(jnp.clip((place / _COARSE).astype(jnp.int32), 0, wide - 1))
         flat = flat_index(places, coarse.shape)
-        return hit | coarse.reshape(-1)[flat]
+        return coarse.reshape(-1)[flat]
 
-    hit = jax.lax.fori_loop(0, count, read, vary_like(jnp.zeros(rays.near.shape, bool), grid, rays))
+    def one_by_one():
+        nowhere = vary_like(jnp.zeros(rays.near.shape, bool), grid, rays)
+        return jax.lax.fori_loop(0, count, lambda index, hit: hit | occupied_at(index), nowhere)
+
+    def at_once():  # each iteration of a loop is several launches
+        return jax.vmap(occupied_at)(jnp.arange(count)).any(axis=0)
+
+    hit = jax.lax.platform_dependent(cpu=one_by_one, default=at_once)
     return (hit & (length > 0)) | has_nan(rays)
 
 
