@@ -10,7 +10,7 @@ def get_config():
     data.format, data.dir, data.factor, data.width = "auto", "", "auto", 200
     data.background, data.ndc = "auto", "auto"
     # Without alpha no cell is known to be empty at first. In real scenes thin density is mostly spurious fog.
-    config.occupancy.threshold, config.occupancy.pool_samples_per_ray = 0.03, 9.0
+    config.occupancy.threshold, config.occupancy.cpu_pool_samples_per_ray = 0.03, 9.0
     train = config.train
     # lego_fast.py has other values here, chosen on lego alone.
     train.averaging_power = 0.0

@@ -81,12 +81,12 @@ def get_config():
                 "resolutions": auto(tuple),  # vertices along the longest side, one number per level
                 "features_per_level": 4,
                 # Maximal rows per level; a level with more vertices is hashed. auto: 2^17 to 2^20, in proportion to an
-                # image's side.
+                # image's side; four times as many on an accelerator.
                 "table_size": auto(int, 2**17),
-                "width": 64,  # outputs of the density network's hidden layer
+                "width": auto(int, 64),  # outputs of the density network's hidden layer
                 "geometry_features": 15,  # outputs of the density network that the colour network reads
                 "view_depth": 2,  # hidden layers of the colour network
-                "view_width": 128,  # outputs of such a layer
+                "view_width": auto(int, 128),  # outputs of such a layer
                 "use_viewdirs": True,  # False: colour does not depend on the direction
                 "feature_scale": 4.0,  # features are table entries times this; it scales the table's learning rate
                 "compute_dtype": "auto",  # of the networks' layers: "float32" or "bfloat16"; all else is float32
@@ -105,7 +105,10 @@ def get_config():
                 # Size of the sample buffer in training, divided by the number of rays. If the samples of all rays do
                 # not fit, the rays with most samples get fewer: this fraction of them evenly, the others where the
                 # grid expects the rays to end.
-                "pool_samples_per_ray": 10.0,
+                # auto: cpu_pool_samples_per_ray on a CPU; on an accelerator up to twice as much, to fill the buffer
+                # that keeps it busy.
+                "pool_samples_per_ray": auto(float, 10.0),
+                "cpu_pool_samples_per_ray": 10.0,
                 "uniform_fraction": 0.4,
                 "max_optical_depth": 6.0,  # training skips samples behind it, as estimated by the grid; 0: off
                 "occlusion_start_step": 400,  # training step from which max_optical_depth applies

@@ -12,7 +12,7 @@ def get_config():
     config = default.get_config()
     config.data.format, config.data.dir, config.data.factor = "blender", "lego", 8
     config.field, config.sampler = "hash_grid", "occupancy"
-    config.hash_grid.view_width, config.hash_grid.table_size = 64, "auto"
+    config.hash_grid.width = config.hash_grid.view_width = config.hash_grid.table_size = "auto"
     train = config.train
     train.batch_size, train.cpu_batch_size, train.max_steps, train.lr_steps = "auto", 1024, "auto", "auto"
     train.lr_init, train.lr_final, train.lr_decay_power, train.warmup_steps = 5e-3, 1.5e-4, 8.0, 50
@@ -21,7 +21,9 @@ def get_config():
     train.averaging_power = 10.0
     train.log_every, train.save_every = 200, 4000
     # More rays with fewer samples, most of them near surfaces, learn faster than fewer rays with all samples.
-    config.occupancy.pool_samples_per_ray, config.occupancy.occlusion_start_step = 5.0, 300
+    occupancy = config.occupancy
+    occupancy.pool_samples_per_ray, occupancy.cpu_pool_samples_per_ray = "auto", 5.0
+    occupancy.occlusion_start_step = 300
     config.eval.sample_multiplier = "auto"
     config.eval.early_stop_eps = 0.003  # within 0.01 dB of the PSNR at 0.001, and faster for large images
     return config

@@ -11,7 +11,7 @@ def get_config():
     network.depth, network.width, network.view_width, network.num_freqs = 4, 64, 32, "auto"
     # A dead ReLU has no gradient and cannot recover, and this learning rate is high.
     network.density_activation, network.density_bias = "softplus", -1.0
-    config.occupancy.pool_samples_per_ray = 10.0
+    config.occupancy.cpu_pool_samples_per_ray = 10.0
     train = config.train
     train.cpu_batch_size, train.max_steps, train.lr_steps = 320, 30_000, 30_000
     train.lr_init, train.lr_final, train.muon, train.epsilon = 16e-3, 6e-4, 0.2, 1e-8

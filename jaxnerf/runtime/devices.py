@@ -33,6 +33,8 @@ class DeviceProfile(NamedTuple):
         chunk: rays per rendered chunk, by sampler.
         max_samples: size of the sample buffer in rendering.
         compute_dtype: of the hash grid's networks.
+        layer_width: of the hash grid's networks.
+        table_scale: factor of the rows of a hash grid's level.
         samples_per_step: size of the sample buffer in training; None: as the config says.
     """
 
@@ -41,6 +43,8 @@ class DeviceProfile(NamedTuple):
     chunk: Mapping[str, int]
     max_samples: int
     compute_dtype: str
+    layer_width: int = 64
+    table_scale: int = 1
     samples_per_step: int | None = None
 
 
@@ -54,13 +58,16 @@ _CPU = DeviceProfile(
     compute_dtype="float32",
 )
 # An accelerator needs many samples to be busy, and a dispatch costs as much as a small step. Chosen from operation
-# counts (docs/results/gpu_roofline.md); experiments/gpu/run.py measures other sizes.
+# counts (docs/results/gpu_roofline.md). A larger table and wider networks take little time there: each gained 0.3 dB
+# for lego at 800 x 800 on an H200 (docs/results/gpu.md).
 _ACCELERATOR = DeviceProfile(
     steps_per_dispatch=16,
     update_chunk=2**18,
     chunk={"occupancy": 2**16, "hierarchical": 2**13},  # 192 samples per ray of the paper's network take 1.6 GB a layer
     max_samples=2**17,
     compute_dtype="bfloat16",
+    layer_width=128,
+    table_scale=4,
     samples_per_step=2**18,  # that of arXiv:2201.05989
 )
 

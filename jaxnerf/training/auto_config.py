@@ -85,18 +85,19 @@ def resolve(config: ConfigDict, views: Views | None = None, *, platform: str | N
     Args:
         config: see configs/default.py; it is not changed.
         views: of the split "train" where they have been read.
-        platform: see `resolve_for_device`. It determines the number of rays per step.
+        platform: see `resolve_for_device`. It determines the number of rays and samples per step, and the sizes of
+            the hash grid.
 
     Raises:
         ValueError: names the field or file, what was found and what is expected.
     """
     check_ranges(config)
-    config = copy.deepcopy(config)
+    config, platform = copy.deepcopy(config), platform or jax.default_backend()
     config.data, lines = dataset.resolve(config.data)
     views = dataset.load_split(config.data, "train") if views is None else views
-    lines = lines + _resolve_sizes(config, views)
+    lines = lines + _resolve_sizes(config, views, devices.profile_of(platform))
     _resolve_background(config, views, lines)
-    _resolve_schedule(config, views, lines, platform or jax.default_backend())
+    _resolve_schedule(config, views, lines, platform)
     views = _resolve_near(config, views, lines)
     left = [name for name in auto_fields(config) if name not in DEVICE_FIELDS]
     if left:
@@ -224,7 +225,7 @@ def _resolve_background(config: ConfigDict, views: Views, lines: list[str]) -> N
         )
 
 
-def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
+def _resolve_sizes(config: ConfigDict, views: Views, profile: devices.DeviceProfile) -> list[str]:
     """Fills the sizes of grids and networks into a config; returns lines."""
     lines: list[str] = []
     infer = _inferring(lines)
@@ -273,9 +274,12 @@ def _resolve_sizes(config: ConfigDict, views: Views) -> list[str]:
     levels = tuple(max(vertices // 2**level, 2) for level in reversed(range(_LEVELS + more)))
     line = f"hash grid     {levels} vertices along the longest side"
     infer(config.hash_grid, "resolutions", levels, line, used=config.field == "hash_grid")
-    rows = 2 ** round(math.log2(np.clip(_ROWS_PER_PIXEL * side, _MIN_ROWS, _MAX_ROWS)))
+    rows = profile.table_scale * 2 ** round(math.log2(np.clip(_ROWS_PER_PIXEL * side, _MIN_ROWS, _MAX_ROWS)))
     line = f"hash grid     at most {rows:,} rows per level, for images of about {side:.0f} x {side:.0f} px"
     infer(config.hash_grid, "table_size", rows, line, used=config.field == "hash_grid")
+    for name, network in (("width", "density"), ("view_width", "colour")):
+        line = f"hash grid     {profile.layer_width} outputs per hidden layer of the {network} network, for this device"
+        infer(config.hash_grid, name, profile.layer_width, line, used=config.field == "hash_grid")
     if "cameras" in config:  # older versions had no such section
         infer(config.cameras, "num_images", len(views.size), "", used=False)
     return lines
@@ -287,7 +291,7 @@ def _side(views):
 
 
 def _resolve_schedule(config: ConfigDict, views: Views, lines: list[str], platform: str) -> None:
-    """Fills the numbers of rays per step and of steps into a config.
+    """Fills the numbers of rays and samples per step and of steps into a config.
 
     A run is planned as a number of rays: steps of fewer rays than would be inferred are more steps. An accelerator
     takes more rays in the same number of steps.
@@ -297,10 +301,16 @@ def _resolve_schedule(config: ConfigDict, views: Views, lines: list[str], platfo
     large = config.field == "hash_grid" and config.hash_grid.table_size >= _LARGE_TABLE
     if config.sampler == "occupancy" and large:
         rays, why = 2 * rays, "twice train.cpu_batch_size, as the hash grid's table is large"
-    if platform != "cpu" and config.sampler == "occupancy":
-        filling = devices.profile_of(platform).samples_per_step / config.occupancy.pool_samples_per_ray
-        rays, why = 2 ** max(math.floor(math.log2(filling)), 0), "they keep this device busy"
+    section, samples = config.occupancy, devices.profile_of(platform).samples_per_step
+    slots = section.get("cpu_pool_samples_per_ray", 0) if is_auto(section.pool_samples_per_ray) else 0
+    slots = slots or section.pool_samples_per_ray
+    if samples is not None and config.sampler == "occupancy":
+        rays, why = 2 ** max(math.floor(math.log2(samples / slots)), 0), "they keep this device busy"
     infer(train, "batch_size", rays, f"batch         {rays:,} rays per step: {why}")
+    if samples is not None:
+        slots = float(np.clip(samples / train.batch_size, slots, 2 * slots))
+    line = f"batch         at most {slots:g} samples per ray in the mean"
+    infer(section, "pool_samples_per_ray", slots, line, used=config.sampler == "occupancy")
     planned = max(round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5 * rays / train.batch_size), 1)
     steps, why = planned, f"{planned:,} steps of {train.batch_size:,} rays, for images of {side:.0f} x {side:.0f} px"
     if train.get("max_seconds"):

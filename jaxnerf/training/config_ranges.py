@@ -58,7 +58,11 @@ _RANGES = (
             "train.epsilon cameras.exposure_lr cameras.refine_lr eval.sample_multiplier"
         ),
     ),
-    ("from 0.01 to 100,000", lambda value: 0.01 <= value <= 100_000, "occupancy.pool_samples_per_ray"),
+    (
+        "from 0.01 to 100,000",
+        lambda value: 0.01 <= value <= 100_000,
+        "occupancy.pool_samples_per_ray occupancy.cpu_pool_samples_per_ray",
+    ),
     ("more than 0 and at most 1", lambda value: 0 < value <= 1, "occupancy.uniform_fraction"),
     ("at least 0 and below 1", lambda value: 0 <= value < 1, "train.beta1 train.beta2 eval.early_stop_eps"),
 )
@@ -77,7 +81,7 @@ _OPTIONAL = (
     "cameras occupancy.uniform_fraction occupancy.min_views train.preview_every "
     "train.max_to_keep train.max_nonfinite train.max_seconds eval.at_end eval.summary_seconds occupancy.update_chunk "
     "hash_grid.compute_dtype train.steps_per_dispatch train.cpu_batch_size train.lr_decay_power "
-    "data.background_color"
+    "data.background_color occupancy.cpu_pool_samples_per_ray"
 ).split()
 
 # Sections that become the arguments of one function, which takes no others.

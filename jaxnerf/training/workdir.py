@@ -19,7 +19,8 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-# A run may be resumed with other values of these fields and sections, as finished steps do not depend on them.
+# A run may be resumed with other values of these fields and sections, as finished steps do not depend on them: some
+# only say how others are inferred.
 CHANGEABLE = (
     "data.dir",
     "train.max_steps",
@@ -32,6 +33,8 @@ CHANGEABLE = (
     "train.microbatch_size",
     "train.steps_per_dispatch",
     "train.parallel",
+    "train.cpu_batch_size",
+    "occupancy.cpu_pool_samples_per_ray",
     "train.max_nonfinite",
     "train.max_reinits",
     "train.preview_every",

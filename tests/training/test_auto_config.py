@@ -34,6 +34,9 @@ AUTO_FIELDS = {
     "fine.num_freqs": 7,
     "hash_grid.resolutions": (8, 16),
     "hash_grid.table_size": 2**12,
+    "hash_grid.width": 32,
+    "hash_grid.view_width": 32,
+    "occupancy.pool_samples_per_ray": 6.0,
     "occupancy.contracted": True,
     "occupancy.lower": (-1.0, -2.0, -3.0),
     "occupancy.upper": (1.0, 2.0, 3.5),
@@ -333,6 +336,38 @@ def test_rays_per_step_depend_on_the_device(views, sampler, platform, rays):
     assert resolve(found, views, platform="tpu").config.train.batch_size == rays  # a workdir's stays on other devices
     config.train.batch_size = 100
     assert resolve(config, views, platform=platform).config.train.batch_size == 100
+
+
+@pytest.mark.parametrize(
+    "platform, rays, expected",
+    [("cpu", AUTO, 5.0), ("gpu", AUTO, 8.0), ("gpu", 2**16, 5.0), ("gpu", 2**10, 10.0)],  # a buffer of 2^18 samples
+)
+def test_an_accelerator_gets_as_many_samples_as_keep_it_busy(views, platform, rays, expected):
+    config = auto_config()
+    config.sampler, config.occupancy.cpu_pool_samples_per_ray = "occupancy", 5.0
+    config.occupancy.pool_samples_per_ray, config.train.batch_size = AUTO, rays
+    found, _, lines = resolve(config, views, platform=platform)
+    assert found.occupancy.pool_samples_per_ray == expected
+    assert any(line == f"batch         at most {expected:g} samples per ray in the mean" for line in lines)
+    config.occupancy.pool_samples_per_ray = 7.0
+    assert resolve(config, views, platform=platform).config.occupancy.pool_samples_per_ray == 7.0
+
+
+def test_a_run_of_an_older_version_has_no_samples_per_ray_of_a_cpu(views):
+    config = auto_config()
+    config.sampler, config.occupancy.pool_samples_per_ray = "occupancy", 7.0
+    del config.occupancy.cpu_pool_samples_per_ray
+    assert resolve(config, views, platform="gpu").config.occupancy.pool_samples_per_ray == 7.0
+
+
+def test_an_accelerator_gets_a_larger_hash_grid(views):
+    config = auto_config()
+    config.field = "hash_grid"
+    section = config.hash_grid
+    section.width = section.view_width = section.table_size = AUTO
+    on_cpu, on_gpu = (resolve(config, views, platform=platform).config.hash_grid for platform in ("cpu", "gpu"))
+    assert (on_cpu.width, on_cpu.view_width) == (64, 64) and (on_gpu.width, on_gpu.view_width) == (128, 128)
+    assert on_gpu.table_size == 4 * on_cpu.table_size
 
 
 def of_cameras(to_world, near=2.0, far=6.0):

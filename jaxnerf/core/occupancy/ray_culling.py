@@ -34,7 +34,7 @@ def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> B
     # Up to rounding, no point of a ray is further than a coarse cell from one of these positions.
     count = math.ceil(math.hypot(*sides) / (1.99 * _COARSE * min(cell)))
 
-    def occupied_at(index):
+    def read(index):
         t, places = inside.near + length * ((index + 0.5) / count), []
         for axis, (size, wide) in enumerate(zip(cell, coarse.shape, strict=True)):
             place = (rays.origins[..., axis] + t * rays.directions[..., axis] - grid.lower[axis]) / size
@@ -44,12 +44,12 @@ def rays_may_hit(grid: OccupancyGrid, rays: Rays, *, cell: Sequence[float]) -> B
 
     def one_by_one():
         nowhere = vary_like(jnp.zeros(rays.near.shape, bool), grid, rays)
-        return jax.lax.fori_loop(0, count, lambda index, hit: hit | occupied_at(index), nowhere)
+        return jax.lax.fori_loop(0, count, lambda index, hit: hit | read(index), nowhere)
 
-    def at_once():  # each iteration of a loop is several launches
-        return jax.vmap(occupied_at)(jnp.arange(count)).any(axis=0)
+    def together():  # each iteration of a loop is several launches
+        return jax.vmap(read)(jnp.arange(count)).any(axis=0)
 
-    hit = jax.lax.platform_dependent(cpu=one_by_one, default=at_once)
+    hit = jax.lax.platform_dependent(cpu=one_by_one, default=together)
     return (hit & (length > 0)) | has_nan(rays)
 
 
