@@ -59,7 +59,7 @@ PIECES = {
         _lego(60, **_FOUR_LEVELS), 2.5, "Lego 800 x 800 after 60 s, without the level of 512 vertices"
     ),
     "frame": Piece(pieces.frame, 2, "A frame of 800 x 800"),
-    "paper_mlp": Piece(pieces.paper_mlp, 8.5, "The paper's network with an occupancy grid, lego 800 x 800"),
+    "paper_mlp": Piece(pieces.paper_mlp, 3, "The paper's network with an occupancy grid, lego 800 x 800"),
     "paper": Piece(pieces.paper, 4, "The paper's own configuration, lego 800 x 800"),
     "fern": Piece(functools.partial(pieces.scene, name="fern"), 3.5, "Fern at full size, 120 s"),
     "can": Piece(functools.partial(pieces.scene, name="can"), 3.5, "Can at full size, 120 s"),
