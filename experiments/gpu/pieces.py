@@ -103,7 +103,10 @@ def _gradient(config, inputs, precision, device):
 
     with jax.default_matmul_precision(precision):
         arguments = jax.device_put(inputs, device)
-        (value, rgb), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(*arguments)
+        # The choice of the fastest kernels takes a GPU half a minute, and this runs once.
+        options = {"xla_gpu_autotune_level": 0} if device.platform == "gpu" else None
+        compiled = jax.jit(jax.value_and_grad(loss, has_aux=True), compiler_options=options)
+        (value, rgb), grads = compiled(*arguments)
     gradient = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(jax.device_get(grads))])
     return {"colour": np.asarray(rgb), "loss": np.asarray(value), "gradient": gradient}
 
@@ -208,11 +211,7 @@ def _built(context, overrides):
 
 
 def kernels(context: Context) -> dict[str, Any]:
-    """Traces training steps and adds up the time of each operation of the compiled step.
-
-    On an accelerator operations are kernels; an operation that the compiler captured in a graph has its kernels' names.
-    The source of a fused operation is that of one of its parts.
-    """
+    """Traces training steps and adds up the time of each kernel; the source of a kernel is that of one of its parts."""
     config = context.config("lego_fast", profiles.FULL_SIZE)
     step = common.compile_step(config)
     state, count = step.state, 2 if context.tiny else 32
@@ -228,24 +227,25 @@ def kernels(context: Context) -> dict[str, Any]:
         wall = (time.perf_counter() - started) / count
     sources = dict(re.findall(r'(?m)^ *(?:ROOT )?%?([\w.-]+) = .*?op_name="([^"]*)"', step.run.as_text()))
     (path,) = folder.glob("**/*.xplane.pb")
+    return {"ms per traced step": 1e3 * wall} | kernel_times(str(path), sources, count)
+
+
+def kernel_times(path: str, sources: dict[str, str], num_steps: int) -> dict[str, Any]:
+    """Returns the times of the kernels of a trace of so many steps; {operation of the compiled step: its source}."""
+    sources = {name.replace(".", "_"): source for name, source in sources.items()}  # as kernels are called
     total, calls = collections.Counter(), collections.Counter()
-    for event in _device_events(jax.profiler.ProfileData.from_file(str(path))):
-        name = str(dict(event.stats).get("hlo_op", event.name))
-        total[name] += event.duration_ns / 1e6 / count
-        calls[name] += 1 / count
+    for event in _kernels(jax.profiler.ProfileData.from_file(path)):
+        name = event.name.replace(".", "_")
+        total[name] += event.duration_ns / 1e6 / num_steps
+        calls[name] += 1 / num_steps
     rows = [
-        {"operation": name, "source": "/".join(sources.get(name, "").split("/")[-4:]), "calls": calls[name], "ms": ms}
-        for name, ms in total.most_common(40)
+        {"kernel": name[:40], "source": "/".join(sources.get(name, "").split("/")[-3:]), "calls": calls[name], "ms": ms}
+        for name, ms in total.most_common(25)
     ]
-    return {
-        "ms per step": 1e3 * wall,
-        "ms in operations": sum(total.values()),
-        "operations a step": sum(calls.values()),
-        "rows": rows,
-    }
+    return {"ms in kernels": sum(total.values()), "kernels per step": sum(calls.values()), "rows": rows}
 
 
-def _device_events(profile):
+def _kernels(profile):
     """Yields the events of the accelerator's streams; on a CPU those of the compiled operations."""
     planes = [plane for plane in profile.planes if plane.name.startswith("/device:")]
     for plane in planes or profile.planes:
@@ -255,13 +255,33 @@ def _device_events(profile):
             yield from (event for event in line.events if planes or "hlo_op" in dict(event.stats))
 
 
-def lego(context: Context, *, seconds: float, name: str = "", **overrides: Any) -> dict[str, Any]:
+def lego(context: Context, *, seconds: float) -> dict[str, Any]:
     """Trains lego at 800 x 800 for so many seconds and scores its test views."""
     limit = min(seconds, 1.0) if context.tiny else seconds
-    config = context.config(
-        "lego_fast", profiles.FULL_SIZE | profiles.TIMED | overrides | {"train.max_seconds": float(limit)}
-    )
-    return _trained(config, context.folder / f"lego{name}-{seconds:g}")
+    config = context.config("lego_fast", profiles.FULL_SIZE | profiles.TIMED | {"train.max_seconds": float(limit)})
+    return _trained(config, context.folder / f"lego-{seconds:g}")
+
+
+_SMALL = {"hash_grid.width": 64, "hash_grid.view_width": 64, "hash_grid.table_size": 2**20}
+_SIZES = {
+    "5 samples per ray, networks 64 wide, 2^20 rows": _SMALL | {"occupancy.pool_samples_per_ray": 5.0},
+    "8 samples per ray": _SMALL,
+    "8 samples per ray, a level of 1,024 vertices": _SMALL | {"hash_grid.resolutions": (32, 64, 128, 256, 512, 1024)},
+    "8 samples per ray, 2^22 rows": _SMALL | {"hash_grid.table_size": 2**22},
+    "8 samples per ray, networks 128 wide": _SMALL | {"hash_grid.width": 128, "hash_grid.view_width": 128},
+    "auto: all but the level": {},
+}
+
+
+def sizes(context: Context) -> dict[str, Any]:
+    """Trains lego at 800 x 800 with other sizes for as many steps, and scores views held out of training."""
+    steps = 20 if context.tiny else 6000
+    fixed = {"data.hold_out": 8, "train.max_steps": steps, "train.lr_steps": steps, "train.save_every": steps}
+    rows = []
+    for index, (name, changes) in enumerate(_SIZES.items()):
+        config = context.config("lego_fast", profiles.FULL_SIZE | fixed | changes)
+        rows.append({"sizes": name, **_trained(config, context.folder / f"sizes_{index}", split="held_out")})
+    return {"rows": rows}
 
 
 def scene(context: Context, *, name: str) -> dict[str, Any]:
@@ -271,8 +291,8 @@ def scene(context: Context, *, name: str) -> dict[str, Any]:
     return _trained(context.config("capture", profiles.TIMED | overrides), context.folder / name)
 
 
-def _trained(config, folder):
-    results = common.run(config, folder)
+def _trained(config, folder, split=None):
+    results = common.run(config, folder, split=split)
     if results is None:
         raise KeyboardInterrupt
     row = metric_log.read_rows(folder)[-1]

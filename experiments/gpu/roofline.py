@@ -83,6 +83,8 @@ def count(jaxpr) -> Counts:
         sizes = [variable.aval.size * variable.aval.dtype.itemsize for variable in equation.outvars]
         if name == "scan":
             total.add(inner[0], equation.params["length"])
+        elif None in (equation.params.get("branches_platforms") or ()):  # the others are for a CPU
+            total.add(inner[equation.params["branches_platforms"].index(None)])
         elif name in ("cond", "while"):
             total.conditionals += 1
             total.add(max(inner, key=lambda part: sum(part.flops.values()) + part.row_bytes + part.other_bytes))
@@ -232,8 +234,9 @@ def main(argv: list[str]) -> None:
         "",
         *common.provenance(),
         "",
-        "Nothing on this page was measured on an accelerator. The operations of a training step are counted, at the "
-        "sizes that `auto` fields get on a GPU, and divided by what the data sheets of GPUs state:",
+        "Nothing on this page was measured on an accelerator; [the measurements](gpu.md) are on another page. The "
+        "operations of a training step are counted, at the sizes that `auto` fields get on a GPU, and divided by what "
+        "the data sheets of GPUs state:",
         "",
         *common.markdown(("", "memory", "float32", "products of float32 (TF32)", "products of bfloat16"), rates),
         "",
@@ -246,8 +249,7 @@ def main(argv: list[str]) -> None:
         "overlap.",
         "",
         "Additions to the table's gradient are atomic on a GPU, in no fixed order, so float32 sums differ between "
-        "runs. A run should resume bit for bit with `XLA_FLAGS=--xla_gpu_deterministic_ops=true`, which sorts the "
-        "rows first and is slower; experiments/gpu/run.py measures both.",
+        "runs. With `XLA_FLAGS=--xla_gpu_deterministic_ops=true` two runs are the same bit for bit, but much slower.",
     ]
     for name, overrides in _CONFIGS.items():
         config = profiles.configuration(name, overrides, tiny=_TINY.value)

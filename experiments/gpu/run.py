@@ -39,26 +39,21 @@ class Piece(NamedTuple):
     title: str
 
 
-def _lego(seconds, **options):
-    return functools.partial(pieces.lego, seconds=seconds, **options)
-
-
-_FOUR_LEVELS = {"name": "_256", "hash_grid.resolutions": (32, 64, 128, 256)}
 PIECES = {
     "hard_cases": Piece(pieces.hard_cases, 2, "Hard cases on the device"),
-    "agreement": Piece(pieces.agreement, 1.5, "Device against CPU: relative errors of the first step"),
+    "agreement": Piece(pieces.agreement, 4, "Device against CPU: relative errors of the first step"),
     "determinism": Piece(pieces.determinism, 2, "The same steps twice"),
     "ceilings": Piece(pieces.ceilings, 0.5, "What the device reaches"),
     "step": Piece(pieces.step_parts, 2, "The training step and its parts, lego 800 x 800"),
-    "kernels": Piece(pieces.kernels, 1, "Where the time of a training step goes, lego 800 x 800"),
+    "kernels": Piece(pieces.kernels, 1, "The kernels of a training step, lego 800 x 800"),
     **{
-        f"lego_{seconds}": Piece(_lego(seconds), seconds / 60 + 1.5, f"Lego 800 x 800 after {seconds} s")
+        f"lego_{seconds}": Piece(
+            functools.partial(pieces.lego, seconds=seconds), seconds / 60 + 1.5, f"Lego 800 x 800 after {seconds} s"
+        )
         for seconds in (15, 30, 60, 120, 300)
     },
-    "lego_60_256": Piece(
-        _lego(60, **_FOUR_LEVELS), 2.5, "Lego 800 x 800 after 60 s, without the level of 512 vertices"
-    ),
     "frame": Piece(pieces.frame, 2, "A frame of 800 x 800"),
+    "sizes": Piece(pieces.sizes, 6, "Sizes: views held out of training, lego 800 x 800"),
     "paper_mlp": Piece(pieces.paper_mlp, 3, "The paper's network with an occupancy grid, lego 800 x 800"),
     "paper": Piece(pieces.paper, 4, "The paper's own configuration, lego 800 x 800"),
     "fern": Piece(functools.partial(pieces.scene, name="fern"), 3.5, "Fern at full size, 120 s"),
@@ -123,7 +118,11 @@ def main(argv: list[str]) -> None:
 def page(kept: dict[str, Any]) -> list[str]:
     """Returns the lines of the page of results.json's content."""
     about = kept["about"]
-    lines = ["# Measured on an accelerator", "", f"Device: {about['device']}; JAX {about['jax']}."]
+    lines = [
+        "# Measured on an accelerator",
+        "",
+        f"Device: {about['device']}; JAX {about['jax']}. [The guide](../guides/accelerators.md) discusses the figures.",
+    ]
     for name, piece in PIECES.items():
         result = kept["pieces"].get(name)
         if result is None:
