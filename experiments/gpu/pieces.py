@@ -269,7 +269,7 @@ _SIZES = {
     "8 samples per ray, a level of 1,024 vertices": _SMALL | {"hash_grid.resolutions": (32, 64, 128, 256, 512, 1024)},
     "8 samples per ray, 2^22 rows": _SMALL | {"hash_grid.table_size": 2**22},
     "8 samples per ray, networks 128 wide": _SMALL | {"hash_grid.width": 128, "hash_grid.view_width": 128},
-    "auto: all but the level": {},
+    "auto": {},
 }
 
 
