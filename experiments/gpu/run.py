@@ -102,7 +102,8 @@ def main(argv: list[str]) -> None:
         except Exception as error:  # the other pieces do not depend on it; main reports it at its end
             found = {"error": f"{type(error).__name__}: {error}".splitlines()[0][:500]}
         seconds = time.perf_counter() - begun
-        results[name] = {"seconds": seconds, "commit": common.commit(), "command": " ".join(sys.argv), **found}
+        origin = {"commit": common.commit(), "date": time.strftime("%F"), "command": " ".join(sys.argv)}
+        results[name] = {"seconds": seconds, **origin, **found}
         common.write_json(path, kept)
         print(f"{name}: {seconds:.0f} s" + (f", failed: {found['error']}" if "error" in found else ""), flush=True)
         jax.clear_caches()
@@ -121,16 +122,16 @@ def page(kept: dict[str, Any]) -> list[str]:
     lines = [
         "# Measured on an accelerator",
         "",
-        f"Device: {about['device']}; JAX {about['jax']}. [The guide](../guides/accelerators.md) discusses the figures.",
+        f"JAX {about['jax']}. [The guide](../guides/accelerators.md) discusses the figures.",
     ]
     for name, piece in PIECES.items():
         result = kept["pieces"].get(name)
         if result is None:
             continue
         plain = {key: value for key, value in result.items() if not isinstance(value, list)}
-        origin = {key: plain.pop(key) for key in ("seconds", "commit", "command")}
-        lines += ["", f"## {piece.title}", ""]
-        lines += [f"`{origin['command']}`, commit {origin['commit']}, {origin['seconds']:.0f} s.", ""]
+        seconds, commit, date, command = (plain.pop(key) for key in ("seconds", "commit", "date", "command"))
+        origin = (f"`{command}`, {seconds:.0f} s", f"{commit}, {date}", about["device"])
+        lines += ["", f"## {piece.title}", "", *common.markdown(("command", "commit", "machine"), [origin]), ""]
         if plain:
             lines += [*common.markdown(list(plain), [[_text(value) for value in plain.values()]]), ""]
         rows = result.get("rows", [])

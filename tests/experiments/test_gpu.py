@@ -28,14 +28,14 @@ def test_counts_of_products_rows_and_loops():
 
 
 def test_page_has_a_section_for_each_finished_piece():
-    origin = {"seconds": 3.2, "commit": "abc", "command": "run.py"}
+    origin = {"seconds": 3.2, "commit": "abc", "date": "2026-11-26", "command": "run.py"}
     kept = {
         "about": {"device": "a device", "jax": "1.0"},
         "pieces": {"frame": {**origin, "workdir": "lego-30", "rows": [{"chunk": 256, "ms per frame": 12.345}]}},
     }
     text = "\n".join(runbook.page(kept))
     assert "| 256 | 12.35 |" in text or "| 256 | 12.34 |" in text
-    assert text.count("## ") == 1 and "commit abc, 3 s" in text
+    assert text.count("## ") == 1 and "| `run.py`, 3 s | abc, 2026-11-26 | a device |" in text
 
 
 @pytest.fixture
