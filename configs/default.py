@@ -83,10 +83,11 @@ def get_config():
                 # Maximal rows per level; a level with more vertices is hashed. auto: 2^17 to 2^20, in proportion to an
                 # image's side; four times as many on an accelerator.
                 "table_size": auto(int, 2**17),
-                "width": auto(int, 64),  # outputs of the density network's hidden layer
+                # Outputs of a hidden layer of the density network; auto: 64 on a CPU, 128 on an accelerator.
+                "width": auto(int, 64),
                 "geometry_features": 15,  # outputs of the density network that the colour network reads
                 "view_depth": 2,  # hidden layers of the colour network
-                "view_width": auto(int, 128),  # outputs of such a layer
+                "view_width": auto(int, 128),  # outputs of such a layer; auto: as width
                 "use_viewdirs": True,  # False: colour does not depend on the direction
                 "feature_scale": 4.0,  # features are table entries times this; it scales the table's learning rate
                 "compute_dtype": "auto",  # of the networks' layers: "float32" or "bfloat16"; all else is float32
@@ -102,13 +103,12 @@ def get_config():
                 "update_every": 64,  # training steps between updates of the grid
                 "cells_per_update": 2**18,  # cells whose density an update evaluates
                 "update_chunk": auto(int),  # cells of these evaluated at once
-                # Size of the sample buffer in training, divided by the number of rays. If the samples of all rays do
-                # not fit, the rays with most samples get fewer: this fraction of them evenly, the others where the
-                # grid expects the rays to end.
-                # auto: cpu_pool_samples_per_ray on a CPU; on an accelerator up to twice as much, to fill the buffer
-                # that keeps it busy.
+                # Size of the sample buffer in training, divided by the number of rays. auto: on a CPU
+                # cpu_pool_samples_per_ray; on an accelerator, which a larger buffer keeps busy, up to twice as much.
                 "pool_samples_per_ray": auto(float, 10.0),
                 "cpu_pool_samples_per_ray": 10.0,
+                # If the samples of all rays do not fit into the buffer, the rays with most samples get fewer: this
+                # fraction of them evenly, the others where the grid expects the rays to end.
                 "uniform_fraction": 0.4,
                 "max_optical_depth": 6.0,  # training skips samples behind it, as estimated by the grid; 0: off
                 "occlusion_start_step": 400,  # training step from which max_optical_depth applies

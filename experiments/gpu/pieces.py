@@ -287,7 +287,7 @@ def sizes(context: Context) -> dict[str, Any]:
 def scene(context: Context, *, name: str) -> dict[str, Any]:
     """Trains a real capture at its full size for two minutes and scores its test views."""
     limit = 1.0 if context.tiny else 120.0
-    overrides = {"data.dir": name, "data.width": 10_000, "hash_grid.table_size": 2**19, "train.max_seconds": limit}
+    overrides = {"data.dir": name, "data.width": 10_000, "train.max_seconds": limit}
     return _trained(context.config("capture", profiles.TIMED | overrides), context.folder / name)
 
 
@@ -327,19 +327,13 @@ def frame(context: Context) -> dict[str, Any]:
 
 
 def paper_mlp(context: Context) -> dict[str, Any]:
-    """Trains the paper's network with an occupancy grid; scores all test views at the end, and two on the way."""
-    config = context.config("lego_mlp_fast", mlp_overrides(max(min(context.left() - 75, 420.0), 60.0)))
-    if context.tiny:
-        config.train.max_seconds = 1.0
-    folder = context.folder / "paper_mlp"
-    return {**_trained(config, folder), "rows": _scored(config, folder)}
-
-
-def mlp_overrides(seconds: float) -> dict[str, Any]:
-    """Returns what makes lego_mlp_fast train the paper's network at 800 x 800 for so many seconds."""
+    """Trains the paper's network with an occupancy grid; scores all test views at the end, two at each checkpoint."""
+    limit = 1.0 if context.tiny else max(min(context.left() - 75, 420.0), 60.0)
     overrides = {"fine.depth": 8, "fine.width": 256, "fine.view_width": 128, "fine.num_freqs": 10}
     overrides |= {"fine.compute_dtype": "bfloat16", "train.max_to_keep": 20, "train.save_every": 4000}
-    return profiles.FULL_SIZE | profiles.TIMED | overrides | {"train.max_seconds": float(seconds)}
+    overrides |= profiles.FULL_SIZE | profiles.TIMED | {"train.max_seconds": limit}
+    config, folder = context.config("lego_mlp_fast", overrides), context.folder / "paper_mlp"
+    return {**_trained(config, folder), "rows": _scored(config, folder)}
 
 
 def paper(context: Context) -> dict[str, Any]:
@@ -384,7 +378,7 @@ def memory_use(context: Context) -> dict[str, Any]:
     """Measures memory and rays per second of a step by its batch, and memory of a frame by its chunk."""
     rows = []
     for rays in (32, 64) if context.tiny else (2**12, 2**14, 2**15, 2**16, 2**17):
-        config = context.config("lego_fast", profiles.FULL_SIZE)
+        config = context.config("lego_fast", profiles.FULL_SIZE | {"occupancy.pool_samples_per_ray": 8.0})
         step = common.compile_step(common.changed(config, {"train.batch_size": rays, "train.microbatch_size": rays}))
         stats = step.run.memory_analysis()
         state = step.state

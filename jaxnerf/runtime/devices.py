@@ -59,7 +59,7 @@ _CPU = DeviceProfile(
 )
 # An accelerator needs many samples to be busy, and a dispatch costs as much as a small step. Chosen from operation
 # counts (docs/results/gpu_roofline.md). A larger table and wider networks take little time there: each gained 0.3 dB
-# for lego at 800 x 800 on an H200 (docs/results/gpu.md).
+# for lego at 800 x 800 on an H200 (docs/guides/accelerators.md).
 _ACCELERATOR = DeviceProfile(
     steps_per_dispatch=16,
     update_chunk=2**18,

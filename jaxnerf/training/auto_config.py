@@ -302,14 +302,14 @@ def _resolve_schedule(config: ConfigDict, views: Views, lines: list[str], platfo
     if config.sampler == "occupancy" and large:
         rays, why = 2 * rays, "twice train.cpu_batch_size, as the hash grid's table is large"
     section, samples = config.occupancy, devices.profile_of(platform).samples_per_step
-    slots = section.get("cpu_pool_samples_per_ray", 0) if is_auto(section.pool_samples_per_ray) else 0
-    slots = slots or section.pool_samples_per_ray
+    slots = section.pool_samples_per_ray
+    slots = section.cpu_pool_samples_per_ray if is_auto(slots) else slots
     if samples is not None and config.sampler == "occupancy":
         rays, why = 2 ** max(math.floor(math.log2(samples / slots)), 0), "they keep this device busy"
     infer(train, "batch_size", rays, f"batch         {rays:,} rays per step: {why}")
     if samples is not None:
         slots = float(np.clip(samples / train.batch_size, slots, 2 * slots))
-    line = f"batch         at most {slots:g} samples per ray in the mean"
+    line = f"batch         at most {slots:g} samples per ray on average"
     infer(section, "pool_samples_per_ray", slots, line, used=config.sampler == "occupancy")
     planned = max(round(_TRAIN_STEPS_PER_ROOT_PIXEL * side**0.5 * rays / train.batch_size), 1)
     steps, why = planned, f"{planned:,} steps of {train.batch_size:,} rays, for images of {side:.0f} x {side:.0f} px"

@@ -348,7 +348,7 @@ def test_an_accelerator_gets_as_many_samples_as_keep_it_busy(views, platform, ra
     config.occupancy.pool_samples_per_ray, config.train.batch_size = AUTO, rays
     found, _, lines = resolve(config, views, platform=platform)
     assert found.occupancy.pool_samples_per_ray == expected
-    assert any(line == f"batch         at most {expected:g} samples per ray in the mean" for line in lines)
+    assert any(line == f"batch         at most {expected:g} samples per ray on average" for line in lines)
     config.occupancy.pool_samples_per_ray = 7.0
     assert resolve(config, views, platform=platform).config.occupancy.pool_samples_per_ray == 7.0
 
