@@ -1,5 +1,6 @@
 """The hash grid: features at the vertices of several levels, decoded by two small networks."""
 
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.safe_math import clamp
@@ -156,8 +158,7 @@ class HashGrid(linen.Module):
         levels = self.levels()
         # All levels share a table, so there is only one gradient to clear and one array to update.
         table = self.param("table", _near_zero, (levels[-1].rows.stop, self.features_per_level))
-        features = [interpolate(table, place, level.size, rows=level.rows) for level in levels]
-        features = self._rounded(self.feature_scale * jnp.concatenate(features, axis=-1))
+        features = self._rounded(self.feature_scale * interpolate(table, place, levels))
         kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
         bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
         kernel, bias = self._rounded(kernel), self._rounded(bias)
@@ -184,34 +185,76 @@ def vertices(side: Vector, resolution: int) -> tuple[int, int, int]:
 def interpolate(
     table: Float[ArrayLike, "rows features"],
     place: Sequence[Float[ArrayLike, " N"]],
-    size: tuple[int, int, int],
-    *,
-    rows: range,
-) -> Float[Array, "N features"]:
-    """Interpolates features linearly between the 8 vertices around each place.
+    levels: Sequence[TableLevel],
+) -> Float[Array, "N levels_and_features"]:
+    """Interpolates features linearly between the 8 vertices around each place, for each level.
 
     Args:
         table: [T, F] features of vertices.
         place: three arrays [N], x, y and z as fractions of the box; clamped to it.
-        size: vertices along x, y and z.
-        rows: range of the table's rows that belong to this level: one row per vertex, z fastest, or fewer rows,
-            which vertices share by the hash of arXiv:2201.05989 (Eq. 4).
+        levels: L levels. Each has one row of the table per vertex, z fastest, or fewer rows, which vertices share by
+            the hash of arXiv:2201.05989 (Eq. 4). All levels that share rows have the same number of them.
 
     Returns:
-        [N, F]. The derivative with respect to place is that of the linear pieces, also on a face of the box.
+        [N, L F], level by level. The derivative with respect to place is that of the linear pieces, also on a face
+        of the box.
 
     Raises:
-        ValueError: on another shape of the table.
+        ValueError: on another shape of the table, or if the levels that share rows have different numbers of them.
     """
     check_shapes("interpolate", table=(table, "T F"), x=(place[0], "N"), y=(place[1], "N"), z=(place[2], "N"))
-    spread = [clamp(value, 0, 1) * (count - 1) for value, count in zip(place, size, strict=True)]
-    low = [jnp.minimum(value.astype(jnp.int32), count - 2) for value, count in zip(spread, size, strict=True)]
-    fractions = [value - start for value, start in zip(spread, low, strict=True)]
-    corner_weights = _of_corners(jnp.multiply, [(1 - fraction, fraction) for fraction in fractions])
-    total = 0.0
-    for row, weight in zip(_corner_rows(low, size, rows), corner_weights, strict=True):
-        total = total + weight[:, None] * table.at[row].get(mode="promise_in_bounds")
-    return total
+    if len({len(level.rows) for level in levels if _is_hashed(level)}) > 1:
+        raise ValueError(f"interpolate: levels that share rows are {levels}, expected equal numbers of rows")
+    return _interpolate(tuple(levels), table, tuple(place))
+
+
+def _interpolated(levels, table, place):
+    """Interpolates level by level, which is faster than by `_all_corners` where no derivative is needed."""
+    weights, features = [], []
+    for level in levels:
+        low, fractions = _cells(level.size, place)
+        weights.append(_of_corners(jnp.multiply, [(1 - fraction, fraction) for fraction in fractions]))
+        features.append([_read(table, row) for row in _corner_rows(low, level)])
+    return _weighted_sums(weights, features)
+
+
+_interpolate = jax.custom_jvp(_interpolated, nondiff_argnums=(0,))
+
+
+@functools.partial(_interpolate.defjvp, symbolic_zeros=True)
+def _interpolate_jvp(levels, primals, tangents):
+    """Differentiates with rows and weights of all levels and vertices at once.
+
+    Otherwise the gradient has a loop of its own for the rows of each vertex of each level, all of which are compiled.
+    The features are split by vertex, as XLA's loops over several vertices divide an index for each element.
+    """
+    (table, place), (change, moved) = primals, tangents
+    rows, weights = _all_corners(levels, place)
+    tangent = 0.0
+    if not isinstance(change, SymbolicZero):
+        read = jax.lax.split(_read(change, rows.reshape(-1)), [rows.shape[2]] * (rows.shape[0] * 8))
+        tangent = _weighted_sums(weights, [read[start : start + 8] for start in range(0, len(read), 8)])
+    if not all(isinstance(each, SymbolicZero) for each in moved):
+        moved = tuple(
+            jnp.zeros_like(x) if isinstance(change, SymbolicZero) else change
+            for x, change in zip(place, moved, strict=True)
+        )
+        tangent += jax.jvp(functools.partial(_interpolated, levels, table), (place,), (moved,))[1]
+    return _weighted_sums(weights, [[_read(table, row) for row in level] for level in rows]), tangent
+
+
+def _weighted_sums(weights, features):
+    """Returns the sums over the vertices [N, L F] of weights and features by level and vertex, [N] and [N, F] each.
+
+    Not as sums over an axis, for which XLA would write all products to memory.
+    """
+    return jnp.concatenate(
+        [
+            functools.reduce(jnp.add, (w[:, None] * f for w, f in zip(*level, strict=True)))
+            for level in zip(weights, features, strict=True)
+        ],
+        axis=-1,
+    )
 
 
 def _stored(values):
@@ -264,16 +307,23 @@ def harmonics(directions: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 
     )
 
 
-def _corner_rows(low, size, rows):
+def _cells(size, place):
+    """Returns, for each axis, the lower vertices of the cells around places, and the fractions of cells below them."""
+    spread = [clamp(value, 0, 1) * np.float32(count - 1) for value, count in zip(place, size, strict=True)]
+    low = [jnp.minimum(value.astype(jnp.int32), count - 2) for value, count in zip(spread, size, strict=True)]
+    return low, [value - start for value, start in zip(spread, low, strict=True)]
+
+
+def _corner_rows(low, level):
     """Returns the rows [N] of the 8 vertices around places; low holds the lowest along each axis."""
-    if len(rows) == np.prod(size):
-        strides = (size[1] * size[2], size[2], 1)
+    if not _is_hashed(level):
+        strides = (level.size[1] * level.size[2], level.size[2], 1)
         along = [(v * stride, v * stride + stride) for v, stride in zip(low, strides, strict=True)]
-        return [rows.start + row for row in _of_corners(jnp.add, along)]
+        return [level.rows.start + row for row in _of_corners(jnp.add, along)]
     first = [v.astype(jnp.uint32) for v in low]
     along = [(v * prime, (v + 1) * prime) for v, prime in zip(first, map(jnp.uint32, _PRIMES), strict=True)]
     scattered = _of_corners(jnp.bitwise_xor, along)
-    return [rows.start + (row % jnp.uint32(len(rows))).astype(jnp.int32) for row in scattered]
+    return [level.rows.start + (row % jnp.uint32(len(level.rows))).astype(jnp.int32) for row in scattered]
 
 
 def _of_corners(combine, along):
@@ -281,6 +331,33 @@ def _of_corners(combine, along):
     x, y, z = along
     pairs = [combine(*pair) for pair in itertools.product(x, y)]
     return [combine(*pair) for pair in itertools.product(pairs, z)]
+
+
+def _all_corners(levels, place):
+    """Returns the rows and the weights [L, 8, N] of the 8 vertices around places, z fastest."""
+    size = np.array([level.size for level in levels], np.int32).T[..., None, None]
+    corners = np.array(list(itertools.product((0, 1), repeat=3)), np.int32).T[:, None, :, None]
+    low, fractions = _cells(size, [value[None, None] for value in place])
+    weights = [jnp.where(corner == 1, value, 1 - value) for corner, value in zip(corners, fractions, strict=True)]
+    vertices = list(map(jnp.add, low, corners))
+    rows = functools.reduce(jnp.add, map(jnp.multiply, vertices, (size[1] * size[2], size[2], 1)))
+    hashed = np.array([_is_hashed(level) for level in levels])
+    if hashed.any():
+        scattered = [v.astype(jnp.uint32) * jnp.uint32(prime) for v, prime in zip(vertices, _PRIMES, strict=True)]
+        scattered = functools.reduce(jnp.bitwise_xor, scattered) % jnp.uint32(len(levels[hashed.argmax()].rows))
+        rows = jnp.where(hashed[:, None, None], scattered.astype(jnp.int32), rows)
+    starts = np.array([level.rows.start for level in levels], np.int32)
+    # On a CPU, XLA would compute the rows once more for the gradient, but not if their last step is a remainder.
+    rows = jax.lax.rem(rows + starts[:, None, None], jnp.full(rows.shape, np.iinfo(np.int32).max, jnp.int32))
+    return rows, functools.reduce(jnp.multiply, weights)
+
+
+def _is_hashed(level):
+    return len(level.rows) < np.prod(level.size)
+
+
+def _read(table, rows):
+    return jnp.asarray(table).at[rows].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _near_zero(key, shape):

@@ -7,6 +7,7 @@ import optax
 import pytest
 
 from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
+from jaxnerf.core.types import TableLevel
 from jaxnerf.fields.hash_grid import color_activation, harmonics, hash_grid_field, interpolate, vertices
 
 pytest_plugins = ["run_fixtures"]
@@ -21,13 +22,13 @@ fast_harmonics = compiled(harmonics)
 @compiled
 def dense(table, place):
     """Returns the features of a level that begins at row 7."""
-    return interpolate(table, list(place), SIZE, rows=range(7, 7 + COUNT))
+    return interpolate(table, list(place), [TableLevel(SIZE, range(7, 7 + COUNT))])
 
 
 @compiled
 def shared(table, place):
     """Returns the features of a level of 9 x 9 x 9 vertices in 64 rows from row 5 on."""
-    return interpolate(table, list(place), (9, 9, 9), rows=range(5, 69))
+    return interpolate(table, list(place), [TableLevel((9, 9, 9), range(5, 69))])
 
 
 def level(values):
@@ -146,7 +147,7 @@ def test_gradients_are_those_of_the_linear_pieces():
     points[:, 4], points[:, 5] = 0, 1  # on faces of the box
 
     def first(place):
-        return interpolate(jnp.asarray(table), list(place), SIZE, rows=range(7, 7 + COUNT))[:, 0].sum()
+        return interpolate(jnp.asarray(table), list(place), [TableLevel(SIZE, range(7, 7 + COUNT))])[:, 0].sum()
 
     slopes = jax.jit(jax.grad(first))(points)
     step = np.where(points[0] == 1, -1, 1) * np.float32(1 / 64)
@@ -367,6 +368,28 @@ def test_wrong_options_are_named(options, message):
         hash_grid_field(**options)
 
 
+def test_mixed_second_derivatives_are_those_of_finite_differences():
+    """As a loss of the field's slopes has them: by the place, then by the table."""
+    levels = [TableLevel(SIZE, range(COUNT)), TableLevel((9, 9, 9), range(COUNT, COUNT + 64))]
+    rng = np.random.default_rng(3)
+    table, change = (rng.normal(size=(COUNT + 64, 2)).astype(np.float32) for _ in range(2))
+    points = list(places(20, low=0.02, high=0.98))
+
+    @jax.jit
+    def loss(table):
+        slopes = jax.grad(lambda place: interpolate(table, place, levels).sum())(points)
+        return sum((slope**2).sum() for slope in slopes)
+
+    along = (jax.jit(jax.grad(loss))(table) * change).sum()
+    np.testing.assert_allclose(along, (loss(table + change) - loss(table - change)) / 2, rtol=1e-3)  # a square: exact
+
+
+def test_hashed_levels_with_different_numbers_of_rows_are_named():
+    with pytest.raises(ValueError, match="interpolate: levels that share rows are .* expected equal numbers of rows"):
+        levels = [TableLevel((9, 9, 9), range(64)), TableLevel((9, 9, 9), range(64, 96))]
+        interpolate(jnp.ones((96, 2)), [jnp.zeros(3)] * 3, levels)
+
+
 def test_a_table_of_another_shape_is_named():
     with pytest.raises(ValueError, match="interpolate: table"):
-        interpolate(jnp.ones(8), [jnp.zeros(3)] * 3, (2, 2, 2), rows=range(8))
+        interpolate(jnp.ones(8), [jnp.zeros(3)] * 3, [TableLevel((2, 2, 2), range(8))])
