@@ -1,6 +1,5 @@
 """Memory: how much is free, whether a program fits, and retrying with smaller parts when it does not."""
 
-import functools
 import pathlib
 import sys
 from collections.abc import Callable
@@ -157,16 +156,20 @@ def image_renderer(
             None: all are rendered.
     """
     fitting = {}  # requested chunk -> the one that fits
+    checked = set()
 
     def image(variables, rays, chunk=None):
         requested = min(default if chunk is None else chunk, 1 << (rays.near.size - 1).bit_length())
         key = requested, _shapes(variables)
 
         def attempt(size):
-            if fitting.get(key) != size:
-                part = jax.tree.map(lambda leaf: _chunk_of(leaf, rays.near.ndim, size), rays)
-                check(render.lower(variables, part).compile())  # cached for the calls below
-            part = functools.partial(render, variables)
+            def part(rays):
+                if (size, key) not in checked:
+                    # For these arrays, not only their shapes: a call with arrays elsewhere would compile once more.
+                    check(render.lower(variables, rays).compile())
+                    checked.add((size, key))
+                return render(variables, rays)
+
             if cull is None:
                 return jax.block_until_ready(render_image(part, rays, chunk=size))
             return jax.block_until_ready(render_selected(part, rays, *cull(variables, rays), chunk=size))
@@ -177,10 +180,6 @@ def image_renderer(
         return result
 
     return image
-
-
-def _chunk_of(leaf, axes, size):
-    return jax.ShapeDtypeStruct((size, *leaf.shape[axes:]), leaf.dtype)
 
 
 def _shapes(tree):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers import assert_same, random_rays
+from jaxnerf.core.occupancy.ray_culling import render_background
 from jaxnerf.core.types import Rendering
 from jaxnerf.evaluation import metrics
 from jaxnerf.runtime import devices, memory
@@ -147,6 +148,35 @@ def test_chunk_that_does_not_fit_is_halved_and_the_image_is_the_same(monkeypatch
     tried.clear()
     memory.image_renderer(colours, 40)(jnp.float32(2), rays)
     assert "image with 40 rays per chunk (--chunk): needs 0.0 MB" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("chunk", [16, 64])
+@pytest.mark.parametrize("placed", [False, True])  # parameters that are bound to a device, as those of a checkpoint
+@pytest.mark.parametrize("culled", [False, True])
+def test_an_image_is_compiled_once(chunk, placed, culled):
+    rays, compiled = jax.tree.map(jnp.asarray, random_rays(0, (6, 7))), []
+
+    @jax.jit
+    def colours(scale, rays):
+        empty = render_background(rays)
+        return dataclasses.replace(empty, rgb=scale * rays.viewdirs)
+
+    def cull(scale, rays):
+        return scale * rays.near >= 0, render_background(rays)
+
+    def listen(event, seconds, fun_name="", **_):
+        if event.endswith("backend_compile_duration") and fun_name == "jit(colours)":
+            compiled.append(seconds)
+
+    scale = jax.device_put(jnp.float32(2), jax.devices()[0] if placed else None)
+    image = memory.image_renderer(colours, chunk, cull if culled else None)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for _ in range(2):
+            np.testing.assert_allclose(image(scale, rays).rgb, 2 * np.asarray(rays.viewdirs), rtol=1e-6)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert len(compiled) == 1
 
 
 @pytest.mark.slow
