@@ -5,6 +5,7 @@ the weights of the config's `losses`, over the rays whose samples were all evalu
 parameters of all networks to a number.
 """
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnerf.core.types import Batch, PackedSamples, Rendering, Samples, TableLevel, check_shapes
-from jaxnerf.core.volume_rendering import exclusive_sum, running_sum
+from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
 from jaxnerf.registry import Loss
 
 
@@ -77,18 +78,37 @@ def _packed_distortion(samples: PackedSamples, near: jax.Array, far: jax.Array) 
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
     gaps = jnp.where(starts | ~samples.used, 0, s - jnp.roll(s, 1))  # without NaN of the ray before
     weights = jnp.where(samples.used, samples.weights, 0)
-    before = jnp.where(starts, 0, jnp.roll(_sum_since(starts, weights), 1))
-    values = weights * (2 * _sum_since(starts, before * gaps) + weights * length / 3)
-    return jax.ops.segment_sum(values, ray, near.size, indices_are_sorted=True).reshape(shape)
+    lengths = jax.ops.segment_sum(weights**2 * length / 3, ray, near.size, indices_are_sorted=True)
+    return (_distances(near.size, ray, weights, gaps) + lengths).reshape(shape)
 
 
-def _sum_since(starts: jax.Array, values: jax.Array) -> jax.Array:
-    """Computes the sum of the values [K] from the last start up to each, in linear time."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _distances(num_rays, ray, weights, gaps):
+    """Computes sum_ij w_i w_j |s_i - s_j| of each ray: of each gap the weights before times those behind, twice."""
+    before, behind = _sums_around(ray, weights, weights)
+    values = gaps * before * (weights + behind)
+    return 2 * jax.ops.segment_sum(values, ray, num_rays, indices_are_sorted=True)
 
-    def add(first, second):
-        return first[0] | second[0], jnp.where(second[0], second[1], first[1] + second[1])
 
-    return jax.lax.associative_scan(add, (starts, values))[1]
+@_distances.defjvp
+def _distances_jvp(num_rays, primals, tangents):
+    """Differentiates by cumulative sums; the transpose of their loops would take longer to compile."""
+    (ray, weights, gaps), (_, change, moved) = primals, tangents
+    before, behind = _sums_around(ray, weights, weights)
+    at_least = weights + behind
+    nearer, farther = _sums_around(ray, gaps * before, gaps * at_least)
+    values = gaps * before * at_least, change * (nearer + gaps * before + farther) + moved * before * at_least
+    return tuple(2 * jax.ops.segment_sum(each, ray, num_rays, indices_are_sorted=True) for each in values)
+
+
+def _sums_around(ray, first, second):
+    """Returns [K], for each sample, the sums of the first values before it and of the second behind it on its ray."""
+    starts, ends = ray != jnp.roll(ray, 1).at[0].set(-1), ray != jnp.roll(ray, -1).at[-1].set(-1)
+    sums = running_sum_since(
+        jnp.concatenate([starts, ends[::-1]]), jnp.concatenate([first, second[::-1]]), longest=ray.size
+    )
+    before, behind = jnp.split(sums, 2)
+    return jnp.where(starts, 0, jnp.roll(before, 1)), jnp.where(ends, 0, jnp.roll(behind[::-1], -1))
 
 
 def _fractions(t, delta, used, near, far, rule):
