@@ -33,6 +33,7 @@ VARIANTS = {
     "black behind the scene": {"data.background_color": ()},
     "depth off": {"losses.depth": 0.0},
     "depth 0.1 to the end": {"losses.depth": 0.1},
+    "distortion off": {"losses.distortion": 0.0},
     "distortion 0.003": {"losses.distortion": 0.003},
     "distortion 0.01": {"losses.distortion": 0.01},
     "opaque 0.01": {"losses.opaque": 0.01},

@@ -35,9 +35,10 @@ def distortion_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, 
         sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 d_i
 
     s_i is the position of sample i and d_i its length, both as fractions of the ray between near and far, or
-    of its range of disparity where far is infinite. The sum over pairs takes linear time: it is
-    2 sum_i w_i D_i, where D_i = D_(i-1) + (w_1 + ... + w_(i-1)) (s_i - s_(i-1)) adds only terms >= 0, so
-    there is no cancellation.
+    of its range of disparity where far is infinite. The sum over pairs takes linear time, with packed samples
+    O(K log K), and adds only terms >= 0, so there is no cancellation. With dense samples it is 2 sum_i w_i D_i, where
+    D_i = D_(i-1) + (w_1 + ... + w_(i-1)) (s_i - s_(i-1)). With packed samples each gap s_i - s_(i-1) counts twice the
+    weight in front of it times the weight behind it.
 
     Args:
         outputs: Renderings [B] with samples; those of a packed rendering may be PackedSamples.
@@ -74,6 +75,8 @@ def _dense_distortion(weights: jax.Array, samples: Samples, near: jax.Array, far
 def _packed_distortion(samples: PackedSamples, near: jax.Array, far: jax.Array) -> jax.Array:
     shape, near, far = near.shape, near.reshape(-1), far.reshape(-1)
     ray = samples.ray_index
+    if not ray.size:
+        return jnp.zeros(shape)
     s, length = _fractions(samples.t, samples.delta, samples.used, near[ray], far[ray], samples.rule)
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
     gaps = jnp.where(starts | ~samples.used, 0, s - jnp.roll(s, 1))  # without NaN of the ray before
@@ -84,7 +87,7 @@ def _packed_distortion(samples: PackedSamples, near: jax.Array, far: jax.Array) 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _distances(num_rays, ray, weights, gaps):
-    """Computes sum_ij w_i w_j |s_i - s_j| of each ray: of each gap the weights before times those behind, twice."""
+    """Computes sum_ij w_i w_j |s_i - s_j| of each ray; a sample's gap is that to the sample before it."""
     before, behind = _sums_around(ray, weights, weights)
     values = gaps * before * (weights + behind)
     return 2 * jax.ops.segment_sum(values, ray, num_rays, indices_are_sorted=True)
@@ -92,12 +95,13 @@ def _distances(num_rays, ray, weights, gaps):
 
 @_distances.defjvp
 def _distances_jvp(num_rays, primals, tangents):
-    """Differentiates by cumulative sums; the transpose of their loops would take longer to compile."""
+    """Differentiates by cumulative sums; the transpose of the loops in the value would take longer to compile."""
     (ray, weights, gaps), (_, change, moved) = primals, tangents
     before, behind = _sums_around(ray, weights, weights)
-    at_least = weights + behind
-    nearer, farther = _sums_around(ray, gaps * before, gaps * at_least)
-    values = gaps * before * at_least, change * (nearer + gaps * before + farther) + moved * before * at_least
+    from_here = weights + behind  # of the sample and all behind it
+    nearer, farther = _sums_around(ray, gaps * before, gaps * from_here)
+    by_weight, by_gap = nearer + gaps * before + farther, before * from_here
+    values = gaps * by_gap, change * by_weight + moved * by_gap
     return tuple(2 * jax.ops.segment_sum(each, ray, num_rays, indices_are_sorted=True) for each in values)
 
 

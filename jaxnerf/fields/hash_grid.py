@@ -193,18 +193,19 @@ def interpolate(
         table: [T, F] features of vertices.
         place: three arrays [N], x, y and z as fractions of the box; clamped to it.
         levels: L levels. Each has one row of the table per vertex, z fastest, or fewer rows, which vertices share by
-            the hash of arXiv:2201.05989 (Eq. 4). All levels that share rows have the same number of them.
+            the hash of arXiv:2201.05989 (Eq. 4). All hashed levels have the same number of rows.
 
     Returns:
-        [N, L F], level by level. The derivative with respect to place is that of the linear pieces, also on a face
-        of the box.
+        [N, L F], level by level, at least float32. The derivative with respect to place is that of the linear pieces,
+        also on a face of the box.
 
     Raises:
-        ValueError: on another shape of the table, or if the levels that share rows have different numbers of them.
+        ValueError: on another shape of the table, or if hashed levels have different numbers of rows.
     """
     check_shapes("interpolate", table=(table, "T F"), x=(place[0], "N"), y=(place[1], "N"), z=(place[2], "N"))
-    if len({len(level.rows) for level in levels if _is_hashed(level)}) > 1:
-        raise ValueError(f"interpolate: levels that share rows are {levels}, expected equal numbers of rows")
+    counts = {len(level.rows) for level in levels if _is_hashed(level)}
+    if len(counts) > 1:
+        raise ValueError(f"interpolate: hashed levels have {sorted(counts)} rows, expected the same number in each")
     return _interpolate(tuple(levels), table, tuple(place))
 
 
@@ -223,10 +224,10 @@ _interpolate = jax.custom_jvp(_interpolated, nondiff_argnums=(0,))
 
 @functools.partial(_interpolate.defjvp, symbolic_zeros=True)
 def _interpolate_jvp(levels, primals, tangents):
-    """Differentiates with rows and weights of all levels and vertices at once.
+    """Gathers the rows of all levels and vertices at once.
 
-    Otherwise the gradient has a loop of its own for the rows of each vertex of each level, all of which are compiled.
-    The features are split by vertex, as XLA's loops over several vertices divide an index for each element.
+    Otherwise the gradient would compile loops of its own for the rows of each vertex of each level. The gathered
+    features are split by vertex, as a loop over several vertices would divide an index for each element.
     """
     (table, place), (change, moved) = primals, tangents
     rows, weights = _all_corners(levels, place)
@@ -236,8 +237,8 @@ def _interpolate_jvp(levels, primals, tangents):
         tangent = _weighted_sums(weights, [read[start : start + 8] for start in range(0, len(read), 8)])
     if not all(isinstance(each, SymbolicZero) for each in moved):
         moved = tuple(
-            jnp.zeros_like(x) if isinstance(change, SymbolicZero) else change
-            for x, change in zip(place, moved, strict=True)
+            jnp.zeros_like(value) if isinstance(each, SymbolicZero) else each
+            for value, each in zip(place, moved, strict=True)
         )
         tangent += jax.jvp(functools.partial(_interpolated, levels, table), (place,), (moved,))[1]
     return _weighted_sums(weights, [[_read(table, row) for row in level] for level in rows]), tangent
@@ -347,7 +348,7 @@ def _all_corners(levels, place):
         scattered = functools.reduce(jnp.bitwise_xor, scattered) % jnp.uint32(len(levels[hashed.argmax()].rows))
         rows = jnp.where(hashed[:, None, None], scattered.astype(jnp.int32), rows)
     starts = np.array([level.rows.start for level in levels], np.int32)
-    # On a CPU, XLA would compute the rows once more for the gradient, but not if their last step is a remainder.
+    # The remainder changes nothing, but without it XLA computes the rows once more for the gradient on a CPU.
     rows = jax.lax.rem(rows + starts[:, None, None], jnp.full(rows.shape, np.iinfo(np.int32).max, jnp.int32))
     return rows, functools.reduce(jnp.multiply, weights)
 

@@ -165,7 +165,8 @@ def image_renderer(
         def attempt(size):
             def part(rays):
                 if (size, key) not in checked:
-                    # For these arrays, not only their shapes: a call with arrays elsewhere would compile once more.
+                    # For the arrays themselves, not only their shapes: the call would compile again for arrays that are
+                    # bound to a device.
                     check(render.lower(variables, rays).compile())
                     checked.add((size, key))
                 return render(variables, rays)

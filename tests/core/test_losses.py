@@ -182,11 +182,49 @@ def test_nan_in_a_packed_ray_stays_in_its_ray(name):
         rendering = make_rendering(np.zeros((3, 1), np.float32), np.zeros((3, 1)), np.zeros((3, 1)))
         return jaxnerf.distortion_loss([dataclasses.replace(rendering, weights=None, samples=samples)], batch)
 
-    clean = np.asarray(losses(**arrays))
+    slopes = jax.grad(lambda arrays: losses(**arrays)[jnp.array([0, 2])].sum())
+    clean, clean_slopes = np.asarray(losses(**arrays)), slopes(arrays)
     arrays[name][2:4] = np.nan
     got = np.asarray(losses(**arrays))
     np.testing.assert_array_equal(np.isnan(got), [False, True, False])
     np.testing.assert_array_equal(got[[0, 2]], clean[[0, 2]])
+    for key, slope in slopes(arrays).items():
+        np.testing.assert_array_equal(np.delete(slope, [2, 3]), np.delete(clean_slopes[key], [2, 3]))
+
+
+@pytest.mark.parametrize("far", [7.0, np.inf])
+def test_dense_and_packed_distortion_have_the_same_gradients(far):
+    """By the weight and the position of each sample; the third of five rays is empty, and three slots are unused."""
+    counts, rng = [4, 1, 0, 7, 3], np.random.default_rng(2)
+    ray = np.repeat(np.arange(5), counts)
+    rank = np.concatenate([np.arange(count) for count in counts])
+    weights, delta = (rng.uniform(0.01, 0.3, len(ray)).astype(np.float32) for _ in range(2))
+    t = np.float32(1.5 + 0.7 * rank + rng.uniform(0, 0.3, len(ray)))
+    scale = rng.normal(size=5).astype(np.float32)
+
+    def dense(weights, t):
+        def placed(values, fill):
+            return jnp.full((5, 7), fill, jnp.float32).at[ray, rank].set(values)
+
+        return distortion(placed(weights, 0.0), placed(t, 1.0), placed(delta, 0.0), 1.0, far)
+
+    def packed(weights, t):
+        slots = jaxnerf.PackedSamples(
+            weights=jnp.pad(weights, (0, 3)),
+            t=jnp.pad(t, (0, 3)),
+            delta=np.pad(delta, (0, 3)),
+            ray_index=np.pad(ray, (0, 3), constant_values=4).astype(np.int32),
+            used=np.arange(len(ray) + 3) < len(ray),
+        )
+        rendering = dataclasses.replace(
+            make_rendering(*[np.zeros((5, 1), np.float32)] * 3), weights=None, samples=slots
+        )
+        return jaxnerf.distortion_loss([rendering], make_batch(np.full(5, 1.0), far))
+
+    np.testing.assert_allclose(packed(weights, t), dense(weights, t), rtol=1e-5, atol=1e-7)
+    want, got = (jax.grad(lambda *a, f=f: (scale * f(*a)).sum(), argnums=(0, 1))(weights, t) for f in (dense, packed))
+    for slope, expected in zip(got, want, strict=True):
+        np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-6)
 
 
 RAYS, SEGMENTS = 24, 40
