@@ -35,7 +35,7 @@ def distortion_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, 
         sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 d_i
 
     s_i is the position of sample i and d_i its length, both as fractions of the ray between near and far, or
-    of its range of disparity where far is infinite. The sum over pairs takes linear time, with packed samples
+    of its range of disparity where far is infinite. The sum over pairs takes linear time, for K packed samples
     O(K log K), and adds only terms >= 0, so there is no cancellation. With dense samples it is 2 sum_i w_i D_i, where
     D_i = D_(i-1) + (w_1 + ... + w_(i-1)) (s_i - s_(i-1)). With packed samples each gap s_i - s_(i-1) counts twice the
     weight in front of it times the weight behind it.
