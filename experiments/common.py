@@ -23,6 +23,8 @@ from jaxnerf.data import dataset
 from jaxnerf.runtime.atomic_files import partial_file, write_text
 from jaxnerf.runtime.devices import split_positions
 from jaxnerf.training import auto_config, build
+from jaxnerf.training import config as run_config
+from jaxnerf.training.config import RunConfig
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step
 
@@ -44,7 +46,9 @@ def configuration(base: str, overrides: Mapping[str, Any] | Sequence = (), *, se
 
 
 def changed(config, overrides: Mapping[str, Any]):
-    """Returns a copy of a config with {"section.field": value} replaced."""
+    """Returns a copy of a config, read or not, with {"section.field": value} replaced."""
+    if isinstance(config, RunConfig):
+        return run_config.changed(config, overrides)
     config = copy.deepcopy(config)
     config.update_from_flattened_dict(overrides)
     return config
@@ -98,8 +102,9 @@ def finished(config, folder, *, split: str | None = None) -> dict[str, Any] | No
 
 def load_split(config, split: str) -> Views:
     """Returns the Views of a split; those used last are kept in memory."""
-    key = json.dumps(config.data.to_dict(), sort_keys=True), split
-    views = _splits.pop(key, None) or dataset.load_split(config.data, split)
+    data = run_config.read_config(config).data
+    key = repr(data), split
+    views = _splits.pop(key, None) or dataset.load_split(data, split)
     if len(_splits) == _MOST_SPLITS:
         _splits.pop(next(iter(_splits)))
     _splits[key] = views
@@ -108,7 +113,7 @@ def load_split(config, split: str) -> Views:
 
 def _plain(config):
     """Returns a config as JSON holds it, without the place of the dataset."""
-    plain = json.loads(config.to_json_best_effort())
+    plain = json.loads(run_config.read_config(config).to_json())
     return plain | {"data": {key: value for key, value in plain["data"].items() if key != "dir"}}
 
 
@@ -148,7 +153,7 @@ def compile_step(config, views=None) -> Step:
     config, _ = auto_config.resolve_for_device(config)
     experiment = build.build(config)
     valid, data = experiment.prepare(views)
-    state = create_state(experiment.model, experiment.optimizer, experiment.seed, valid)
+    state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
     positions = jnp.asarray(split_positions(config.train.batch_size, 1, config.train.microbatch_size)[0])
 

@@ -99,12 +99,14 @@ def _check_flags(is_sharded):
 
 def _reference_config():
     """Returns the config whose dataset --predictions are compared with; None without one."""
-    from jaxnerf.training.workdir import read_config
+    from jaxnerf.evaluation.restore import dataset_at
+    from jaxnerf.training.config import read_config
+    from jaxnerf.training.workdir import load_config
 
-    config = _CONFIG.value
-    if config is None and _WORKDIR.value:
-        config = read_config(_WORKDIR.value)
-    return None if config is None else cli.use_data(config, _DATA_DIR.value)
+    if _CONFIG.value is None and not _WORKDIR.value:
+        return None
+    config = load_config(_WORKDIR.value) if _CONFIG.value is None else read_config(_CONFIG.value)
+    return dataset_at(config, _DATA_DIR.value)
 
 
 def run():

@@ -8,19 +8,41 @@ import importlib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+from jaxnerf.options import Facts, Options, Schedule
+
+
+class Part(NamedTuple):
+    """A field or a sampler.
+
+    Attributes:
+        make: see `register_field` and `register_sampler`.
+        options: the class of its options; None: its section of the config is a dict without checks.
+        section: the config's section that holds them, if it is not that of its own name.
+    """
+
+    make: Callable[..., Any]
+    options: type[Options] | None = None
+    section: str | None = None
+
 
 class Loss(NamedTuple):
     """A loss, or a regularizer of the parameters.
 
     Attributes:
         function: see `register_loss`.
-        on: "renderings" if the function is (outputs, batch) -> [B], "params" if it is (params) -> scalar.
-        needs: the optional fields of Batch that it reads; of a regularizer, "levels" or nothing.
+        on: "renderings", "params" or "field", see `register_loss`.
+        needs: the optional fields of Batch that it reads.
+        weight: where the config sets none; "auto" needs `infer`.
+        infer: (facts) -> the weight in place of "auto", and the line that reports it, or "".
+        help: what it compares, for the reference page.
     """
 
-    function: Callable[..., Any]
+    function: Callable[..., Any] | None
     on: str = "renderings"
     needs: tuple[str, ...] = ()
+    weight: Schedule | str = 0.0
+    infer: Callable[[Facts], tuple[Schedule, str]] | None = None
+    help: str = ""
 
 
 class Reader(NamedTuple):
@@ -76,14 +98,14 @@ class Registry:
 FIELDS = Registry(
     "field",
     "jaxnerf.register_field",
-    {"mlp": "jaxnerf.fields.mlp:from_options", "hash_grid": "jaxnerf.fields.hash_grid:from_options"},
+    {"mlp": "jaxnerf.fields.mlp:FIELD", "hash_grid": "jaxnerf.fields.hash_grid:FIELD"},
 )
 SAMPLERS = Registry(
     "sampler",
     "jaxnerf.register_sampler",
     {
-        "hierarchical": "jaxnerf.models.hierarchical:from_context",
-        "occupancy": "jaxnerf.models.occupancy:from_context",
+        "hierarchical": "jaxnerf.models.hierarchical:SAMPLER",
+        "occupancy": "jaxnerf.models.occupancy:SAMPLER",
     },
 )
 LOSSES = Registry(
@@ -94,8 +116,8 @@ LOSSES = Registry(
         "distortion": "jaxnerf.core.losses:DISTORTION",
         "depth": "jaxnerf.core.losses:DEPTH",
         "opaque": "jaxnerf.core.losses:OPAQUE",
-        "hash_decay": "jaxnerf.core.losses:HASH_DECAY",
-        "total_variation": "jaxnerf.core.losses:TOTAL_VARIATION",
+        "hash_decay": "jaxnerf.fields.hash_grid:HASH_DECAY",
+        "total_variation": "jaxnerf.fields.hash_grid:TOTAL_VARIATION",
     },
 )
 READERS = Registry(
@@ -120,55 +142,67 @@ EXPORTERS = Registry(
 )
 
 
-def register_field(name: str, make: Callable[..., Any]) -> None:
+def register_field(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
     """Registers a field under a name for the config's `field`.
 
     Args:
-        name: of the field, and of the config's section that holds its options, if there is one.
-        make: (options, box) -> Field, see `jaxnerf.fields.base.Field`. `options` is that section as a dict;
-            `box` is the scene's box (lower [3], upper [3]) in world units, or None if the run has none.
+        name: of the field, and of the config's section that holds its options.
+        make: (options, box) -> Field, see `jaxnerf.fields.base.Field`. `box` is the scene's box (lower [3],
+            upper [3]) in world units, or None if the run has none.
+        options: the class of the options, see `jaxnerf.options.Options`: it gives them flags, checks and help. None:
+            `make` gets the section as a dict, without checks.
 
     Raises:
         ValueError: if another field has that name.
     """
-    FIELDS.add(name, make)
+    FIELDS.add(name, Part(make, options))
 
 
-def register_sampler(name: str, make: Callable[..., Any]) -> None:
+def register_sampler(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
     """Registers a way to place samples under a name for the config's `sampler`.
 
     Args:
-        name: of the sampler. Its options may be in a section of the config, see `SamplerContext.sections`.
+        name: of the sampler, and of the config's section that holds its options.
         make: (context) -> Model, see `jaxnerf.models.base.SamplerContext` and `Model`.
+        options: the class of `context.options`, as of `register_field`.
 
     Raises:
         ValueError: if another sampler has that name.
     """
-    SAMPLERS.add(name, make)
+    SAMPLERS.add(name, Part(make, options))
 
 
 def register_loss(
-    name: str, function: Callable[..., Any], *, on: str = "renderings", needs: Iterable[str] = ()
+    name: str,
+    function: Callable[..., Any] | None,
+    *,
+    on: str = "renderings",
+    needs: Iterable[str] = (),
+    weight: Schedule = 0.0,
+    help: str = "",
 ) -> None:
     """Registers a loss under a name for the config's `losses`, which gives it a weight.
 
     Args:
         name: of the loss.
         function: with on="renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
-            of a step, with weights and samples; the last one is the final rendering. `batch` is a Batch.
-            With on="params" (params) -> scalar, or (params, levels) -> scalar if it needs "levels", the
-            TableLevels of a hash grid.
-        on: "renderings" or "params".
+            of a step, with weights and samples: a tuple of those that show colours, the final one last, and
+            `outputs["name"]` that of any network. `batch` is a Batch. With on="params" (params) -> scalar, where
+            params has an entry for each network. With on="field" None: the run's fields bring the function, see
+            `Field.regularizers`.
+        on: "renderings", "params" or "field".
         needs: the optional fields of Batch that the function reads, of "image_index", "pixel", "alpha", "depth" and
             "depth_weight". Fields that no loss needs are None. Where one needs a depth, some rays of each batch go
             through observations of the dataset's sparse points, see `draw_batch`.
+        weight: where the config sets none; 0: off.
+        help: what it compares, for the reference page.
 
     Raises:
         ValueError: if another loss has that name, or on another value of `on`.
     """
-    if on not in ("renderings", "params"):
-        raise ValueError(f"register_loss: on is {on!r}, expected 'renderings' or 'params'")
-    LOSSES.add(name, Loss(function, on, tuple(needs)))
+    if on not in ("renderings", "params", "field"):
+        raise ValueError(f"register_loss: on is {on!r}, expected 'renderings', 'params' or 'field'")
+    LOSSES.add(name, Loss(function, on, tuple(needs), weight, help=help))
 
 
 def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[..., bool] | None = None) -> None:

@@ -13,15 +13,24 @@ from jaxnerf.runtime import cli
 
 
 def _load_saved(path):
-    from jaxnerf.training.workdir import config_to_resume
+    from jaxnerf.training.config import to_config_dict
+    from jaxnerf.training.workdir import load_config
 
     if os.path.basename(path) != "config.json":
         raise ValueError(f"--config={path} is not a run's config.json; give that, a name, or a Python file")
-    return config_to_resume(os.path.dirname(path))
+    return to_config_dict(load_config(os.path.dirname(path)))
+
+
+def _describe_options():
+    from jaxnerf.training.reference import options_page
+
+    return options_page()
 
 
 _CONFIG = cli.define_config(
-    "The config of the run: a name, or the path of a file. When it is not given, the workdir's.", load_saved=_load_saved
+    "The config of the run: a name, or the path of a file. When it is not given, the workdir's.",
+    load_saved=_load_saved,
+    describe_options=_describe_options,
 )
 _WORKDIR = flags.DEFINE_string(
     "workdir", None, "The run's folder. Training resumes if the folder holds a run.", required=True

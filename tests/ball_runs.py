@@ -14,6 +14,7 @@ from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model
 from jaxnerf.training import auto_config, build, workdir
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config import RunConfig
 from jaxnerf.training.state import create_state
 from runs import PACKED, smoke_config
 
@@ -91,8 +92,7 @@ def solid_run():
         return Rendering(rgb=rgb, opacity=hit.astype(jnp.float32), depth=depth, disparity=zero, **options)
 
     model = Model(init=None, render=None, view=view, scene=None, samples_per_ray=1.0)
-    section = SimpleNamespace(sample_multiplier=1.0, early_stop_eps=1e-3)
-    experiment = SimpleNamespace(model=model, eval=section, ndc=False, pixel_offset=0.5, cameras=None)
+    experiment = SimpleNamespace(model=model, config=RunConfig(), cameras=None)
     run = SimpleNamespace(experiment=experiment, model_with=lambda settings: model, steps=lambda: [20])
     return run, solid_views()
 

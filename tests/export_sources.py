@@ -11,6 +11,7 @@ from jaxnerf import Camera, Views, create_grid, look_at, mask_scene, render_rays
 from jaxnerf.data import ray_batches
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.exporters.base import ExportSettings, ExportSource
+from jaxnerf.training.config import RunConfig
 
 RADIUS, SIZE = 0.5, 48
 # A rotation by 90 degrees about z, twice the size, moved: the world of the dataset's files.
@@ -58,12 +59,10 @@ def source_of(scene=ball, *, say=lambda line: None, background=None, **settings)
     experiment = SimpleNamespace(
         view_rays=functools.partial(ray_batches.view_rays, ndc=False),
         world_depth=ray_batches.world_depth,
-        ndc=False,
-        pixel_offset=0.5,
+        config=RunConfig(),
         background=background,
         model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid)),
         load_split=lambda split: views,
-        eval=SimpleNamespace(split="test"),
         cameras=None,
     )
     grid = create_grid(np.full(3, -1.0), np.full(3, 1.0), np.ones((2, 2, 2), bool), initial_density=1.0)

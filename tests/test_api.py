@@ -59,9 +59,9 @@ SURFACE = {
     "load_scene": "workdir |",
     "restore_run": "workdir config=None | data_dir=None settings=None",
     "train_and_evaluate": "config workdir | views=None",
-    "register_field": "name make |",
-    "register_sampler": "name make |",
-    "register_loss": "name function | on='renderings' needs=()",
+    "register_field": "name make | options=None",
+    "register_sampler": "name make | options=None",
+    "register_loss": "name function | on='renderings' needs=() weight=0.0 help=''",
     "register_reader": "name read | detect=None",
     "register_exporter": "name export |",
 }

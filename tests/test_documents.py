@@ -1,6 +1,8 @@
 """The documents: links lead somewhere, every public name and every page is listed, and Python examples run."""
 
 import re
+import subprocess
+import sys
 
 import jax
 import pytest
@@ -130,7 +132,7 @@ def faults(command):
         elif words[0] != "pip" and name.removeprefix("no") not in flags and name not in flags:
             found.append(f"--{name}")
         if name == "config" and re.fullmatch("[a-z]\\w*", value) and value != "help":
-            found += [] if (ROOT / "configs" / f"{value}.py").exists() else [f"--config={value}"]
+            found += [] if (ROOT / "jaxnerf" / "configs" / f"{value}.py").exists() else [f"--config={value}"]
     return found
 
 
@@ -144,6 +146,14 @@ def _missing_field(name):
             return [f"--{name}"]
         section = section[part]
     return []
+
+
+def test_the_page_of_options_is_what_the_program_prints():
+    command = [sys.executable, "-m", "jaxnerf.train", "--config=help:options"]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    _, _, rest = (DOCS / "configuration.md").read_text().partition("<!-- options -->\n")
+    found, _, _ = rest.partition("<!-- end of options -->")
+    assert found == printed, "write what jaxnerf-train --config=help:options prints between the marks"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -23,7 +23,7 @@ from jaxnerf.runtime import shards
 from jaxnerf.structure_from_motion.estimate import estimate_cameras
 from jaxnerf.structure_from_motion.images import is_rotated_jpeg
 from jaxnerf.training.metric_log import MetricLog, read_rows
-from jaxnerf.training.workdir import read_config, workdir_lock
+from jaxnerf.training.workdir import load_config, workdir_lock
 from runs import ROOT
 
 pytest_plugins = ["run_fixtures"]
@@ -41,7 +41,7 @@ READERS = {
     "3.png": image_files.read_stored,
     "path.json": read_path_file,
     "model_000010.npy": lambda path: read_weights([path]),
-    "config.json": lambda path: read_config(path.parent),
+    "config.json": lambda path: load_config(path.parent),
     "metrics.jsonl": lambda path: read_rows(path.parent),
     "origin.json": lambda path: shards.check_origin(path.parent, {}, file=path.name, remedy="remove it"),
     GROUND_TRUTH: lambda path: read_ground_truth(path.parent),

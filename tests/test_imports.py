@@ -1,8 +1,8 @@
 """Tests that imports follow the order of the packages, without cycles.
 
 core <- fields, models <- data <- training <- evaluation, interop, capture_check, structure_from_motion <-
-programs. runtime imports core only, and data and everything above may import it and the configs. Everything may
-import jaxnerf.registry.
+programs. runtime imports core only, and data and everything above may import it. Everything may import
+jaxnerf.registry and jaxnerf.options.
 """
 
 import ast
@@ -32,6 +32,7 @@ RANKS = {
 # Packages of one rank do not import each other, apart from these.
 ALLOWED = {("models", "fields"), ("exporters", "evaluation"), ("viewer", "evaluation")}
 FORBIDDEN = {("fields", "runtime"), ("models", "runtime")}
+SHARED = ("jaxnerf.registry", "jaxnerf.options")
 CORE_LIBRARIES = {"jax", "jaxtyping", *sys.stdlib_module_names}
 # jaxnerf/__init__.py is excluded: it exports names of core, and names of other packages on demand.
 FILES = sorted(
@@ -84,10 +85,10 @@ def forbidden_imports(path, source):
     for name in imported_modules(source, ["jaxnerf", *path.relative_to(ROOT).parts[:-1]]):
         if name.partition(".")[0] == "jaxnerf":
             other = package_of(name)
-            if name == "jaxnerf.registry" or own == other and name != "jaxnerf":
+            if name in SHARED or own == other and name != "jaxnerf":
                 continue
             lower = RANKS[other] < RANKS[own] or (own, other) in ALLOWED
-            if module == "jaxnerf.registry" or not lower or (own, other) in FORBIDDEN:
+            if module in SHARED or not lower or (own, other) in FORBIDDEN:
                 wrong.append(name)
         elif own == "core" and name.partition(".")[0] not in CORE_LIBRARIES:
             wrong.append(name)
@@ -128,6 +129,8 @@ def test_every_package_has_an_init():
         ("core/sampling.py", "from jaxnerf.fields import mlp", False),
         ("core/sampling.py", "import jaxnerf", False),
         ("core/sampling.py", "from jaxnerf import registry", True),
+        ("core/losses.py", "from jaxnerf.options import Facts", True),
+        ("options.py", "from jaxnerf.core import types", False),
         ("fields/mlp.py", "from jaxnerf.core.encoding import positional_encoding", True),
         ("fields/mlp.py", "def f():\n    from jaxnerf.data.readers import blender", False),
         ("fields/mlp.py", "from jaxnerf.models import base", False),

@@ -12,7 +12,7 @@ import pytest
 from runs import ROOT
 
 pytest_plugins = ["run_fixtures"]
-SOURCES = ("configs", "jaxnerf", "LICENSE", "README.md", "pyproject.toml", "setup.cfg")
+SOURCES = ("jaxnerf", "LICENSE", "README.md", "pyproject.toml", "setup.cfg")
 
 
 def call(*command, **options):
@@ -56,10 +56,8 @@ def test_the_wheel_holds_one_package_with_configs_and_types(wheel):
     files = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in files if ".dist-info/" not in name} == {"jaxnerf"}
     assert "jaxnerf/py.typed" in files
-    for folder in ("jaxnerf", "configs"):
-        for path in (ROOT / folder).rglob("*.py"):
-            name = path.relative_to(ROOT).as_posix()
-            assert name.replace("configs", "jaxnerf/configs", folder == "configs") in files
+    for path in (ROOT / "jaxnerf").rglob("*.py"):
+        assert path.relative_to(ROOT).as_posix() in files
 
 
 @pytest.mark.slow
@@ -67,7 +65,7 @@ def test_programs_of_the_wheel_find_the_configs(installed):
     program, _, _ = installed
     listed = program("jaxnerf-train", "--config=help")
     assert {line.split()[0] for line in listed.splitlines()} == {
-        path.stem for path in (ROOT / "configs").glob("[!_]*.py")
+        path.stem for path in (ROOT / "jaxnerf" / "configs").glob("[!_]*.py")
     }
     for name in ("eval", "render", "view", "cameras", "check", "convert"):
         assert "--plugins: " in program(f"jaxnerf-{name}", "--help")

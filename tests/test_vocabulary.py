@@ -11,7 +11,7 @@ import pytest
 
 from runs import ROOT
 
-FOLDERS = ("configs", "examples", "experiments", "jaxnerf", "tests")
+FOLDERS = ("examples", "experiments", "jaxnerf", "tests")
 
 # Parts of a name that are not used, alone or in sequence, and what is used instead.
 PARTS = {
@@ -169,7 +169,7 @@ def complaint(name):
 
 def sources():
     paths = (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
-    return sorted(path for path in paths if ROOT / "jaxnerf" / "configs" not in path.parents)
+    return sorted(paths)
 
 
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))

@@ -11,6 +11,7 @@ from jaxnerf.training.build import build_losses
 
 OPTIMIZER = optax.adam(0.1)
 LOSSES = build_losses({"mse": 1.0})
+NETWORKS = ("coarse", "fine")
 
 
 def toy_rendering(rgb, num_dropped=None):
@@ -24,13 +25,12 @@ def toy_model(trouble=lambda params: 0.0):
     """Returns a Model of colours that are linear in the direction, coarse and fine, plus trouble(params)."""
 
     def render(keys, params, grid, rays, step):
-        colours = [rays.viewdirs @ params[name]["w"] + trouble(params) for name in ("coarse", "fine")]
-        return tuple(toy_rendering(rgb) for rgb in colours)
+        return {name: toy_rendering(rays.viewdirs @ params[name]["w"] + trouble(params)) for name in NETWORKS}
 
     def init(key):
-        return {name: {"w": jax.random.normal(key, (3, 3))} for name in ("coarse", "fine")}
+        return {name: {"w": jax.random.normal(key, (3, 3))} for name in NETWORKS}
 
-    return Model(init, render, view=None, scene=None, samples_per_ray=1.0)
+    return Model(init, render, view=None, scene=None, samples_per_ray=1.0, image_networks=NETWORKS)
 
 
 def toy_draw(step, positions, data):

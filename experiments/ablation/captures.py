@@ -105,7 +105,7 @@ def _psnr(run, variables, views):
     values = []
     for index in np.unique(np.linspace(0, len(views.offset) - 1, _MAX_VIEWS).astype(int)):
         height, width = (int(value) for value in views.size[index])
-        pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)[::_STRIDE, ::_STRIDE]
+        pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)[::_STRIDE, ::_STRIDE]
         image = run.render_image(variables, run.experiment.view_rays(views, index, pixels))
         error = mse(jnp.clip(image.rgb, 0, 1), reference(views, index)[::_STRIDE, ::_STRIDE])
         values.append(-10 * np.log10(float(error)))

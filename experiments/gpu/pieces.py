@@ -88,7 +88,7 @@ def _first_step(config, views):
     experiment = build.build(auto_config.resolve_for_device(config, "cpu")[0])
     with jax.default_device(jax.devices("cpu")[0]):
         cells, data = experiment.prepare(views)
-        state = create_state(experiment.model, experiment.optimizer, experiment.seed, cells)
+        state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, cells)
         positions = jnp.arange(config.train.batch_size)
         return state.params, state.grid, *jax.jit(experiment.draw)(state.step, positions, data)
 
@@ -206,7 +206,7 @@ def _built(context, overrides):
     resolved, _ = auto_config.resolve_for_device(resolved)
     experiment = build.build(resolved)
     cells, data = experiment.prepare(views)
-    state = create_state(experiment.model, experiment.optimizer, experiment.seed, cells)
+    state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, cells)
     return experiment, state, jax.device_put(data), resolved
 
 
@@ -317,9 +317,9 @@ def frame(context: Context) -> dict[str, Any]:
     for chunk, max_samples in sizes:
         run = restore.restore_run(folder, settings={"chunk": chunk, "max_samples": max_samples})
         variables = run.variables(restore.newest_step(run, folder))
-        views = run.experiment.load_split(run.experiment.eval.split)
+        views = run.experiment.load_split(run.experiment.config.eval.split)
         rays = run.experiment.view_rays(
-            views, 0, pixel_grid(*views.size[0].tolist(), offset=run.experiment.pixel_offset)
+            views, 0, pixel_grid(*views.size[0].tolist(), offset=run.experiment.config.data.pixel_offset)
         )
         seconds = profiles.repeated(functools.partial(run.render_image, variables), rays, repeats=3)
         rows.append({"chunk": chunk, "max_samples": max_samples, "ms per frame": 1e3 * seconds})
@@ -357,14 +357,14 @@ def paper(context: Context) -> dict[str, Any]:
 def _scored(config, folder):
     """Scores two test views at each checkpoint; returns rows."""
     run = restore.restore_run(folder)
-    views = run.experiment.load_split(run.experiment.eval.split)
+    views = run.experiment.load_split(run.experiment.config.eval.split)
     logged = {row["step"]: row for row in metric_log.read_rows(folder)}
     rows = []
     for step in run.steps():
         variables = run.variables(step)
         errors = []
         for index in (0, len(views.names) // 2):
-            pixels = pixel_grid(*views.size[index].tolist(), offset=run.experiment.pixel_offset)
+            pixels = pixel_grid(*views.size[index].tolist(), offset=run.experiment.config.data.pixel_offset)
             rgb = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
             errors.append(float(np.mean((np.asarray(rgb) - evaluate.reference(views, index)) ** 2)))
         psnr = float(np.mean([-10 * math.log10(error) for error in errors]))

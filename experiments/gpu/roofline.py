@@ -135,7 +135,7 @@ def parts(config, views) -> tuple[dict[str, Counts], Any, tuple]:
     experiment = build.build(resolved)
     model = experiment.model
     cells, data = experiment.prepare(views)
-    state = jax.eval_shape(lambda: create_state(model, experiment.optimizer, experiment.seed, cells))
+    state = jax.eval_shape(lambda: create_state(model, experiment.optimizer, experiment.config.seed, cells))
     positions = jax.ShapeDtypeStruct((1, resolved.train.batch_size), jnp.int32)
     without = data._replace(cells=None if data.cells is None else data.cells[:0])
     step = make_train_step(model, experiment.optimizer, experiment.draw, experiment.losses)

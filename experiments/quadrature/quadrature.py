@@ -40,6 +40,7 @@ from jaxnerf.fields import analytic
 from jaxnerf.fields.mlp import mlp_field
 from jaxnerf.runtime import cli
 from jaxnerf.training import workdir
+from jaxnerf.training.config import to_config_dict
 
 flags.DEFINE_string("out", "runs/quadrature", "Folder of the measurements.")
 flags.DEFINE_string("plot", None, "PNG to write; out/quadrature.png when not given.")
@@ -155,7 +156,7 @@ def _render_medium(keys, rays, medium, *, rule, sampling, number):
 
 def measure_run(folder: str) -> dict:
     """Returns the errors and times of all rules and samplings on a trained run."""
-    config, run = workdir.read_config(folder), restore.restore_run(folder)
+    config, run = to_config_dict(workdir.load_config(folder)), restore.restore_run(folder)
     step = restore.newest_step(run, folder)
     params, _ = run.variables(step)
     rays, truth_of_images = test_rays(run.experiment, FLAGS.test_rays)
@@ -195,7 +196,7 @@ def test_rays(experiment, count: int) -> tuple[Rays, np.ndarray]:
     index = np.int64((np.arange(count) + 0.5) * len(views.pixels) / count)
     view = np.searchsorted(views.offset, index, side="right") - 1
     place, width = index - np.asarray(views.offset)[view], np.asarray(views.size)[view, 1]
-    pixels = np.float32(np.stack([place % width, place // width], axis=-1) + experiment.pixel_offset)
+    pixels = np.float32(np.stack([place % width, place // width], axis=-1) + experiment.config.data.pixel_offset)
     rays = jax.jit(jax.vmap(lambda view, pixel: experiment.view_rays(views, view, pixel)))(view, pixels)
     colours = pixel_colors(jnp.asarray(np.asarray(views.pixels)[index]), views.background)
     return jax.tree.map(np.asarray, rays), np.asarray(colours, np.float64)

@@ -24,7 +24,7 @@ from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import partial_file, read_json, write_text
-from jaxnerf.training.workdir import read_config
+from jaxnerf.training.workdir import load_config
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the page.", required=True)
 _FRAMES = flags.DEFINE_integer("frames", 24, "Largest number of frames in a video.", lower_bound=2)
@@ -70,7 +70,7 @@ def show(folder: pathlib.Path, out: pathlib.Path) -> list[str]:
         duration=1000 * _DURATION / len(chosen),
         loop=0,
     )
-    config = read_config(folder)
+    config = load_config(folder)
     return [
         f"## {name}",
         "",

@@ -11,6 +11,7 @@ import shutil
 from absl import flags
 
 from jaxnerf.evaluation.evaluate import evaluate, summary
+from jaxnerf.options import replaced, values_of
 from jaxnerf.runtime import cli
 from jaxnerf.training import workdir
 
@@ -24,17 +25,19 @@ _MAY_DIFFER = ("dir", "factor", "fingerprint", "width")
 def main(argv: list[str]) -> None:
     """Copies and scores the run."""
     del argv
-    out, config = pathlib.Path(_OUT.value), workdir.read_config(_WORKDIR.value)
+    out, config = pathlib.Path(_OUT.value), workdir.load_config(_WORKDIR.value)
     if out.exists():
         raise ValueError(f"{out}: exists, expected a missing folder; remove it, or give another --out")
-    like = workdir.read_config(_LIKE.value).data
-    for name in like:  # another split of the images could put training images of RUN among those that are scored
-        if name not in _MAY_DIFFER and like[name] != config.data.get(name):
+    like = workdir.load_config(_LIKE.value).data
+    own = values_of(config.data)
+    # Another split of the images could put training images of RUN among those that are scored.
+    for name, value in values_of(like).items():
+        if name not in _MAY_DIFFER and value != own[name]:
             raise ValueError(
-                f"{_LIKE.value}: data.{name} is {like[name]!r}, in {_WORKDIR.value} it is {config.data.get(name)!r}; "
+                f"{_LIKE.value}: data.{name} is {value!r}, in {_WORKDIR.value} it is {own[name]!r}; "
                 f"expected runs that differ in {', '.join(_MAY_DIFFER)} only"
             )
-    config.data = like
+    config = replaced(config, data=like)
     shutil.copytree(_WORKDIR.value, out, ignore=shutil.ignore_patterns("eval", "renders"))
     print(summary(evaluate(out, config=config)))
 

@@ -144,11 +144,11 @@ def _row(steps):
     config, _ = auto_config.resolve_for_device(config)
     experiment = build.build(config)
     valid, data = experiment.prepare(views)
-    state = create_state(experiment.model, experiment.optimizer, experiment.seed, valid)
+    state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
-    rays, started = experiment.train.batch_size, time.perf_counter()
-    size = experiment.train.microbatch_size
+    rays, started = experiment.config.train.batch_size, time.perf_counter()
+    size = experiment.config.train.microbatch_size
     run, state, data = devices.compile_step(step, state, data, batch_size=rays, microbatch_size=size, mode="sharded")
     compile_seconds, taken = time.perf_counter() - started, []
     for _ in range(steps):

@@ -26,6 +26,7 @@ import common
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.training import auto_config
+from jaxnerf.training.config import to_config_dict
 
 HEADS = ("removed", "loss, dB", "up to, dB", "training time saved", "parameters saved", "verdict")
 
@@ -198,7 +199,7 @@ def short(config, steps: int):
     changes = {f"train.{name}": value for name, value in budget.items()} | {"eval.at_end": False}
     config = common.changed(config, changes | {"data.hold_out": config.data.hold_out or 8})
     config, views, _ = auto_config.resolve(config)
-    return config, views.pixels.shape[-1] == 4
+    return to_config_dict(config), views.pixels.shape[-1] == 4
 
 
 def search(complete, alpha: bool, folder: pathlib.Path, *, seeds: list[int], loss: float, names: list[str]) -> Found:

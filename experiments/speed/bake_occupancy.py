@@ -47,7 +47,7 @@ def main(argv: list[str]) -> None:
     if run.experiment.model.grid_schedule is not None:
         raise ValueError(f"{folder}: was trained with a grid, expected a run with the sampler 'hierarchical'")
     step = newest_step(run, folder)
-    renderers, variables = [_renderer(run, run.variables(step), run.experiment.eval.chunk)], None
+    renderers, variables = [_renderer(run, run.variables(step), run.experiment.config.eval.chunk)], None
     for setting in settings:
         baked = restore_run(folder, settings={"bake_occupancy": True} | setting)
         variables = variables or baked.variables(step)  # the grid is the same with all settings
@@ -104,7 +104,7 @@ def _measure(run, views, chosen, renderers):
     """Returns the seconds of each renderer and view [R, V], and the mean PSNR of each renderer [R]."""
     seconds, scores = np.zeros((2, len(renderers), len(chosen)))
     for place, index in enumerate(chosen):
-        pixels = pixel_grid(*np.asarray(views.size[index]).tolist(), offset=run.experiment.pixel_offset)
+        pixels = pixel_grid(*np.asarray(views.size[index]).tolist(), offset=run.experiment.config.data.pixel_offset)
         rays = jax.block_until_ready(run.experiment.view_rays(views, index, pixels.astype(jnp.float32)))
         truth = np.asarray(reference(views, index))
         for number, render in enumerate(renderers):

@@ -13,6 +13,7 @@ from jaxnerf import pixel_grid, psnr
 from jaxnerf.evaluation.evaluate import reference
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.training import workdir
+from jaxnerf.training.config import to_config_dict
 
 MULTIPLIERS = (4.0, 2.0, 1.0, 0.7, 0.5, 0.35)
 EARLY_STOPS = (0.0, 1e-3, 1e-2, 3e-2, 1e-1)
@@ -33,7 +34,7 @@ def measure(kept: dict[str, Any], save: Callable[[dict], None], folder, num_view
         folder: of a trained run.
         num_views: number of views.
     """
-    config = workdir.read_config(folder)
+    config = to_config_dict(workdir.load_config(folder))
     run = restore_run(folder)
     step = newest_step(run, folder)
     name = {"workdir": str(folder), "step": step, "frames": num_views, "machine": common.describe_machine()}
@@ -46,7 +47,7 @@ def measure(kept: dict[str, Any], save: Callable[[dict], None], folder, num_view
     if not missing:
         return
     kept["gflops"].append(common.matrix_gflops())
-    views = run.experiment.load_split(run.experiment.eval.split)
+    views = run.experiment.load_split(run.experiment.config.eval.split)
     chosen = np.unique(np.linspace(0, len(views.offset) - 1, num_views).astype(int))
     truths = [np.asarray(reference(views, index)) for index in chosen]
     exact_frame = _renderer(folder, config, _EXACT, step, views)
@@ -69,7 +70,7 @@ def settings(config, run) -> tuple[list[dict[str, Any]], list[str]]:
     One setting at a time varies around the run's own, and sample_multiplier together with early_stop_eps. A run
     that was trained without a grid is rendered once without, and otherwise through a grid that is baked from it.
     """
-    section, options = config[_section(config)], run.experiment.eval
+    section, options = config[_section(config)], run.experiment.config.eval
     has_grid = run.experiment.model.grid_schedule is not None
     own = {
         "sample_multiplier": options.sample_multiplier,
@@ -105,7 +106,7 @@ def _renderer(folder, config, setting, step, views):
 
     def frame(index, side=None):
         size = np.asarray(views.size[index])
-        pixels = pixel_grid(*([side] * 2 if side else size.tolist()), offset=run.experiment.pixel_offset)
+        pixels = pixel_grid(*([side] * 2 if side else size.tolist()), offset=run.experiment.config.data.pixel_offset)
         pixels = pixels * (size[::-1] / side if side else np.ones(2))[None, None]
         rays = run.experiment.view_rays(views, index, pixels.astype(jnp.float32))
         return np.asarray(run.render_image(variables, rays, chunk=setting["chunk"]).rgb)

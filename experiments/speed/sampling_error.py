@@ -23,6 +23,7 @@ from jaxnerf.core.metrics import decibels
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.runtime import cli
 from jaxnerf.training import auto_config, build, workdir
+from jaxnerf.training.config import changed
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run.", required=True)
 _LIMITS = flags.DEFINE_list("limits", ["2", "4", "6", "12", "0"], "Values of occupancy.max_optical_depth.")
@@ -44,7 +45,7 @@ HEADS = (
 def main(argv: list[str]) -> None:
     """Prints a row for each setting."""
     del argv
-    config, _ = auto_config.resolve_for_device(workdir.read_config(_WORKDIR.value))
+    config, _ = auto_config.resolve_for_device(workdir.load_config(_WORKDIR.value))
     if config.sampler != "occupancy":
         raise ValueError(
             f"{_WORKDIR.value}: has the sampler {config.sampler!r}, expected 'occupancy'; give another run"
@@ -61,8 +62,10 @@ def main(argv: list[str]) -> None:
     rows = []
     for limit in map(float, _LIMITS.value):
         for slots in map(float, _SLOTS.value):
-            config.occupancy.max_optical_depth, config.occupancy.pool_samples_per_ray = limit, slots
-            found = measure(build.build_model(config), run.variables(step), batches, step, _DRAWS.value)
+            limits = {"occupancy.max_optical_depth": limit, "occupancy.pool_samples_per_ray": slots}
+            found = measure(
+                build.build_model(changed(config, limits)), run.variables(step), batches, step, _DRAWS.value
+            )
             numbers = [f"{found[name]:.2f}" for name in ("samples", "psnr", "psnr_of_mean", "noise")]
             rows.append((f"{limit:g}", f"{slots:g}", *numbers))
     common.publish(common.markdown(HEADS, rows), _TABLE.value)

@@ -22,7 +22,7 @@ from jaxnerf.data.dataset import select_views
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.models.occupancy import render_with_grid
 from jaxnerf.training import auto_config
-from jaxnerf.training.workdir import read_config
+from jaxnerf.training.workdir import load_config
 
 PERIOD = 64  # steps timed together, so that updates of the grid are among them
 RAYS, BUFFERS, FACTORS, VIEWS = (256, 512, 1024, 2048), (0.5, 1, 2), (8, 4, 2), (25, 50, 100)
@@ -132,13 +132,13 @@ def _frame_row(folder):
     """Returns the row of the first scored view, in the run's own settings."""
     run = restore_run(folder)
     variables = run.variables(newest_step(run, folder))
-    options, model = run.experiment.eval, run.experiment.model
+    options, model = run.experiment.config.eval, run.experiment.model
     views = run.experiment.load_split(options.split)
     height, width = (int(value) for value in views.size[0])
-    rays = run.experiment.view_rays(views, 0, pixel_grid(height, width, offset=run.experiment.pixel_offset))
+    rays = run.experiment.view_rays(views, 0, pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset))
     rays = jax.tree.map(lambda leaf: leaf.reshape(height * width, *leaf.shape[2:]), rays)
     flops = run.render.lower(variables, rays).compile().cost_analysis()["flops"]
-    counts = {name: rays.near.size * count for name, count in _samples_per_ray(read_config(folder)).items()}
+    counts = {name: rays.near.size * count for name, count in _samples_per_ray(load_config(folder)).items()}
     if model.grid_schedule is not None:
         rounds, size = _rounds(model, variables, rays, options), options.max_samples
         scene = jax.jit(lambda params, *places: model.scene(params, variables[1])(*places))

@@ -134,7 +134,7 @@ def run_to(time_limit: float, config, where: pathlib.Path) -> dict[str, Any] | N
     trained, compiling = result["training_seconds"], result["compile_seconds"]
     return {
         "time_limit": time_limit,
-        "ended": result["step"] >= workdir.read_config(where).train.max_steps,
+        "ended": result["step"] >= workdir.load_config(where).train.max_steps,
         "seconds": trained,
         "comparable": common.comparable(trained, sum(speed) / 2),
         "gflops": speed,

@@ -21,7 +21,6 @@ import pathlib
 import statistics
 import sys
 import time
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -110,13 +109,13 @@ class Study:
             seed: of the initial parameters and the rays.
             allowed: train.max_reinits.
         """
-        options = SimpleNamespace(**{**vars(self._experiment.train), "max_reinits": allowed})
-        experiment = self._experiment._replace(seed=seed, train=options)
+        config = common.changed(self._experiment.config, {"seed": seed, "train.max_reinits": allowed})
+        experiment = self._experiment._replace(config=config)
         reinitialize = dead_networks.make_reinitializer(experiment, f"seed {seed}")
         state = create_state(experiment.model, experiment.optimizer, seed)
         data = self._step.data._replace(seed=np.uint32(seed))
         started, found, counted = time.perf_counter(), [], 0
-        for step in range(1, options.max_steps + 1):
+        for step in range(1, config.train.max_steps + 1):
             state, metrics = reinitialize(step, *self._step.run(state, data, self._step.positions))
             if step % dead_networks.CHECK_EVERY == 0 and int(metrics["num_reinits"]) > counted:
                 found, counted = [*found, step], int(metrics["num_reinits"])
@@ -221,9 +220,9 @@ class PaintedStudy:
         views_of_step = dataclasses.replace(self._step.data.views, pixels=jax.numpy.asarray(views.pixels))
         data = self._step.data._replace(seed=np.uint32(seed), views=views_of_step)
         errors, dead = [], 0
-        for _ in range(experiment.train.max_steps):
+        for _ in range(experiment.config.train.max_steps):
             state, metrics = self._step.run(state, data, self._step.positions)
-            errors.append(float(metrics["mse"]))
+            errors.append(float(metrics["mse_fine"]))
             dead = max(dead, int(metrics["dead_fine"]))
         alone = np.square(views.pixels / 255 - BACKGROUNDS[background]).mean()
         return {

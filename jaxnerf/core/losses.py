@@ -1,22 +1,23 @@
-"""Training losses: each maps the renderings of a step and its batch to one value per ray; and regularizers.
+"""Training losses: each maps the renderings of a step and its batch to one value per ray.
 
-`outputs` are all renderings of a step; the last one is the final rendering. The training step sums the losses with
-the weights of the config's `losses`, over the rays whose samples were all evaluated. A regularizer maps the
-parameters of all networks to a number.
+`outputs` are the renderings of a step whose colours are compared with the batch; the last one is the final rendering.
+The training step sums the losses with the weights of the config's `losses`, over the rays whose samples were all
+evaluated.
 """
 
 import functools
-import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnerf.core.types import Batch, PackedSamples, Rendering, Samples, TableLevel, check_shapes
+from jaxnerf.core.types import Batch, PackedSamples, Rendering, Samples, check_shapes
 from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
 from jaxnerf.registry import Loss
+
+_MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
+_DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 
 
 def squared_error(rendering: Rendering, batch: Batch) -> Float[Array, "*batch"]:
@@ -197,43 +198,6 @@ def opaque_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*ba
     return jnp.asarray(batch.alpha) * (1 - outputs[-1].opacity) ** 2
 
 
-def hash_decay(params: Mapping[str, Any], levels: Sequence[TableLevel]) -> Float[Array, ""]:
-    """Computes the mean over levels of the mean square of a level's table entries (arXiv:2304.06706, Section 3.2).
-
-    The mean of each level has the same weight, so an entry of a coarse level is pulled towards 0 more strongly than
-    one of a fine level, which fewer samples reach.
-
-    Args:
-        params: of all networks; the table is that of the final rendering's.
-        levels: of the table.
-    """
-    table = params["fine"]["table"]
-    each = [jnp.full(len(level.rows), 1 / len(level.rows)) for level in levels]
-    return jnp.concatenate(each) @ (table**2).mean(axis=-1) / len(levels)
-
-
-def total_variation(params: Mapping[str, Any], levels: Sequence[TableLevel]) -> Float[Array, ""]:
-    """Computes the mean squared difference of neighbouring vertices' features, summed over axes (arXiv:2112.05131).
-
-    Only levels with a row for each vertex count, with the same weight each; the neighbours in a hashed level share
-    their rows with vertices elsewhere. Such levels have at most table_size rows, so all of them are evaluated.
-
-    Args:
-        params: of all networks; the table is that of the final rendering's.
-        levels: of the table.
-
-    Returns:
-        A number; 0 if all levels are hashed.
-    """
-    table = params["fine"]["table"]
-    dense = [level for level in levels if len(level.rows) == math.prod(level.size)]
-    total = jnp.zeros(())
-    for level in dense:
-        vertices = table[level.rows.start : level.rows.stop].reshape(*level.size, -1)
-        total += sum((jnp.diff(vertices, axis=axis) ** 2).mean() for axis in range(3))
-    return total / max(len(dense), 1)
-
-
 def _samples(function, rendering):
     """Returns a Rendering's samples; ValueError if it has none, or no weights for them."""
     samples = rendering.samples
@@ -244,9 +208,21 @@ def _samples(function, rendering):
     return samples
 
 
-MSE = Loss(mse_loss)
-DISTORTION = Loss(distortion_loss)
-DEPTH = Loss(depth_loss, needs=("depth", "depth_weight"))
-OPAQUE = Loss(opaque_loss, needs=("alpha",))
-HASH_DECAY = Loss(hash_decay, on="params", needs=("levels",))
-TOTAL_VARIATION = Loss(total_variation, on="params", needs=("levels",))
+def _weight_of_depth(facts):
+    if facts.num_observations < _MIN_OBSERVATIONS:
+        return 0.0, ""
+    line = f"depth         {facts.num_observations:,} observations of sparse points guide the start of training"
+    return _DEPTH_WEIGHT, line
+
+
+MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over all renderings")
+DISTORTION = Loss(distortion_loss, help="distortion of the weights (arXiv:2111.12077, Eq. 15)")
+DEPTH = Loss(
+    depth_loss,
+    needs=("depth", "depth_weight"),
+    weight="auto",
+    infer=_weight_of_depth,
+    help="distance of the weights from the dataset's sparse points, and from depths interpolated between them (after "
+    "arXiv:2107.02791); auto: at the start of training where space is contracted and there are such points",
+)
+OPAQUE = Loss(opaque_loss, needs=("alpha",), help="squared transmittance of rays where the image is opaque")

@@ -1,8 +1,8 @@
 """Data types of the whole package, and the shape check of the public functions."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeAlias, TypeVar, dataclass_transform
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -128,6 +128,23 @@ class Rendering:
     median_depth: Float[Array, "*batch"] | None = None
 
 
+class Renderings(tuple[Rendering, ...]):
+    """The renderings of a training step.
+
+    As a tuple it holds those whose colours are compared with the batch, that of images last. `outputs["name"]` is the
+    rendering of any network, such as one that only proposes samples.
+    """
+
+    def __new__(cls, by_network: Mapping[str, Rendering], compared: Iterable[str]) -> "Renderings":
+        """Makes the tuple from the renderings by network, and the names of those that are compared."""
+        renderings = super().__new__(cls, (by_network[name] for name in compared))
+        renderings._by_network = by_network
+        return renderings
+
+    def __getitem__(self, key):
+        return self._by_network[key] if isinstance(key, str) else super().__getitem__(key)
+
+
 def without_samples(rendering: Rendering) -> Rendering:
     """Drops the weights and samples of a Rendering: most of its bytes, which no image needs."""
     return dataclasses.replace(rendering, weights=None, samples=None)
@@ -179,18 +196,6 @@ class SparsePoints:
     pixel: Float[Array, "M 2"]
     confidence: Float[Array, " M"] | None = None
     between: Float[Array, "V H W 2"] | None = None
-
-
-class TableLevel(NamedTuple):
-    """A level of the table of a hash grid.
-
-    Attributes:
-        size: vertices along x, y and z.
-        rows: range of the table's rows; fewer than vertices where the level is hashed.
-    """
-
-    size: tuple[int, int, int]
-    rows: range
 
 
 @pytree(static=("names", "background"))

@@ -1,6 +1,5 @@
 """Datasets: the Views of a split, for a folder or for the data section of a config."""
 
-import copy
 import dataclasses
 import os
 import pathlib
@@ -9,16 +8,17 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
-from ml_collections import ConfigDict
+from jaxtyping import Int
 
 from jaxnerf.core.types import SparsePoints, Views
 from jaxnerf.data import synthetic
+from jaxnerf.data.facts import LookAt, mean_color
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
 from jaxnerf.data.readers import base, blender
 from jaxnerf.data.readers.base import fingerprint
-from jaxnerf.runtime.config_fields import AUTO, is_auto
+from jaxnerf.fields import still_life
+from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, is_auto, option, replaced, values_of
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 WORLDS = {
@@ -27,9 +27,97 @@ WORLDS = {
     "around": "the point that the cameras look at becomes the origin, their distance 1",
 }
 _SYNTHETIC = {"fingerprint": "", "factor": 1, "background": "white", "world": "file", "ndc": False}
+_NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
 BLENDER_RANGE = (2.0, 6.0)  # near and far of the NeRF paper's synthetic scenes, world units
-_MEAN_RUNS, _MEAN_RUN = 2**10, 2**10  # of pixels, of whose colours the mean is taken
 _HELD_OUT_OFFSET = 3  # not 0, as the first views of a dataset often differ from the others
+
+
+def _wrong_color(color):
+    right = len(color) in (0, 3) and all(isinstance(each, int | float) and 0 <= each <= 1 for each in color)
+    return None if right else "red, green and blue in [0, 1], or () for black"
+
+
+@dataclasses.dataclass(frozen=True)
+class DataOptions(Options):
+    """The options of the dataset: which images are read, and how."""
+
+    format: str = option(
+        "synthetic",
+        "`synthetic` (the embedded scene, rendered once and cached), `blender`, `transforms`, `colmap`, `llff`, or "
+        "the name of a registered reader; auto: what the folder holds",
+        auto=True,
+        protocol=True,
+    )
+    dir: str = option("", "the dataset's folder: a path, or a name below $JAXNERF_SCENES", changes=Changes.NOTHING)
+    fingerprint: str = option(
+        AUTO,
+        "Identifies the images and cameras that a run is trained on. It is empty for formats that store each split "
+        "in files of its own.",
+        auto=True,
+    )
+    factor: int = option(
+        1,
+        "images are shrunk by this factor (area average); auto: to about `width`",
+        range=at_least(1),
+        auto=True,
+        protocol=True,
+    )
+    width: int = option(800, "see `factor`", unit="px", range=at_least(1))
+    size: int = option(100, "side of the embedded scene's images", unit="px", range=at_least(1))
+    finish: str = option(
+        "usual",
+        "surfaces of the embedded scene; `matt` ones do not depend on the view direction",
+        choices=tuple(sorted(still_life.FINISHES)),
+    )
+    near: float = option(
+        AUTO,
+        "Where rays start, along the camera's axis. 0: each image has its own, from the dataset. auto: one small "
+        "distance where the occupancy sampler contracts space, otherwise 0.",
+        unit="of the dataset's files",
+        range=at_least(0),
+        auto=True,
+    )
+    far: float = option(0.0, "where rays end, as `near`", unit="of the dataset's files", range=at_least(0))
+    background: str = option(
+        "white",
+        "The colour behind alpha and behind the scene. `none`: alpha is dropped, and `background_color` is behind the "
+        "scene. auto: `white` for images with alpha, otherwise `none`.",
+        choices=tuple(BACKGROUNDS),
+        auto=True,
+        protocol=True,
+    )
+    background_color: tuple[float, ...] = option(
+        AUTO,
+        "behind the scene where `background` is `none`: red, green, blue in [0, 1], or () for black. auto: the mean "
+        "of the training images where the occupancy sampler contracts space, otherwise black",
+        auto=True,
+        check=_wrong_color,
+    )
+    hold_out: int = option(
+        0,
+        "every n-th training view belongs to the split `held_out` instead; 0: none",
+        range=at_least(0),
+        protocol=True,
+    )
+    num_views: int = option(
+        0,
+        "number of training views to use, spread evenly over all of them; 0: all",
+        range=at_least(0),
+        protocol=True,
+    )
+    pixel_offset: float = option(
+        0.5, "rays pass through pixel centres (0.5) or pixel corners (0)", unit="px", protocol=True
+    )
+    world: str = option(
+        AUTO,
+        "The world's coordinates: `file` (as in the dataset), `forward` (recentred for NDC), or `around` (centred on "
+        "and scaled to the region that the cameras see).",
+        choices=tuple(WORLDS),
+        auto=True,
+    )
+    ndc: bool = option(
+        False, "whether rays are in normalised device coordinates; requires the world `forward`", auto=True
+    )
 
 
 def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any) -> Views:
@@ -50,34 +138,33 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    from jaxnerf.configs import default
-
-    data = default.get_config().data
-    inferred = {name: AUTO for name in ("format", "background", "world", "ndc")}
-    known = [name for name in data if name != "background_color"]  # of renderings, not of images
+    inferred = DataOptions(format=AUTO, background=AUTO, world=AUTO, ndc=AUTO)  # type: ignore[arg-type]
+    known = [name for name in values_of(inferred) if name != "background_color"]  # of renderings, not of images
     if unknown := sorted(set(options) - set(known)):
         raise ValueError(f"load_dataset: {unknown[0]} is no option, expected one of {', '.join(known)}; correct it")
-    data.update(inferred | {"dir": str(dir)} | options)
-    return load_split(data, split)
+    return load_split(replaced(inferred, **{"dir": str(dir)} | options), split)
 
 
-def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
-    """Resolves a data section against its folder: every "auto" becomes a value.
+def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
+    """Resolves the options of a dataset against its folder.
+
+    `near` and `background_color` stay "auto", see `resolve_for_scene`.
 
     Args:
-        data: see configs/default.py; it is not changed.
+        data: the options.
 
     Returns:
-        A copy of the section, and one line per inferred value with its reason.
+        The options, and one line per inferred value with its reason.
 
     Raises:
         ValueError: if the folder does not exist or holds no dataset.
     """
-    data, lines = copy.deepcopy(data), []
+    lines = []
 
     def infer(name, value, line=None):
-        if is_auto(data[name]):
-            data[name] = value
+        nonlocal data
+        if is_auto(getattr(data, name)):
+            data = replaced(data, **{name: value})
             if line:
                 lines.append(line)
 
@@ -87,7 +174,7 @@ def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
         return data, lines
     folder = dataset_folder(data.dir)
     if pathlib.Path(data.dir).is_dir():  # a name below $JAXNERF_SCENES stays a name
-        data.dir = str(folder.absolute())
+        data = replaced(data, dir=str(folder.absolute()))
     if is_auto(data.format):
         found = base.detect_formats(folder)
         others = f", of {', '.join(found)}: --format selects another" if len(found) > 1 else ""
@@ -97,7 +184,7 @@ def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
         infer("fingerprint", "")
         infer("world", "file")
     # Reading the cameras takes a while, so they are only read to infer something from them.
-    if any(is_auto(data[name]) for name in ("factor", "world", "background", "fingerprint")):
+    if any(map(is_auto, (data.factor, data.world, data.background, data.fingerprint))):
         capture = base.read_capture(folder, data.format)
         lines += [f"note          {note}" for note in capture.notes]
         masks = [frame.mask for frame in capture.frames if frame.mask is not None]
@@ -119,14 +206,54 @@ def resolve(data: ConfigDict) -> tuple[ConfigDict, list[str]]:
     return data, lines
 
 
-def load_split(data: ConfigDict, split: str, *, max_views: int | None = None) -> Views:
-    """Reads the Views of a split of the dataset that a config's data section describes.
+def resolve_for_scene(data: DataOptions, views: Views, *, fills_space: bool) -> tuple[DataOptions, Views, list[str]]:
+    """Resolves what concerns the space in front of the cameras, and the colour behind the scene.
+
+    In unbounded captures each image's own near follows from what it shows. No ray would then train the space between
+    a camera and its near, so that another camera could see fog there. Distant walls and sky have little texture, so
+    training leaves them partly transparent. With black behind them they are too dark, and bright fog in front of
+    single cameras takes their place.
+
+    Args:
+        data: the options, otherwise resolved.
+        views: of the split "train".
+        fills_space: whether the run evaluates the field in all of space.
+
+    Returns:
+        The options, the views with their near, and one line per inferred value.
+    """
+    color, lines = data.background_color, []
+    if is_auto(color):
+        color = ()
+        if data.background == "none" and fills_space:
+            color = tuple(round(value, 3) for value in mean_color(views))
+            lines.append(f"behind        {color}, the mean colour of the training images")
+        data = replaced(data, background_color=color)
+    elif len(color) and data.background != "none":
+        raise ValueError(
+            f"data.background_color is {tuple(color)} and data.background {data.background!r}, which is behind the "
+            "scene, too; set data.background to 'none', or data.background_color to ()"
+        )
+    if not is_auto(data.near):
+        return data, views, lines
+    if not fills_space:
+        return replaced(data, near=0.0), views, lines
+    unit = 1.0 if views.to_file is None else world.unit_of(views.to_file)
+    distance = float(np.median(LookAt(views).distance))
+    data = replaced(data, near=float(f"{_NEAR * distance * unit:.4g}"))
+    near = np.float32(data.near / unit)
+    lines.append(f"near          {near:.3g} for all images, so that the space in front of each camera is trained")
+    return data, dataclasses.replace(views, near=np.full_like(views.near, near)), lines
+
+
+def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -> Views:
+    """Reads the Views of a split of the dataset that options describe.
 
     With `hold_out`, some views of "train" form the split "held_out" instead. With `num_views`, "train" has only
     that many of its views. Fields that are still "auto" are resolved first.
 
     Args:
-        data: see configs/default.py.
+        data: the options.
         split: of the dataset.
         max_views: read at most so many of its views, spread evenly; None: all.
 
@@ -190,16 +317,16 @@ def dataset_folder(name: str) -> pathlib.Path:
     return found[0]
 
 
-def background_of(data: ConfigDict) -> tuple[float, float, float] | None:
+def background_of(data: DataOptions) -> tuple[float, float, float] | None:
     """Returns the colour behind alpha, or None where alpha is dropped."""
     if data.background not in BACKGROUNDS:
         raise ValueError(f"data.background is {data.background!r}, expected one of {sorted(BACKGROUNDS)}; correct it")
     return BACKGROUNDS[data.background]
 
 
-def color_behind(data: ConfigDict) -> tuple[float, float, float] | None:
-    """Returns the colour behind the scene of a resolved data section; None: black."""
-    color = data.get("background_color", ())  # configs of older versions lack it
+def color_behind(data: DataOptions) -> tuple[float, ...] | None:
+    """Returns the colour behind the scene of resolved options; None: black."""
+    color = data.background_color
     if data.background != "none" or len(color) == 0:
         return background_of(data)
     if is_auto(color):
@@ -210,25 +337,9 @@ def color_behind(data: ConfigDict) -> tuple[float, float, float] | None:
     return tuple(color)
 
 
-def mean_color(views: Views) -> tuple[float, float, float]:
-    """Returns the mean colour of the views' pixels in [0, 1], alpha dropped; see `sample_pixels`."""
-    return tuple(float(value) for value in sample_pixels(views)[:, :3].mean(axis=0))
-
-
-def sample_pixels(views: Views) -> Float[np.ndarray, "N C"]:
-    """Returns pixels of all views in [0, 1].
-
-    Of more than 2^20 pixels some are chosen: runs of them at random places, as single pixels of a file on disk would
-    take as long to read as all. Pixels that a mask excludes do not count, unless it excludes all that were chosen.
-    """
-    total, chosen = len(views.pixels), np.arange(len(views.pixels))
-    if total > _MEAN_RUNS * _MEAN_RUN:
-        starts = np.sort(np.random.default_rng(0).integers(0, total - _MEAN_RUN, _MEAN_RUNS))
-        chosen = (starts[:, None] + np.arange(_MEAN_RUN)).reshape(-1)
-    if views.mask is not None and views.mask[chosen].any():
-        chosen = chosen[views.mask[chosen]]
-    pixels = views.pixels[chosen]
-    return pixels / np.iinfo(pixels.dtype).max
+def conventions(data: DataOptions) -> dict[str, Any]:
+    """Returns the options of a dataset that an evaluation protocol records."""
+    return {name: getattr(data, name) for name, (declared, _) in declarations(DataOptions).items() if declared.protocol}
 
 
 def held_out(count: int, every: int) -> Int[np.ndarray, " N"]:
@@ -276,7 +387,7 @@ def _select_observations(sparse: SparsePoints, indices: np.ndarray) -> SparsePoi
     )
 
 
-def _selection(data: ConfigDict, split: str) -> Callable[[int], np.ndarray] | None:
+def _selection(data: DataOptions, split: str) -> Callable[[int], np.ndarray] | None:
     """Returns a function from the number of views to the indices of those that a split has; None: all."""
     every = data.hold_out if split in ("train", "held_out") else 0
     number = data.num_views if split == "train" else 0

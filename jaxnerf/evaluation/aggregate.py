@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxnerf.core.types import Rendering, Views
+from jaxnerf.data import dataset
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images, protocol
 from jaxnerf.evaluation.restore import TrainedRun, render_settings
@@ -124,7 +125,7 @@ def _results(run, workdir, views, variables, finished, origin):
     timed = [view["row"] for view in finished if not view["first"]] or rows
     seconds = sum(row["seconds"] for row in timed) / len(timed)
     trained = [row for row in metric_log.read_rows(workdir) if row["step"] <= origin["step"]]
-    conventions = {**run.experiment.conventions, "chunk": run.experiment.eval.chunk}
+    conventions = {**dataset.conventions(run.experiment.config.data), "chunk": run.experiment.config.eval.chunk}
     return {
         **means(rows),
         "views": len(rows),

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from ml_collections import ConfigDict
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Views
@@ -27,13 +26,14 @@ from jaxnerf.runtime import atomic_files, processes, shards
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config import Config
 from jaxnerf.training.loop import train
 from jaxnerf.training.state import TrainState
 
 _REMEDY = "give --overwrite without --shard, or remove it"
 
 
-def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views: Views | None = None) -> bool:
+def train_and_evaluate(config: Config, workdir: str | os.PathLike, *, views: Views | None = None) -> bool:
     """Trains as a config says, from the last checkpoint in a workdir if there is one, and scores the result.
 
     Args:
@@ -53,7 +53,7 @@ def train_and_evaluate(config: ConfigDict, workdir: str | os.PathLike, *, views:
 
 
 def train_observed(
-    config: ConfigDict,
+    config: Config,
     workdir: str | os.PathLike,
     *,
     views: Views | None = None,
@@ -84,7 +84,7 @@ def _score_newest(workdir):
 def evaluate(
     workdir: str | os.PathLike,
     *,
-    config: ConfigDict | None = None,
+    config: Config | None = None,
     data_dir: str | None = None,
     split: str | None = None,
     step: int | None = None,
@@ -127,7 +127,7 @@ def score_run(
     """Scores a checkpoint as `evaluate` does, for a restored run, with views if they have been read already."""
     step = newest_step(run, workdir, step)
     target = claim_target(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
-    split = split or run.experiment.eval.split
+    split = split or run.experiment.config.eval.split
     views = run.experiment.load_split(split) if views is None else views
     variables = run.variables(step)
     views = refined_views(run, views, split, variables[0])
@@ -163,7 +163,7 @@ def claim_target(
 
     For a shard it may exist: all shards are then finished, and this one has nothing to do.
     """
-    step, own = newest_step(run, workdir, step), run.experiment.eval.split
+    step, own = newest_step(run, workdir, step), run.experiment.config.eval.split
     name = str(step) if split in (None, own) else f"{step}-{split}"
     target = pathlib.Path(workdir) / "eval" / name
     atomic_files.check_tree(target.parent)
@@ -207,7 +207,7 @@ def _score_views(run, render, views, folder, shard):
     progress, first = metric_log.Progress(len(frames), show=processes.is_first()), True
     for done, index in enumerate(todo, len(frames) - len(todo) + 1):
         name, (height, width) = views.names[index], (int(value) for value in views.size[index])
-        pixels = pixel_grid(height, width, offset=run.experiment.pixel_offset)
+        pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
         started = time.perf_counter()
         rays = run.experiment.view_rays(views, index, pixels)
         image = jax.block_until_ready(render(rays))

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from ml_collections import ConfigDict
 
 from jaxnerf.data.images.image_files import read_image
 from jaxnerf.evaluation import protocol
@@ -16,12 +15,13 @@ from jaxnerf.evaluation.aggregate import means
 from jaxnerf.evaluation.metrics import image_metrics, pixel_mask, reference
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import build
+from jaxnerf.training.config import Config
 
 
 def score_folder(
     folder: str | os.PathLike,
     *,
-    config: ConfigDict | None = None,
+    config: Config | None = None,
     split: str | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class Previews:
             views: of the split "train".
         """
         run, rows = self._run, metric_log.read_rows(self._workdir)
-        options, step = run.experiment.train, newest_step(run, self._workdir)
+        options, step = run.experiment.config.train, newest_step(run, self._workdir)
         row = next((row for row in rows if row["step"] == step), {"seconds": 0.0})
         if step >= options.max_steps:
             limit, more = "train.max_steps", 2 * step
@@ -82,7 +82,7 @@ class Previews:
     def _held_out(self):
         """The split of the held-out views, some of its Views or None, and why there are none."""
         experiment = self._run.experiment
-        split = "held_out" if experiment.conventions["hold_out"] else experiment.eval.split
+        split = "held_out" if experiment.config.data.hold_out else experiment.config.eval.split
         if split == "train":
             return split, None, "eval.split is 'train'"
         try:
@@ -100,7 +100,7 @@ class Previews:
         split, held_out, why = self._held_out
         results = self._workdir / "eval" / str(step) / "results.json"
         lines = []
-        if self._run.experiment.eval.summary_seconds:
+        if self._run.experiment.config.eval.summary_seconds:
             try:
                 variables = _on_one_device(self._run.variables(step))
                 lines.append(f"training      {self._mean_psnr(variables, views)} of {len(views.offset)} images")
@@ -129,7 +129,7 @@ class Previews:
     def _commands(self, more):
         split, held_out, _ = self._held_out
         workdir = f"--workdir={shlex.quote(str(self._workdir))}"
-        option = "" if split == self._run.experiment.eval.split else f" --split={split}"
+        option = "" if split == self._run.experiment.config.eval.split else f" --split={split}"
         commands = [f"jaxnerf-eval {workdir}{option}"] if held_out is not None else []
         commands += [f"jaxnerf-render {workdir}", f"jaxnerf-train {workdir} {more}"]
         purposes = ["scores all held-out images", "renders a video", "trains longer"][-len(commands) :]
@@ -156,7 +156,7 @@ class Previews:
         views = refined_views(self._run, views, split, variables[0])
         height, width = (int(value) for value in views.size[index])
         every = math.ceil(math.sqrt(height * width / _MAX_RAYS))
-        pixels = pixel_grid(height, width, offset=experiment.pixel_offset)[::every, ::every]
+        pixels = pixel_grid(height, width, offset=experiment.config.data.pixel_offset)[::every, ::every]
         rgb = self._run.render_image(variables, experiment.view_rays(views, index, pixels)).rgb
         truth, mask = reference(views, index)[::every, ::every], pixel_mask(views, index)
         mask = None if mask is None else mask[::every, ::every]
@@ -170,7 +170,7 @@ class Previews:
             scores.append(self._render(variables, views, int(index))[0])
             if len(scores) == 1:
                 started = time.perf_counter()  # the first one may compile
-            elif time.perf_counter() - started > self._run.experiment.eval.summary_seconds:
+            elif time.perf_counter() - started > self._run.experiment.config.eval.summary_seconds:
                 break
         return f"PSNR {np.mean(scores):.2f} dB over {len(scores)}"
 

@@ -56,7 +56,7 @@ def of_views(conventions: Mapping[str, Any], views: Views, *, split: str) -> dic
     """Returns what results.json states about its metrics: {"conventions": ..., "comparable_with": ...}.
 
     Args:
-        conventions: how the views were read, see `build.conventions`.
+        conventions: how the views were read, see `dataset.conventions`.
         views: Views, all of the split.
         split: its name.
     """

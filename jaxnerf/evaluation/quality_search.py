@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from ml_collections import ConfigDict
 
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.evaluate import claim_target
 from jaxnerf.evaluation.restore import newest_step, restore_run
+from jaxnerf.training.config import Config
 
 # What the error is measured against.
 _EXACT = {"sample_multiplier": 4.0, "early_stop_eps": 0.0, "bake_occupancy": False}
@@ -37,7 +37,7 @@ def choose(
     workdir: str | os.PathLike,
     error_budget: float,
     *,
-    config: ConfigDict | None = None,
+    config: Config | None = None,
     data_dir: str | None = None,
     split: str | None = None,
     step: int | None = None,
@@ -60,7 +60,7 @@ def cheapest_settings(
     workdir: str | os.PathLike,
     error_budget: float,
     *,
-    config: ConfigDict | None = None,
+    config: Config | None = None,
     data_dir: str | None = None,
     split: str | None = None,
     step: int | None = None,
@@ -94,14 +94,14 @@ def cheapest_settings(
         ValueError: if none is within the budget; says how close the best comes.
     """
     if sample_multipliers is None:
-        own = restore_run(workdir, config, data_dir=data_dir, settings=settings).experiment.eval.sample_multiplier
-        sample_multipliers = [own * fraction for fraction in _FRACTIONS]
+        own = restore_run(workdir, config, data_dir=data_dir, settings=settings).experiment.config.eval
+        sample_multipliers = [own.sample_multiplier * fraction for fraction in _FRACTIONS]
     exact = restore_run(workdir, config, data_dir=data_dir, settings={**(settings or {}), **_EXACT})
     experiment = exact.experiment
-    views = experiment.load_split(split or experiment.eval.split)
-    rays = random_rays(views, num_rays, experiment.view_rays, pixel_offset=experiment.pixel_offset)
+    views = experiment.load_split(split or experiment.config.eval.split)
+    rays = random_rays(views, num_rays, experiment.view_rays, pixel_offset=experiment.config.data.pixel_offset)
     step = newest_step(exact, workdir, step)
-    smaller_chunk = -(-experiment.eval.chunk // int(_EXACT["sample_multiplier"]))
+    smaller_chunk = -(-experiment.config.eval.chunk // int(_EXACT["sample_multiplier"]))
     exact_variables = exact.variables(step)
     truth = np.asarray(exact.render_image(exact_variables, rays, chunk=smaller_chunk).rgb)
     candidates, variables = [], {False: exact_variables}

@@ -1,27 +1,24 @@
 """Restores a trained run as functions for other code."""
 
-import copy
 import functools
 import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-from ml_collections import ConfigDict
 
 from jaxnerf.core.types import Rays, Rendering, SceneFn, Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.models.base import Model
-from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.options import Changes, changing, is_auto, replaced
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
 from jaxnerf.training.optimizer import averaged_params
 from jaxnerf.training.state import create_state
-from jaxnerf.training.workdir import read_config
-
-_RENDER_SETTINGS = ("sample_multiplier", "early_stop_eps", "bake_occupancy")
+from jaxnerf.training.workdir import load_config
 
 
 class TrainedRun(NamedTuple):
@@ -32,7 +29,7 @@ class TrainedRun(NamedTuple):
         steps: () -> the steps of the finished checkpoints, ascending.
         variables: step -> (params, grid) of that checkpoint; the grid is None where the model has none.
         render: (variables, Rays [...]) -> Rendering [...] without weights, jitted.
-        identity: text that is equal for configs that render alike, see `build.identity`.
+        identity: text that is equal for configs that render alike, see `config.identity`.
         render_image: (variables, Rays [...], chunk=None, median_depth=False) -> Rendering [...] as `render`, in
             chunks that fit into memory.
         variables_of: (averaged parameters, grid) of a state of training -> (params, grid) as `variables` returns them.
@@ -52,7 +49,7 @@ class TrainedRun(NamedTuple):
 
 def restore_run(
     workdir: str | os.PathLike,
-    config: ConfigDict | None = None,
+    config: Config | None = None,
     *,
     data_dir: str | None = None,
     settings: dict[str, Any] | None = None,
@@ -85,33 +82,28 @@ def restore_with_grid(workdir: str | os.PathLike, *, data_dir: str | None = None
 def _restore(workdir, config, data_dir, settings, *, crop):
     """Returns what `restore_run` describes; crop: see `bake_occupancy`."""
     if config is None:
-        config = read_config(workdir)
-    elif auto_config.auto_fields(config):
-        config = auto_config.fill_from(config, read_config(workdir))
-    else:
-        config = copy.deepcopy(config)
-    if data_dir:
-        config.data.dir = data_dir
-        if config.data.format == "synthetic":  # it has no folder, so the format of data_dir is detected
-            config.data.format = "auto"
+        config = load_config(workdir)
+    elif auto_fields(config):
+        config = auto_config.fill_from(config, load_config(workdir))
+    config = dataset_at(read_config(config), data_dir)
     if data_dir or is_auto(config.data.ndc):
-        config.data, _ = dataset.resolve(config.data)
-    config.eval.update(settings)
+        config = replaced(config, data=dataset.resolve(config.data)[0])
+    config = _with_settings(config, settings)
     config, _ = auto_config.resolve_for_device(config)
     experiment = build.build(config)
     checkpoints = Checkpoints(workdir)
     trained, model, bake = experiment.model, experiment.model, None
     if config.eval.bake_occupancy and model.grid_schedule is None:
         views = experiment.load_split("train")
-        if auto_config.auto_fields(config):  # of a run that was converted without its dataset
+        if auto_fields(config):  # of a run that was converted without its dataset
             config = auto_config.resolve_for_device(auto_config.resolve(config, views).config)[0]
-        options = {"view_rays": experiment.view_rays, "pixel_offset": experiment.pixel_offset}
+        options = {"view_rays": experiment.view_rays, "pixel_offset": config.data.pixel_offset}
         rays = functools.partial(random_rays, views, **options)
         model, bake = build.bake_model(config, model, rays, crop=crop)
 
     @functools.cache
     def template():
-        shapes = jax.eval_shape(lambda: create_state(trained, experiment.optimizer, experiment.seed))
+        shapes = jax.eval_shape(lambda: create_state(trained, experiment.optimizer, config.seed))
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), shapes)
 
@@ -126,10 +118,9 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         return variables_of(averaged_params(state), state.grid)
 
     def model_with(settings):
-        other = copy.deepcopy(config)
-        other.eval.update(settings)
-        changed = build.build_model(other)
-        return build.bake_model(other, changed, lambda count: None)[0] if bake else changed
+        other = _with_settings(config, settings)
+        model = build.build_model(other)
+        return build.bake_model(other, model, lambda count: None)[0] if bake else model
 
     def cull(variables, rays, **options):
         return model.cull(variables[1], rays, **options)
@@ -137,20 +128,39 @@ def _restore(workdir, config, data_dir, settings, *, crop):
     @functools.cache
     def renderer(**options):
         part, mask = (jax.jit(functools.partial(each, **options)) for each in (render, cull))
-        return image_renderer(part, experiment.eval.chunk, model.cull and mask)
+        return image_renderer(part, config.eval.chunk, model.cull and mask)
 
     def render_image(variables, rays, chunk=None, median_depth=False):
         return renderer(**{"median_depth": True} if median_depth else {})(variables, rays, chunk)
 
-    identity = build.identity(config)
     return TrainedRun(
-        experiment, checkpoints.steps, variables, jax.jit(render), identity, render_image, variables_of, model_with
+        experiment,
+        checkpoints.steps,
+        variables,
+        jax.jit(render),
+        identity(config),
+        render_image,
+        variables_of,
+        model_with,
     )
+
+
+def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:
+    """Returns the config with another folder of the dataset; None: its own."""
+    if not folder:
+        return config
+    synthetic = config.data.format == "synthetic"  # it has no folder, so the format is detected
+    return changed(config, {"data.dir": folder, **({"data.format": "auto"} if synthetic else {})})
+
+
+def _with_settings(config, settings):
+    return changed(config, {f"eval.{name}": value for name, value in settings.items()}) if settings else config
 
 
 def render_settings(run: TrainedRun) -> dict[str, Any]:
     """Returns the settings of the config's section `eval` that change what a run renders, by name."""
-    return {name: getattr(run.experiment.eval, name) for name in _RENDER_SETTINGS}
+    options = run.experiment.config.eval
+    return {name: getattr(options, name) for name in changing(options, Changes.IMAGES)}
 
 
 def refined_views(run: TrainedRun, views: Views, split: str, params: Any) -> Views:

@@ -6,18 +6,17 @@ import sys
 import time
 from typing import Any
 
-from ml_collections import ConfigDict
-
 from jaxnerf.evaluation.evaluate import score_run, summary
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import metric_log
+from jaxnerf.training.config import Config
 
 
 def watch(
     workdir: str | os.PathLike,
     *,
     poll_seconds: float = 10.0,
-    config: ConfigDict | None = None,
+    config: Config | None = None,
     data_dir: str | None = None,
     split: str | None = None,
     settings: dict[str, Any] | None = None,
@@ -36,8 +35,8 @@ def watch(
     while not (workdir / "config.json").exists():
         said = _wait(f"{workdir}: no run yet", said, poll_seconds)
     run = restore_run(workdir, config, data_dir=data_dir, settings=settings)
-    split = split or run.experiment.eval.split
-    suffix = "" if split == run.experiment.eval.split else f"-{split}"
+    split = split or run.experiment.config.eval.split
+    suffix = "" if split == run.experiment.config.eval.split else f"-{split}"
     views = run.experiment.load_split(split)
     while True:
         new = [step for step in run.steps() if not (workdir / "eval" / f"{step}{suffix}").exists()]
@@ -56,7 +55,7 @@ def watch(
 
 def _has_ended(run, workdir):
     """Returns whether the training has written its last checkpoint, by its steps or by its clock."""
-    options, steps, rows = run.experiment.train, run.steps(), metric_log.read_rows(workdir)
+    options, steps, rows = run.experiment.config.train, run.steps(), metric_log.read_rows(workdir)
     if not steps:
         return False
     late = rows and rows[-1]["step"] == steps[-1] and 0 < options.max_seconds <= rows[-1]["seconds"]

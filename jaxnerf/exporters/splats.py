@@ -44,9 +44,8 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
     gaussians = make_gaussians(points, normals, extinction, colors_of(source, field_x, normals))
     write_gaussians(folder / "splats.ply", gaussians)
     value, count = score(source, gaussians)
-    source.say(
-        f"{len(points):,} Gaussians; PSNR {value:.2f} dB over {count} views of {source.run.experiment.eval.split}"
-    )
+    split = source.run.experiment.config.eval.split
+    source.say(f"{len(points):,} Gaussians; PSNR {value:.2f} dB over {count} views of {split}")
 
 
 def make_gaussians(points: np.ndarray, normals: np.ndarray, extinction: np.ndarray, colors: np.ndarray) -> Gaussians:
@@ -103,7 +102,7 @@ def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
 
     Behind the Gaussians is the run's background, which the file does not hold.
     """
-    run, split = source.run, source.run.experiment.eval.split
+    run, split = source.run, source.run.experiment.config.eval.split
     views = refined_views(run, run.experiment.load_split(split), split, source.variables[0])
     poses = in_file(np.asarray(views.cameras.to_world), views.to_file)
     count = min(_NUM_SCORED, len(views.size))

@@ -186,7 +186,7 @@ def _poses_of(source, size, all_around):
     chosen = _chosen(len(views.size), source.settings.num_views)
     poses = np.asarray(views.cameras.to_world)[chosen]
     # The rays of NDC are no world rays: they begin elsewhere.
-    bounded = not source.variables[1].contracted and not source.run.experiment.ndc
+    bounded = not source.variables[1].contracted and not source.run.experiment.config.data.ndc
     if all_around and bounded and not look_one_way(poses):
         poses = np.concatenate([poses, _around(poses, max(len(poses) // 2, 1))])
     height, width = (int(side) for side in views.size[0])

@@ -10,8 +10,7 @@ from flax import linen
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core import contraction
-from jaxnerf.core.types import TableLevel, Vector
-from jaxnerf.registry import FIELDS
+from jaxnerf.core.types import Vector
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
 
@@ -29,7 +28,7 @@ class Field(NamedTuple):
             [..., S, 3] in [0, 1]). A field may take `key` and `density_noise` as keywords, see `mlp_field`.
         input_layers: keys of params: the layers that receive the position; empty: all layers. A field is dead
             if no gradient reaches these layers; training then reinitializes it.
-        levels: of the parameter "table" of a hash grid, for regularizers; empty without one.
+        regularizers: by the name of a registered loss, the function (params) -> scalar; see `register_loss`.
         color_layers: keys of params: the first layers that serve colour alone; empty: not checked. A field is dead,
             too, if no gradient reaches these layers.
     """
@@ -37,22 +36,8 @@ class Field(NamedTuple):
     init: Callable[[jax.Array], Any]
     apply: Callable[..., tuple[jax.Array, jax.Array]]
     input_layers: tuple[str, ...] = ()
-    levels: tuple[TableLevel, ...] = ()
+    regularizers: Mapping[str, Callable[[Any], jax.Array]] = {}
     color_layers: tuple[str, ...] = ()
-
-
-def make_field(name: str, options: Mapping[str, Any], box: Box | None) -> Field:
-    """Makes a field by its registered name.
-
-    Args:
-        name: "mlp", "hash_grid", or a name that was given to `register_field`.
-        options: of that field.
-        box: of the scene, in world units; None where the run has none.
-
-    Raises:
-        ValueError: if there is no field of that name, or its options are wrong.
-    """
-    return FIELDS.get(name)(dict(options), box)
 
 
 def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:

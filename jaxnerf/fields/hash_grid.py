@@ -1,9 +1,11 @@
 """The hash grid: features at the vertices of several levels, decoded by two small networks."""
 
+import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +15,11 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.safe_math import clamp
-from jaxnerf.core.types import TableLevel, Vector, check_shapes
+from jaxnerf.core.types import Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network
 from jaxnerf.fields.mlp import Dense
+from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
+from jaxnerf.registry import Loss, Part
 
 _glorot = linen.initializers.glorot_uniform()
 
@@ -24,6 +28,117 @@ _PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, E
 _LARGEST_EXPONENT = 15.0  # a density that is opaque within 1e-5 world units
 # The sigmoid has this slope at this logit, where its value is 0.001 from 1: a quarter of an 8-bit level.
 _END_SLOPE, _END_LOGIT = 1e-3, 6.9
+
+
+_MAX_LEVELS = _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
+_FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of the last of four levels
+# Contracted space, whose box is larger, gets one level more, and so do fine occupancy grids and images of at least
+# _FIVE_LEVELS_SIDE px a side.
+_LEVELS, _FIVE_LEVELS_SIDE = 4, 600
+# Rows of a level per pixel of an image's side; finer images show what collisions of the hash cost.
+_ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
+_LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
+# A larger table and wider networks take little time on an accelerator: each gained 0.3 dB for lego at 800 x 800 on an
+# H200 (docs/guides/accelerators.md).
+_CPU_WIDTH, _ACCELERATOR_WIDTH, _ACCELERATOR_ROWS = 64, 128, 4
+
+
+class TableLevel(NamedTuple):
+    """A level of the table of a hash grid.
+
+    Attributes:
+        size: vertices along x, y and z.
+        rows: range of the table's rows; fewer than vertices where the level is hashed.
+    """
+
+    size: tuple[int, int, int]
+    rows: range
+
+
+def _wrong_levels(levels):
+    right = 0 < len(levels) <= _MAX_LEVELS and all(isinstance(each, int) and 2 <= each <= 2**20 for each in levels)
+    return None if right else f"1 to {_MAX_LEVELS} whole numbers, each from 2 to 2^20"
+
+
+@dataclasses.dataclass(frozen=True)
+class HashGridOptions(Options):
+    """The options of the hash grid."""
+
+    resolutions: tuple[int, ...] = option(
+        "auto", "vertices along the longest side, one number per level", auto=True, check=_wrong_levels
+    )
+    features_per_level: int = option(4, "features of a vertex", range=at_least(1))
+    table_size: int = option(
+        2**17,
+        "maximal rows per level; a level with more vertices is hashed. auto: 2^17 to 2^20, in proportion to an "
+        "image's side; four times as many on an accelerator",
+        range=at_least(1),
+        auto=True,
+    )
+    width: int = option(
+        64,
+        "outputs of a hidden layer of the density network; auto: 64 on a CPU, 128 on an accelerator",
+        range=at_least(1),
+        auto=True,
+    )
+    geometry_features: int = option(
+        15, "outputs of the density network that the colour network reads", range=at_least(0)
+    )
+    view_depth: int = option(2, "hidden layers of the colour network", range=between(0, _MAX_LAYERS))
+    view_width: int = option(128, "outputs of such a layer; auto: as width", range=at_least(1), auto=True)
+    use_viewdirs: bool = option(True, "whether colour depends on the direction")
+    feature_scale: float = option(
+        4.0, "features are table entries times this; it scales the table's learning rate", range=POSITIVE
+    )
+    compute_dtype: str = option(
+        "auto",
+        "type of the numbers in the networks' layers; all else is float32",
+        choices=tuple(_COMPUTE_DTYPES),
+        auto=True,
+        changes=Changes.SPEED | Changes.IMAGES,
+    )
+
+    def resolve(self, facts: Facts, device: Device) -> tuple["HashGridOptions", list[str]]:
+        """Infers levels from the detail that images resolve, rows from their size, and widths from the device."""
+        more = int(facts.contracted or facts.has_fine_cells or facts.side >= _FIVE_LEVELS_SIDE)
+        vertices = min(max(facts.detail, _FINEST[0]), _FINEST[1] << more)
+        levels = tuple(max(vertices // 2**level, 2) for level in reversed(range(_LEVELS + more)))
+        rows = 2 ** round(math.log2(min(max(_ROWS_PER_PIXEL * facts.side, _MIN_ROWS), _MAX_ROWS)))
+        rows, width = (rows, _CPU_WIDTH) if device.is_cpu else (_ACCELERATOR_ROWS * rows, _ACCELERATOR_WIDTH)
+        size = f"{facts.side:.0f} x {facts.side:.0f} px"
+        per_layer = f"hash grid     {width} outputs per hidden layer of the {{}} network, for this device"
+        return infer(
+            self,
+            resolutions=(levels, f"hash grid     {levels} vertices along the longest side"),
+            table_size=(rows, f"hash grid     at most {rows:,} rows per level, for images of about {size}"),
+            width=(width, per_layer.format("density")),
+            view_width=(width, per_layer.format("colour")),
+        )
+
+    def resolve_for_device(self, device: Device) -> tuple["HashGridOptions", list[str]]:
+        """Infers the precision of the layers."""
+        dtype = "float32" if device.is_cpu else "bfloat16"
+        line = f"precision     {dtype} in the layers of the hash grid's networks, for this device"
+        return infer(self, compute_dtype=(dtype, line))
+
+    def bytes_needed(self) -> dict[str, float]:
+        """Returns those of parameters, gradients and the optimizer, at least."""
+        table, width, view_width = (
+            1 if is_auto(value) else value for value in (self.table_size, self.width, self.view_width)
+        )
+        levels = None if is_auto(self.resolutions) else self.resolutions
+        rows = table if levels is None else sum(min(table, level**3) for level in levels)
+        inputs = self.features_per_level * len(levels or [1])
+        return {
+            "table_size": 16 * rows * self.features_per_level,
+            "width": 16 * width * (inputs + 1 + self.geometry_features),
+            "view_width": 16 * view_width * view_width * max(self.view_depth - 1, 0),
+        }
+
+    @property
+    def is_large(self) -> bool:
+        """Whether an update of the table takes as long as half of the rays of a step."""
+        return self.table_size >= _LARGE_TABLE
 
 
 def hash_grid_field(**options: Any) -> Field:
@@ -57,22 +172,24 @@ def hash_grid_field(**options: Any) -> Field:
         return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), color_activation(rgb)
 
     color_layers = ("view_0",) if network.view_depth else ("rgb",)
-    return Field(init, apply, levels=network.levels(), color_layers=color_layers)
+    regularizers = {
+        name: functools.partial(function, levels=network.levels())
+        for name, function in (("hash_decay", hash_decay), ("total_variation", total_variation))
+    }
+    return Field(init, apply, regularizers=regularizers, color_layers=color_layers)
 
 
-def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
-    """Makes the field "hash_grid" from a section of a config, in the scene's box."""
-    resolutions = options["resolutions"]
-    if box is None or isinstance(resolutions, str):
+def from_options(options: HashGridOptions, box: Box | None) -> Field:
+    """Makes the field "hash_grid" from its options, in the scene's box."""
+    if box is None:
         raise ValueError(
-            "hash_grid.resolutions or the box of occupancy.lower and occupancy.upper is 'auto'; resolve the "
-            "config against a dataset, or set them"
+            "the box of occupancy.lower and occupancy.upper is 'auto'; resolve the config against a dataset, or set it"
         )
-    name = options.get("compute_dtype", "float32")  # configs of older versions lack it
-    if name not in _COMPUTE_DTYPES:
-        raise ValueError(f"hash_grid.compute_dtype is {name!r}, expected one of {sorted(_COMPUTE_DTYPES)}; correct it")
-    options = {**options, "compute_dtype": _COMPUTE_DTYPES[name]}
-    return hash_grid_field(lower=box[0], upper=box[1], **options)
+    values = {**dataclasses.asdict(options), "compute_dtype": _COMPUTE_DTYPES[options.compute_dtype]}
+    return hash_grid_field(lower=box[0], upper=box[1], **values)
+
+
+FIELD = Part(from_options, HashGridOptions)
 
 
 @jax.custom_jvp
@@ -291,6 +408,55 @@ def _first_product_jvp(primals, tangents):
         return jnp.einsum("df,dn->fn", kernel, features)
 
     return product(kernel, features), product(tangents[0], features) + product(kernel, change)
+
+
+def hash_decay(params: Mapping[str, Any], *, levels: Sequence[TableLevel]) -> Float[Array, ""]:
+    """Computes the mean over levels of the mean square of a level's table entries (arXiv:2304.06706, Section 3.2).
+
+    The mean of each level has the same weight, so an entry of a coarse level is pulled towards 0 more strongly than
+    one of a fine level, which fewer samples reach.
+
+    Args:
+        params: of the field.
+        levels: of the table.
+    """
+    table = params["table"]
+    each = [jnp.full(len(level.rows), 1 / len(level.rows)) for level in levels]
+    return jnp.concatenate(each) @ (table**2).mean(axis=-1) / len(levels)
+
+
+def total_variation(params: Mapping[str, Any], *, levels: Sequence[TableLevel]) -> Float[Array, ""]:
+    """Computes the mean squared difference of neighbouring vertices' features, summed over axes (arXiv:2112.05131).
+
+    Only levels with a row for each vertex count, with the same weight each; the neighbours in a hashed level share
+    their rows with vertices elsewhere. Such levels have at most table_size rows, so all of them are evaluated.
+
+    Args:
+        params: of the field.
+        levels: of the table.
+
+    Returns:
+        A number; 0 if all levels are hashed.
+    """
+    table = params["table"]
+    dense = [level for level in levels if len(level.rows) == math.prod(level.size)]
+    total = jnp.zeros(())
+    for level in dense:
+        vertices = table[level.rows.start : level.rows.stop].reshape(*level.size, -1)
+        total += sum((jnp.diff(vertices, axis=axis) ** 2).mean() for axis in range(3))
+    return total / max(len(dense), 1)
+
+
+HASH_DECAY = Loss(
+    None,
+    on="field",
+    help="mean square of the entries of each level of the hash grid (arXiv:2304.06706)",
+)
+TOTAL_VARIATION = Loss(
+    None,
+    on="field",
+    help="mean squared difference of neighbouring vertices in the levels of the hash grid that are not hashed",
+)
 
 
 def harmonics(directions: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 9"]:

@@ -1,6 +1,7 @@
 """The paper's network: a multilayer perceptron on encoded positions and directions (Fig. 7)."""
 
-from collections.abc import Mapping
+import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -12,8 +13,50 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.encoding import encode_planes
 from jaxnerf.core.sampling import normal
 from jaxnerf.fields.base import Box, Field, apply_network
+from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, option
+from jaxnerf.registry import Part
+
+_MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
+_MAX_OCTAVES = 64  # of encoding.positional_encoding
+_PIXELS_PER_WAVE = 4  # length of the shortest wave of the encoding
 
 DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
+
+
+@dataclasses.dataclass(frozen=True)
+class MlpOptions(Options):
+    """The options of the paper's network (Fig. 7): 595,844 parameters."""
+
+    depth: int = option(8, "layers before the density", range=between(1, _MAX_LAYERS))
+    width: int = option(256, "outputs of a layer", range=at_least(1))
+    skip_layer: int = option(
+        4, "index of the layer after which the encoded position is concatenated again", range=at_least(0)
+    )
+    view_width: int = option(128, "outputs of the layer that takes the direction", range=at_least(1))
+    num_freqs: int = option(10, "octaves of the position's encoding", range=between(0, _MAX_OCTAVES), auto=True)
+    num_view_freqs: int = option(4, "octaves of the direction's encoding", range=between(0, _MAX_OCTAVES))
+    encode: bool = option(True, "whether position and direction have a positional encoding")
+    use_viewdirs: bool = option(True, "whether colour depends on the direction")
+    density_activation: str = option("relu", "activation of the density", choices=tuple(sorted(DENSITY_ACTIVATIONS)))
+    density_bias: float = option(0.0, "added to the density before its activation")
+    compute_dtype: str = option(
+        "float32", "type of the numbers in the layers; `float64` requires JAX_ENABLE_X64=1", choices=DTYPES
+    )
+
+    def resolve(self, facts: Facts, device: Device) -> tuple["MlpOptions", list[str]]:
+        """Infers the octaves from the size of a pixel."""
+        octaves = 1 + math.log2(2 * math.pi / (_PIXELS_PER_WAVE * facts.footprint))
+        octaves = min(max(round(octaves), 1), 16)
+        line = f"octaves       {octaves} in {{section}}; the shortest wave is four pixels long"
+        return infer(self, num_freqs=(octaves, line))
+
+    def check(self) -> None:
+        if self.compute_dtype == "float64" and not jax.config.jax_enable_x64:
+            raise ValueError("compute_dtype is 'float64', which requires the environment's JAX_ENABLE_X64=1")
+
+    def bytes_needed(self) -> dict[str, float]:
+        """Returns those of parameters, gradients and the optimizer, at least."""
+        return {"width": 16 * self.width * (self.width * self.depth + self.view_width)}
 
 
 def mlp_field(**options: Any) -> Field:
@@ -53,10 +96,13 @@ def mlp_field(**options: Any) -> Field:
     return Field(init, apply, tuple(f"trunk_{layer}" for layer in layers), color_layers=color_layers)
 
 
-def from_options(options: Mapping[str, Any], box: Box | None) -> Field:
-    """Makes the field "mlp" from a section of a config; it needs no box."""
+def from_options(options: MlpOptions, box: Box | None) -> Field:
+    """Makes the field "mlp" from its options; it needs no box."""
     del box
-    return mlp_field(**{**options, "compute_dtype": jnp.dtype(options["compute_dtype"])})
+    return mlp_field(**{**dataclasses.asdict(options), "compute_dtype": jnp.dtype(options.compute_dtype)})
+
+
+FIELD = Part(from_options, MlpOptions)
 
 
 class MLP(linen.Module):

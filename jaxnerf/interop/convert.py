@@ -1,6 +1,5 @@
 """Converts published weights into a workdir, which can be scored, rendered and trained further."""
 
-import copy
 import dataclasses
 import json
 import os
@@ -11,15 +10,15 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import optax
-from ml_collections import ConfigDict
 
 from jaxnerf.data import dataset
 from jaxnerf.interop.published_weights import Network, read_weights
+from jaxnerf.options import is_auto
 from jaxnerf.runtime import atomic_files
-from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.training import auto_config, build, workdir
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config import Config, RunConfig, changed, read_config
 from jaxnerf.training.state import create_state
 
 # The fields of a network's section that set the rows and the columns of a layer.
@@ -33,7 +32,7 @@ _HEADS = ("bottleneck", "view", "density", "rgb")
 
 def convert(
     files: Sequence[str | os.PathLike],
-    config: ConfigDict,
+    config: Config,
     workdir: str | os.PathLike,
     *,
     legacy_posenc_order: bool = False,
@@ -59,11 +58,12 @@ def convert(
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise ValueError(f"{folder}: exists and is not an empty folder; give a new --workdir")
     published = read_weights(paths, legacy_posenc_order=legacy_posenc_order)
+    config = read_config(config)
     build.check_released(config, published.origin)
     config = _resolved(config)
     experiment = build.build(config)
     # Only shapes count: drawing initial parameters would take longer than everything else.
-    like = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, experiment.seed))
+    like = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, config.seed))
     params = _params(published.networks, like.params, ", ".join(map(str, paths)))
     origin = {
         "origin": published.origin,
@@ -76,15 +76,14 @@ def convert(
     return f"{published.origin}, step {published.step}: {names} network, written to {folder}"
 
 
-def _resolved(config: ConfigDict) -> ConfigDict:
+def _resolved(config: RunConfig) -> RunConfig:
     """Returns the config resolved against its dataset, or as far as possible if there is no dataset."""
     try:
         if config.data.format != "synthetic":
             dataset.dataset_folder(config.data.dir)
     except ValueError:
-        config = copy.deepcopy(config)
-        if is_auto(config.data.background_color):
-            config.data.background_color = ()  # as it is inferred for all models without an occupancy grid
+        if is_auto(config.data.background_color):  # as it is inferred for all models without an occupancy grid
+            return changed(config, {"data.background_color": ()})
         return config
     return auto_config.resolve(config).config
 

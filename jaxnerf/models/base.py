@@ -1,62 +1,104 @@
 """The interface of models: a sampler places samples along rays and renders a run's fields there."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 
-from jaxnerf.core.types import Rendering, SceneFn
-from jaxnerf.fields.base import Field
+from jaxnerf.core.types import Background, Rendering, SceneFn
+from jaxnerf.fields.base import Box, Field
 from jaxnerf.models.grid_schedule import GridSchedule
-from jaxnerf.registry import SAMPLERS
+from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
+
+_SAMPLE_MULTIPLIER = 1.5  # samples of images over those of training: no jitter averages over a step in rendering
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewOptions(Options):
+    """The options of images: how a trained model renders them."""
+
+    chunk: int = option("auto", "rays per rendered chunk", range=at_least(1), auto=True, changes=Changes.SPEED)
+    sample_multiplier: float = option(
+        1.0,
+        "samples per ray of images, divided by those of training; auto: 1.5",
+        range=POSITIVE,
+        auto=True,
+        changes=Changes.IMAGES,
+    )
+    bake_occupancy: bool = option(
+        False,
+        "whether a model that was trained without an occupancy grid renders with one, of its visible density",
+        changes=Changes.IMAGES,
+    )
+    early_stop_eps: float = option(
+        1e-3,
+        "with a grid: the transmittance below which a ray is terminated",
+        range=BELOW_ONE,
+        changes=Changes.IMAGES,
+    )
+    max_samples: int = option(
+        "auto", "with a grid: size of the sample buffer", range=at_least(1), auto=True, changes=Changes.SPEED
+    )
+
+    def resolve(self, facts: Facts, device: Device) -> tuple["ViewOptions", list[str]]:
+        """Infers the number of samples."""
+        line = f"images        {_SAMPLE_MULTIPLIER:g} times the samples of training"
+        return infer(self, sample_multiplier=(_SAMPLE_MULTIPLIER, line))
+
+    def resolve_for_device(self, device: Device) -> tuple["ViewOptions", list[str]]:
+        """Infers sizes that keep the device busy, and activations in the cache of a CPU."""
+        samples = 2**10 if device.is_cpu else 2**17
+        return infer(
+            self,
+            max_samples=(samples, f"images        {samples} samples per batch, for this device"),
+            chunk=(device.chunk, f"images        {device.chunk} rays per chunk, for this device"),
+        )
 
 
 class Model(NamedTuple):
     """Pure functions of parameters, an occupancy grid (None if the model has none) and rays.
 
     Attributes:
-        init: key -> params, a dict with an entry for each network. "fine" is the network of the final rendering.
-        render: (keys [B], params, grid, Rays [B], step) -> Renderings [B] for training, that of "fine" last.
-            They carry weights and samples, for losses.
+        init: key -> params, a dict with an entry for each network.
+        render: (keys [B], params, grid, Rays [B], step) -> for training, a dict with the Rendering [B] of each
+            network. They carry weights and samples, for losses.
         view: (params, grid, Rays [...]) -> Rendering [...] without weights and samples, for images. With
             median_depth=True it has a median depth; a sampler whose images need none may lack that argument.
         scene: (params, grid) -> the scene of the final rendering.
         samples_per_ray: approximate number of evaluations of the largest network per ray in training.
+        fields: by network, the Field that has its parameters.
+        image_networks: the networks whose renderings are compared with the colours of the batch, that of the final
+            rendering last. Others, which may only propose samples, need a loss of their own.
         grid_schedule: how the occupancy grid is created and updated; None without one.
-        input_layers, color_layers: by network, see `Field`.
         cull: (grid, Rays [...], median_depth=False) -> bool [...], which rays may hit an occupied cell, and the
             Rendering [...] of those that cannot; None where all may.
     """
 
     init: Callable[[jax.Array], Any]
-    render: Callable[..., tuple[Rendering, ...]]
+    render: Callable[..., dict[str, Rendering]]
     view: Callable[..., Rendering]
     scene: Callable[..., SceneFn]
     samples_per_ray: float
+    fields: Mapping[str, Field] = {}
+    image_networks: tuple[str, ...] = ("fine",)
     grid_schedule: GridSchedule | None = None
-    input_layers: Mapping[str, tuple[str, ...]] = {}
     cull: Callable[..., tuple] | None = None
-    color_layers: Mapping[str, tuple[str, ...]] = {}
 
 
 class SamplerContext(NamedTuple):
-    """The parts of a resolved config from which a sampler makes a model.
+    """What a sampler makes a model from.
 
     Attributes:
-        make_field: name of a network ("fine" or "coarse") -> its Field.
-        sections: the config's sections as plain dicts, by name.
+        options: of the sampler: an instance of its registered class, or the section of its name as a dict.
+        make_field: name of a network ("fine" or "coarse") -> its Field, as the config describes it.
+        view: the options of images.
         background: [3] colour behind the scene; None: black.
+        box: lower and upper corner of what the run renders, world units; None where the run has none.
     """
 
+    options: Any
     make_field: Callable[[str], Field]
-    sections: Mapping[str, Mapping[str, Any]]
-    background: tuple[float, float, float] | None
-
-
-def make_model(sampler: str, context: SamplerContext) -> Model:
-    """Makes a model by the registered name of its sampler.
-
-    Raises:
-        ValueError: if there is no sampler of that name, or it cannot do what a section asks for.
-    """
-    return SAMPLERS.get(sampler)(context)
+    view: ViewOptions
+    background: Background | None
+    box: Box | None

@@ -1,5 +1,6 @@
 """The paper's sampler: a coarse network guides the samples of a fine one (Section 5.2 of arXiv:2003.08934)."""
 
+import dataclasses
 import functools
 import inspect
 from collections.abc import Mapping
@@ -11,57 +12,73 @@ from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import Background, without_samples
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model, SamplerContext
+from jaxnerf.options import Options, at_least, option
+from jaxnerf.registry import Part
+
+
+@dataclasses.dataclass(frozen=True)
+class HierarchicalOptions(Options):
+    """The options of the sampler "hierarchical"."""
+
+    num_coarse: int = option(64, "samples per ray for the coarse network", range=at_least(1))
+    num_fine: int = option(
+        128, "additional samples per ray for the fine network; 0: no coarse network", range=at_least(0)
+    )
+    rule: str = option(
+        "segments",
+        "quadrature: `gauss` takes pairs and has fourth order, `points` is the paper's",
+        choices=("segments", "gauss", "points"),
+    )
+    in_disparity: bool = option(False, "whether coarse samples have equal steps of 1 / t")
+    stratified: bool = option(True, "whether training draws its samples at random; images have fixed positions")
+    importance_padding: float = option(0.0, "added to the coarse weights before importance sampling", range=at_least(0))
+    density_noise: float = option(
+        0.0, "standard deviation of the noise on the density in training", unit="1 / world unit", range=at_least(0)
+    )
 
 
 def from_context(context: SamplerContext) -> Model:
-    """Makes the model that the section `sampling` describes; with `num_fine` 0 it has one network, "fine"."""
-    sampling = dict(context.sections["sampling"])
-    if sampling["rule"] not in ("segments", "gauss", "points"):
-        raise ValueError(f"sampling.rule is {sampling['rule']!r}, expected 'segments', 'gauss' or 'points'")
-    names = ("coarse", "fine") if sampling["num_fine"] else ("fine",)
+    """Makes the model that the options describe; with `num_fine` 0 it has one network, "fine"."""
+    names = ("coarse", "fine") if context.options.num_fine else ("fine",)
+    fields = {name: context.make_field(name) for name in names}
     return hierarchical_model(
-        {name: context.make_field(name) for name in names},
+        fields,
+        context.options,
         background=context.background,
-        sample_multiplier=context.sections["eval"]["sample_multiplier"],
-        **sampling,
+        sample_multiplier=context.view.sample_multiplier,
     )
+
+
+SAMPLER = Part(from_context, HierarchicalOptions, section="sampling")
 
 
 def hierarchical_model(
     fields: Mapping[str, Field],
+    sampling: HierarchicalOptions,
     *,
-    num_coarse: int,
-    num_fine: int,
-    rule: str,
-    in_disparity: bool,
-    importance_padding: float,
-    density_noise: float,
     background: Background | None,
-    stratified: bool = True,
     sample_multiplier: float = 1.0,
 ) -> Model:
     """Makes the paper's model from the fields "coarse" and "fine", or from "fine" alone where num_fine is 0.
 
     Args:
         fields: Field by name.
-        density_noise: 1 / world unit, standard deviation of the noise on the density in training.
-        stratified: whether training draws its samples at random; otherwise they have fixed positions, as in
-            images.
+        sampling: see also `render_hierarchical`.
+        background: see `render_hierarchical`.
         sample_multiplier: samples per ray of images over those of training.
-        num_coarse, num_fine, rule, in_disparity, importance_padding, background: see `render_hierarchical`.
 
     Raises:
         ValueError: if density_noise is set and a field takes no noise.
     """
-    options = {"rule": rule, "in_disparity": in_disparity, "background": background}
+    options = {"rule": sampling.rule, "in_disparity": sampling.in_disparity, "background": background}
     for name, field in fields.items():
         parameters = inspect.signature(field.apply).parameters
         takes_noise = "density_noise" in parameters or any(
             parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()
         )
-        if density_noise and not takes_noise:
+        if sampling.density_noise and not takes_noise:
             raise ValueError(
-                f"sampling.density_noise is {density_noise}, and the {name} field takes no noise; set it to 0"
+                f"sampling.density_noise is {sampling.density_noise}, and the {name} field takes no noise; set it to 0"
             )
 
     def init(key):
@@ -70,7 +87,7 @@ def hierarchical_model(
 
     def render(keys, params, grid, rays, step, multiplier=1.0, median_depth=False):
         del grid, step
-        noise = density_noise if keys is not None else 0.0
+        noise = sampling.density_noise if keys is not None else 0.0
         keys, *noise_keys = split_key(keys, 1 + len(fields)) if noise else (keys, *[None] * len(fields))
         scenes = [
             functools.partial(
@@ -78,18 +95,19 @@ def hierarchical_model(
             )
             for (name, field), noise_key in zip(fields.items(), noise_keys, strict=True)
         ]
-        keys = keys if stratified else None
+        keys = keys if sampling.stratified else None
         first, more = (
             max(2, 2 * round(number * multiplier / 2)) if multiplier != 1 else number
-            for number in (num_coarse, num_fine)
+            for number in (sampling.num_coarse, sampling.num_fine)
         )
         if len(scenes) == 1:
-            return (render_rays(keys, *scenes, rays, num_samples=first, median_depth=median_depth, **options),)
-        counts = {"num_coarse": first, "num_fine": more, "importance_padding": importance_padding}
-        return render_hierarchical(keys, *scenes, rays, median_depth=median_depth, **counts, **options)
+            return {"fine": render_rays(keys, *scenes, rays, num_samples=first, median_depth=median_depth, **options)}
+        counts = {"num_coarse": first, "num_fine": more, "importance_padding": sampling.importance_padding}
+        renderings = render_hierarchical(keys, *scenes, rays, median_depth=median_depth, **counts, **options)
+        return dict(zip(fields, renderings, strict=True))
 
     def view(params, grid, rays, median_depth=False):
-        return without_samples(render(None, params, grid, rays, None, sample_multiplier, median_depth)[-1])
+        return without_samples(render(None, params, grid, rays, None, sample_multiplier, median_depth)["fine"])
 
     def scene(params, grid):
         del grid
@@ -100,7 +118,7 @@ def hierarchical_model(
         render=render,
         view=view,
         scene=scene,
-        samples_per_ray=num_coarse + num_fine,
-        input_layers={name: field.input_layers for name, field in fields.items()},
-        color_layers={name: field.color_layers for name, field in fields.items()},
+        samples_per_ray=sampling.num_coarse + sampling.num_fine,
+        fields=fields,
+        image_networks=tuple(fields),
     )

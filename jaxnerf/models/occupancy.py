@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,62 +17,205 @@ from jaxnerf.core.occupancy.ray_culling import rays_may_hit, render_background
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import Background, Rays, Rendering, SceneFn
 from jaxnerf.fields.base import Field
-from jaxnerf.models.base import Model, SamplerContext
+from jaxnerf.models.base import Model, SamplerContext, ViewOptions
 from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
+from jaxnerf.options import (
+    FRACTION,
+    POSITIVE,
+    Changes,
+    Device,
+    Facts,
+    Options,
+    at_least,
+    between,
+    infer,
+    is_auto,
+    numbers,
+    option,
+)
+from jaxnerf.registry import Part
 
 _SMALLEST_EPS = 1e-30  # replaces an early_stop_eps of 0: below this transmittance no light is left
+_DETAIL = (32, 256)  # fewest and most of the smallest details along the longest side that a grid follows
+_MAX_STEPS = 144  # along the longest side: finer images need finer features rather than finer steps
+# But a step is at most as long as a cell, since training skips cells in which no step has its middle. With more than
+# _MAX_RESOLUTION cells it is a little shorter, which gains 0.1 dB at 400 px.
+_FINE_STEPS_PER_CELL = 1.125
+_MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
+_FINE_RESOLUTION = 256  # where alpha empties most of them; a cell then holds two of the smallest details
+_MAX_OPEN_RESOLUTION = 96  # where nothing empties cells before training, so that all of them are updated
+_MAX_STEPS_PER_SIDE = 2**16  # of any step size, through the box
+_ACCELERATOR_SAMPLES = 2**18  # of a step, which keep an accelerator busy; as in arXiv:2201.05989
+_POOL = between(0.01, 100_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class OccupancyOptions(Options):
+    """The options of the sampler "occupancy"; the box also bounds the hash grid."""
+
+    use_alpha: bool = option(
+        True, "whether cells outside the visual hull of the alpha channels are empty from the start"
+    )
+    contracted: bool = option(
+        "auto",
+        "whether the box holds all of space; positions outside its inner half are then contracted",
+        auto=True,
+    )
+    lower: tuple[float, ...] = option("auto", "a corner of the box", unit="world units", auto=True, check=numbers(3))
+    upper: tuple[float, ...] = option(
+        "auto", "the opposite corner of the box", unit="world units", auto=True, check=numbers(3)
+    )
+    step_size: float = option("auto", "distance of samples", unit="world units", range=POSITIVE, auto=True)
+    resolution: int = option("auto", "cells along the longest side", range=at_least(1), auto=True)
+    threshold: float = option(0.01, "opacity over one step below which a cell is empty", range=at_least(0))
+    update_every: int = option(64, "training steps between updates of the grid", range=at_least(1))
+    cells_per_update: int = option(2**18, "cells whose density an update evaluates", range=at_least(1))
+    update_chunk: int = option(
+        "auto", "cells of these evaluated at once", range=at_least(1), auto=True, changes=Changes.SPEED
+    )
+    pool_samples_per_ray: float = option(
+        10.0,
+        "size of the sample buffer in training, divided by the number of rays. auto: on a CPU "
+        "`cpu_pool_samples_per_ray`; on an accelerator, which a larger buffer keeps busy, up to twice as much",
+        range=_POOL,
+        auto=True,
+    )
+    cpu_pool_samples_per_ray: float = option(10.0, "see `pool_samples_per_ray`", range=_POOL, changes=Changes.NOTHING)
+    uniform_fraction: float = option(
+        0.4,
+        "If the samples of all rays do not fit into the buffer, the rays with most samples get fewer: this fraction "
+        "of them evenly, the others where the grid expects the rays to end.",
+        range=FRACTION,
+    )
+    max_optical_depth: float = option(
+        6.0, "training skips samples behind it, as estimated by the grid; 0: off", range=at_least(0)
+    )
+    occlusion_start_step: int = option(400, "training step from which `max_optical_depth` applies", range=at_least(0))
+    min_views: int = option(
+        "auto", "training views that must see a cell; other cells are empty; 0: no limit", range=at_least(0), auto=True
+    )
+
+    def resolve(self, facts: Facts, device: Device) -> tuple["OccupancyOptions", list[str]]:
+        """Infers the box, its cells and the step from what cameras and images show, the buffer from the device."""
+        contraction = f"contraction   {'on' if facts.contracted else 'off'}: {facts.contraction_reason}"
+        box = f"box           {_point(facts.lower)} to {_point(facts.upper)}, {facts.box_reason}"
+        options, lines = infer(
+            self,
+            contracted=(facts.contracted, contraction),
+            lower=(facts.lower, box),
+            upper=(facts.upper, "" if is_auto(self.lower) else box),
+            min_views=(int(facts.fills_space), "valid cells   those that a training view sees" * facts.fills_space),
+            resolution=_resolution(facts),
+        )
+        options, more = infer(options, step_size=_step_size(facts, options.resolution))
+        lines += more
+        if facts.batch_size:
+            samples = options._samples_per_ray
+            if not device.is_cpu:
+                samples = float(min(max(_ACCELERATOR_SAMPLES / facts.batch_size, samples), 2 * samples))
+            used = facts.sampler == "occupancy"
+            line = f"batch         at most {samples:g} samples per ray on average" * used
+            options, more = infer(options, pool_samples_per_ray=(samples, line))
+            lines += more
+        return options, lines
+
+    def resolve_for_device(self, device: Device) -> tuple["OccupancyOptions", list[str]]:
+        """Infers how many cells an update evaluates at once."""
+        # On a CPU a little under a power of two, so that activations do not collide in the cache.
+        cells = 8160 if device.is_cpu else 2**18
+        line = f"grid          {cells} cells evaluated at once in an update, for this device"
+        return infer(self, update_chunk=(cells, line))
+
+    def check(self) -> None:
+        if is_auto(self.lower) or is_auto(self.upper) or is_auto(self.step_size):
+            return
+        longest = max(self._sides)
+        if longest > _MAX_STEPS_PER_SIDE * self.step_size:
+            raise ValueError(
+                f"step_size is {self.step_size}, expected at least {longest / _MAX_STEPS_PER_SIDE:.3g}: the "
+                f"longest side of the box, {longest:.3g}, in at most {_MAX_STEPS_PER_SIDE:,} steps; correct it"
+            )
+
+    def bytes_needed(self) -> dict[str, float]:
+        """Returns those of the grid."""
+        sides = (1.0, 1.0, 1.0) if is_auto(self.lower) or is_auto(self.upper) else self._sides
+        if is_auto(self.resolution) or min(sides) <= 0:
+            return {}
+        return {"resolution": 10 * self.resolution**3 * math.prod(sides) / max(sides) ** 3}
+
+    def busy_rays(self, device: Device) -> int | None:
+        """Returns as many rays as fill the buffer of an accelerator."""
+        if device.is_cpu:
+            return None
+        return 2 ** max(math.floor(math.log2(_ACCELERATOR_SAMPLES / self._samples_per_ray)), 0)
+
+    def rays_per_chunk(self, device: Device) -> int:
+        """Returns as many rays as fill the buffer, and not much more than a small image needs."""
+        return 2**13 if device.is_cpu else 2**16
+
+    @property
+    def _samples_per_ray(self):
+        pool = self.pool_samples_per_ray
+        return self.cpu_pool_samples_per_ray if is_auto(pool) else pool
+
+    @property
+    def _sides(self):
+        return [high - low for low, high in zip(self.lower, self.upper, strict=True)]
+
+
+def _resolution(facts):
+    """Returns cells along the longest side, and the line that reports them."""
+    is_open = not (facts.has_alpha or facts.contracted or facts.ndc)
+    cells = min(min(max(facts.detail, _DETAIL[0]), _DETAIL[1]), _MAX_OPEN_RESOLUTION if is_open else _MAX_RESOLUTION)
+    if facts.has_fine_cells:
+        cells = min(facts.detail // 2, _FINE_RESOLUTION)
+    return cells, f"grid          {cells} cells along the longest side"
+
+
+def _step_size(facts, resolution):
+    """Returns the step for so many cells, and the line that reports it."""
+    per_cell = _FINE_STEPS_PER_CELL if resolution > _MAX_RESOLUTION else 1
+    finest = min(max(facts.detail, _DETAIL[0]), _DETAIL[1])
+    step = facts.longest / max(min(finest, _MAX_STEPS), per_cell * resolution)
+    return step, f"step size     {step:.4g}; a pixel covers {facts.footprint:.4g} world units"
+
+
+def _point(point):
+    return "(" + ", ".join(f"{value:.2f}" for value in point) + ")"
 
 
 def from_context(context: SamplerContext) -> Model:
-    """Makes the model that the section `occupancy` describes."""
-    section, sampling = context.sections["occupancy"], context.sections["sampling"]
-    if sampling["density_noise"]:
-        raise ValueError(
-            f"sampling.density_noise is {sampling['density_noise']} and the sampler 'occupancy', which adds no "
-            "noise; set it to 0, or use the sampler 'hierarchical'"
-        )
-    if not sampling["stratified"]:
-        raise ValueError(
-            "sampling.stratified is False and the sampler 'occupancy', which draws its samples; set it to True, "
-            "or use the sampler 'hierarchical'"
-        )
+    """Makes the model that the options describe."""
     field = context.make_field("fine")
-    return occupancy_model(
-        field,
-        schedule_from_section(section, field),
-        pool_samples_per_ray=section["pool_samples_per_ray"],
-        uniform_fraction=section.get("uniform_fraction", 1.0),
-        max_optical_depth=section["max_optical_depth"],
-        occlusion_start_step=section["occlusion_start_step"],
-        **view_options(context),
+    schedule = schedule_of(context.options, field)
+    return occupancy_model(field, schedule, context.options, context.view, background=context.background)
+
+
+SAMPLER = Part(from_context, OccupancyOptions, section="occupancy")
+
+
+def schedule_of(options: OccupancyOptions, field: Field | None) -> GridSchedule:
+    """Makes the GridSchedule that resolved options describe; field: None without updates."""
+    return make_grid_schedule(
+        options.lower,
+        options.upper,
+        resolution=options.resolution,
+        step_size=options.step_size,
+        field=field,
+        threshold=options.threshold,
+        update_every=options.update_every,
+        cells_per_update=options.cells_per_update,
+        contracted=options.contracted,
+        update_chunk=options.update_chunk,
     )
-
-
-def schedule_from_section(section: Mapping[str, Any], field: Field | None) -> GridSchedule:
-    """Makes the GridSchedule that a resolved section `occupancy` describes; field: None without updates."""
-    names = ("resolution", "step_size", "threshold", "update_every", "cells_per_update", "contracted", "update_chunk")
-    options = {name: section[name] for name in names if name in section}  # configs of older versions lack some
-    return make_grid_schedule(section["lower"], section["upper"], field=field, **options)
-
-
-def view_options(context: SamplerContext) -> dict[str, Any]:
-    """Returns the options of occupancy_model that concern images."""
-    names = ("early_stop_eps", "sample_multiplier", "max_samples")
-    section = context.sections["eval"]
-    return {name: section[name] for name in names} | {"background": context.background}
 
 
 def occupancy_model(
     field: Field,
     schedule: GridSchedule,
+    options: OccupancyOptions,
+    view: ViewOptions,
     *,
-    pool_samples_per_ray: float,
-    uniform_fraction: float,
-    max_optical_depth: float,
-    occlusion_start_step: int,
-    early_stop_eps: float,
-    sample_multiplier: float,
-    max_samples: int,
     background: Background | None,
 ) -> Model:
     """Makes the model of one field that is evaluated only in the occupied cells of its grid.
@@ -80,15 +223,9 @@ def occupancy_model(
     Args:
         field: any Field.
         schedule: of the occupancy grid.
-        pool_samples_per_ray: size of training's sample buffer over the number of rays. If the samples of all rays do
-            not fit, the rays with most samples get fewer, see `importance_samples`.
-        uniform_fraction: of training, see `importance_samples`.
-        max_optical_depth: training skips samples behind this optical depth, as estimated by the grid;
-            0: no limit.
-        occlusion_start_step: the training step from which max_optical_depth applies.
-        early_stop_eps: of images: transmittance below which a ray ends.
-        sample_multiplier: samples of images over those of training.
-        max_samples: of images: samples evaluated at once.
+        options: of training. If the samples of all rays do not fit into its buffer, the rays with most samples get
+            fewer, see `importance_samples`.
+        view: of images.
         background: see `render_samples`.
     """
 
@@ -96,26 +233,32 @@ def occupancy_model(
         return functools.partial(field.apply, params["fine"])
 
     def render(keys, params, grid, rays, step):
-        buffer = math.ceil(pool_samples_per_ray * rays.near.size)
+        buffer = math.ceil(options.pool_samples_per_ray * rays.near.size)
         fixed = jax.lax.stop_gradient(rays)  # where samples are has no gradient with respect to refined cameras
         limit = jnp.inf
-        if max_optical_depth:
-            limit = jnp.where(step < occlusion_start_step, jnp.inf, max_optical_depth)
+        if options.max_optical_depth:
+            limit = jnp.where(step < options.occlusion_start_step, jnp.inf, options.max_optical_depth)
         candidates = march_rays(None, grid, fixed, step_size=schedule.step_size, cell=schedule.cell)
-        options = {"max_samples": buffer, "uniform_fraction": uniform_fraction, "max_optical_depth": limit}
-        samples, occluded = importance_samples(keys, grid, fixed, candidates, **options)
+        samples, occluded = importance_samples(
+            keys,
+            grid,
+            fixed,
+            candidates,
+            max_samples=buffer,
+            uniform_fraction=options.uniform_fraction,
+            max_optical_depth=limit,
+        )
         rendering = render_placed(scene(params), rays, samples, longest=candidates.t.shape[-1])
-        return (_over_background(rendering, occluded, background),)
+        return {"fine": _over_background(rendering, occluded, background)}
 
     return Model(
         init=lambda key: {"fine": field.init(key)},
         render=render,
-        view=_view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background),
+        view=_view(scene, schedule, view, background),
         scene=lambda params, grid: mask_scene(scene(params), grid),
-        samples_per_ray=pool_samples_per_ray,
+        samples_per_ray=options.pool_samples_per_ray,
+        fields={"fine": field},
         grid_schedule=schedule,
-        input_layers={"fine": field.input_layers},
-        color_layers={"fine": field.color_layers},
         cull=_cull(schedule, background),
     )
 
@@ -124,11 +267,9 @@ def bake_occupancy(
     model: Model,
     schedule: GridSchedule,
     visibility_rays: Callable[[int], Rays],
+    view: ViewOptions,
     *,
     crop: bool = True,
-    early_stop_eps: float,
-    sample_multiplier: float,
-    max_samples: int,
     background: Background | None,
 ) -> tuple[Model, Callable[[Any], OccupancyGrid]]:
     """Converts a model trained without a grid into one that renders images with a grid of its visible density.
@@ -139,7 +280,8 @@ def bake_occupancy(
         visibility_rays: count -> Rays [count] of the training views.
         crop: whether the grid is cropped to its occupied cells. Images then take less time, but grids of other
             parameters have other shapes, for which the renderer is compiled again.
-        early_stop_eps, sample_multiplier, max_samples, background: see `occupancy_model`.
+        view: of images.
+        background: see `render_samples`.
 
     Returns:
         Model, which evaluates only occupied cells; and the function params -> its grid, see `visible_grid`.
@@ -150,12 +292,11 @@ def bake_occupancy(
 
     @jax.jit
     def find(params, rays):
-        options = {"max_samples": max_samples, "background": background}
+        options = {"max_samples": view.max_samples, "background": background}
         return visible_grid(scene(params), rays, **schedule.box(), **options)
 
     rays = visibility_rays(num_visibility_rays(schedule.shape))
-    view = _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background)
-    model = model._replace(view=view, cull=_cull(schedule, background))
+    model = model._replace(view=_view(scene, schedule, view, background), cull=_cull(schedule, background))
     return model, lambda params: crop_grid(find(params, rays)) if crop else find(params, rays)
 
 
@@ -200,16 +341,16 @@ def _cull(schedule, background):
     return cull
 
 
-def _view(scene, schedule, sample_multiplier, early_stop_eps, max_samples, background):
+def _view(scene, schedule, options, background):
     def view(params, grid, rays, median_depth=False):
         return render_with_grid(
             scene(params),
             grid,
             rays,
-            step_size=schedule.step_size / sample_multiplier,
+            step_size=schedule.step_size / options.sample_multiplier,
             cell=schedule.cell,
-            early_stop_eps=early_stop_eps,
-            max_samples=max_samples,
+            early_stop_eps=options.early_stop_eps,
+            max_samples=options.max_samples,
             background=background,
             median_depth=median_depth,
         )

@@ -7,7 +7,6 @@ import importlib
 import logging as std_logging
 import os
 import pathlib
-import re
 import signal
 import sys
 import traceback
@@ -20,7 +19,6 @@ from ml_collections import config_flags
 
 from jaxnerf.registry import READERS
 from jaxnerf.runtime import signals
-from jaxnerf.runtime.config_fields import schedule
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 
@@ -49,7 +47,7 @@ def run(
     # collection per 700 objects takes a good part of the tracing time.
     gc.set_threshold(50_000)
     signals.handle(signals.interrupt)
-    plugins = flags.DEFINE_list(
+    flags.DEFINE_list(
         "plugins", [], "Modules to import first: they register fields, samplers, losses, dataset readers or exporters."
     )
 
@@ -57,7 +55,6 @@ def run(
         try:
             if len(argv) > 1 and not positional:
                 raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
-            _import_plugins(plugins.value)
             # Imported after the flags are parsed, so that a wrong flag is reported at once.
             from jaxnerf.runtime.compilation_cache import use_compilation_cache
 
@@ -71,7 +68,11 @@ def run(
             _leave(1, f"out of memory ({error}); free memory, or reduce what the flags ask for")
 
     try:
+        # Before the flags are parsed, as the options of registered parts are flags, too.
+        _import_plugins(_given_flag("plugins").split(","))
         app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
+    except ValueError as error:
+        _leave(1, error)
     except KeyboardInterrupt as interrupt:
         code = 128 + (interrupt.args or (signal.SIGINT,))[0]
         print(f"error: stopped {stopped}", file=sys.stderr)
@@ -84,7 +85,11 @@ def run(
 
 
 def define_config(
-    help: str, *, required: bool = False, load_saved: Callable[[str], Any] | None = None
+    help: str,
+    *,
+    required: bool = False,
+    load_saved: Callable[[str], Any] | None = None,
+    describe_options: Callable[[], str] | None = None,
 ) -> flags.FlagHolder:
     """Defines --config, which takes the name or the path of a config file, followed by `:argument` or not.
 
@@ -92,15 +97,20 @@ def define_config(
         help: what the config is for.
         required: whether the flag must be given.
         load_saved: path -> the ConfigDict in a config.json that a run has saved; None: such paths are not accepted.
+        describe_options: returns what --config=help:options prints.
     """
-    config = config_flags.DEFINE_config_file("config", None, f"{help} --config=help lists the names.")
+    lists = f"--config=help lists the names{', --config=help:options all options' if describe_options else ''}."
+    config = config_flags.DEFINE_config_file("config", None, f"{help} {lists}")
     parser = flags.FLAGS["config"].parser
     load = parser.parse
 
     def parse(value):
         if load_saved and value.endswith(".json"):
-            return _with_losses(load_saved(value)).lock()
-        return _with_losses(load(_list_configs() if value == "help" else config_path(value)))
+            return load_saved(value).lock()
+        if describe_options and value == "help:options":
+            print(describe_options())
+            sys.exit(0)
+        return load(_list_configs() if value == "help" else config_path(value))
 
     parser.parse = parse
     if required:
@@ -110,14 +120,19 @@ def define_config(
 
 def use_saved_config() -> None:
     """Adds --config=<workdir>/config.json to the command line if it has --workdir and no --config."""
-    given = {}
-    for index, argument in enumerate(sys.argv[1:], 1):
-        name, equals, value = argument.lstrip("-").partition("=")
-        if argument.startswith("-"):
-            given[name] = value if equals else next(iter(sys.argv[index + 1 :]), "")
-    path = pathlib.Path(given.get("workdir", "")) / "config.json"
-    if "config" not in given and given.get("workdir") and path.exists():
+    path = pathlib.Path(_given_flag("workdir")) / "config.json"
+    if not _given_flag("config") and _given_flag("workdir") and path.exists():
         sys.argv.insert(1, f"--config={path}")  # before the flags that set its fields
+
+
+def _given_flag(name: str) -> str:
+    """Returns the value of a flag on the command line, before flags are parsed; "" where it is not given."""
+    value = ""
+    for index, argument in enumerate(sys.argv[1:], 1):
+        found, equals, given = argument.lstrip("-").partition("=")
+        if argument.startswith("-") and found == name:
+            value = given if equals else next(iter(sys.argv[index + 1 :]), "")
+    return value
 
 
 def define_count(name: str, help: str) -> flags.FlagHolder:
@@ -163,18 +178,6 @@ def config_path(value: str) -> str:
             f"there is no file and no config {name!r}, expected a path or one of {', '.join(config_names())}"
         )
     return f"{CONFIGS / name}.py{colon}{argument}"
-
-
-def _with_losses(config):
-    """Returns a config with all losses whose weight the command line sets; plugins, which register losses, come later.
-
-    A loss that no plugin registers is an error when the run is built.
-    """
-    arguments = [re.match(r"--?config\.losses\.(\w+)(=|$)", argument) for argument in sys.argv[1:]]
-    with config.unlocked():
-        for name in {match[1] for match in arguments if match and "losses" in config} - set(config.get("losses", {})):
-            config.losses[name] = schedule(0.0)
-    return config
 
 
 def _list_configs():
@@ -226,7 +229,8 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
     except (AttributeError, KeyError) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         if "ml_collections" in pathlib.Path(place.filename).parts:
-            _leave(2, f"the config has no such field: {_unquoted(error)}; {CONFIGS / 'default.py'} lists all fields")
+            where = "--config=help:options lists all fields, those of registered parts with --plugins=MODULE, too"
+            _leave(2, f"the config has no such field: {_unquoted(error)}; {where}")
         _leave(2, f"--config: {place.filename}, line {place.lineno}: {type(error).__name__}: {error}; correct the file")
     except (
         flags.Error,
@@ -260,6 +264,7 @@ def _help(module: str) -> str:
 
 
 def _import_plugins(names: Sequence[str]) -> None:
+    names = [name.strip() for name in names if name.strip()]
     if names:
         sys.path.append(os.getcwd())  # the path of an installed program does not contain it
     for name in names:

@@ -8,9 +8,9 @@ process writes config.json and metrics.jsonl and prints; all take part in a chec
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,59 +22,6 @@ from jaxnerf.runtime import memory, processes
 
 MODES = ("auto", "jit", "sharded", "pmap")
 CPU_MICROBATCH_SAMPLES = 12_288  # the fastest in experiments/speed: activations stay in the cache
-
-
-class DeviceProfile(NamedTuple):
-    """The sizes that suit a kind of device, for the fields of a config that are "auto".
-
-    Attributes:
-        steps_per_dispatch: training steps in one dispatch, at most.
-        update_chunk: cells of an occupancy grid that an update evaluates at once.
-        chunk: rays per rendered chunk, by sampler.
-        max_samples: size of the sample buffer in rendering.
-        compute_dtype: of the hash grid's networks.
-        layer_width: of the hash grid's networks.
-        table_scale: factor of the rows of a hash grid's level.
-        samples_per_step: size of the sample buffer in training; None: as the config says.
-    """
-
-    steps_per_dispatch: int
-    update_chunk: int
-    chunk: Mapping[str, int]
-    max_samples: int
-    compute_dtype: str
-    layer_width: int = 64
-    table_scale: int = 1
-    samples_per_step: int | None = None
-
-
-# Activations should stay in the cache. A chunk of the occupancy sampler fills its sample buffer, and is not much more
-# than a small image needs.
-_CPU = DeviceProfile(
-    steps_per_dispatch=1,
-    update_chunk=8160,  # a little under a power of two, so that activations do not collide in the cache
-    chunk={"occupancy": 2**13, "hierarchical": 2**12},
-    max_samples=2**10,
-    compute_dtype="float32",
-)
-# An accelerator needs many samples to be busy, and a dispatch costs as much as a small step. Chosen from operation
-# counts (docs/results/gpu_roofline.md). A larger table and wider networks take little time there: each gained 0.3 dB
-# for lego at 800 x 800 on an H200 (docs/guides/accelerators.md).
-_ACCELERATOR = DeviceProfile(
-    steps_per_dispatch=16,
-    update_chunk=2**18,
-    chunk={"occupancy": 2**16, "hierarchical": 2**13},  # 192 samples per ray of the paper's network take 1.6 GB a layer
-    max_samples=2**17,
-    compute_dtype="bfloat16",
-    layer_width=128,
-    table_scale=4,
-    samples_per_step=2**18,  # that of arXiv:2201.05989
-)
-
-
-def profile_of(platform: str) -> DeviceProfile:
-    """Returns the profile of the devices of a platform: "cpu", or any other."""
-    return _CPU if platform == "cpu" else _ACCELERATOR
 
 
 def compile_step(

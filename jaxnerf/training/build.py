@@ -1,32 +1,27 @@
-"""Turns a resolved config into the functions of a run.
-
-Beside it, only `auto_config` and `restore_run`, which fill in and replace fields, read a resolved config.
-"""
+"""Turns a resolved config into the functions of a run."""
 
 import dataclasses
 import functools
-import json
-from collections.abc import Callable, Mapping, Sequence
-from types import SimpleNamespace
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from ml_collections import ConfigDict
 
-from jaxnerf.core.types import TableLevel, Views
+from jaxnerf.core.types import Views
 from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.geometry.free_space import interpolated_depths
 from jaxnerf.data.observations import confident_observations
-from jaxnerf.fields.base import Field, contract_field, make_field
-from jaxnerf.models.base import Model, SamplerContext, make_model
-from jaxnerf.models.occupancy import bake_occupancy, schedule_from_section, view_options
-from jaxnerf.registry import LOSSES, Loss
-from jaxnerf.runtime.config_fields import is_auto
+from jaxnerf.fields.base import Field, contract_field
+from jaxnerf.models.base import Model, SamplerContext
+from jaxnerf.models.occupancy import bake_occupancy, schedule_of
+from jaxnerf.options import Changes, Options, changing, is_auto, values_of
+from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.training.camera_parameters import CameraParameters
+from jaxnerf.training.config import Config, RunConfig, read_config
 from jaxnerf.training.optimizer import make_optimizer
 from jaxnerf.training.step import StepLoss, TrainData
 
@@ -35,9 +30,10 @@ _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIEL
 
 
 class Experiment(NamedTuple):
-    """Everything that the training and evaluation loops need of a config.
+    """A run's config, and the functions that it describes.
 
     Attributes:
+        config: resolved.
         model: the config's field and sampler.
         cameras: the parameters of the training images; None where the config has none.
         losses: those whose weight is not 0.
@@ -49,117 +45,114 @@ class Experiment(NamedTuple):
         view_rays: (Views, index, pixels) -> Rays.
         world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
         prepare: Views -> (InitialCells, or None without a grid; TrainData).
-        seed: of everything random.
-        pixel_offset: px, from a pixel's index to the point that its ray goes through.
-        ndc: whether view_rays returns rays in normalised device coordinates.
         background: [3] the colour behind the scene; None: black.
-        train, eval: the config's sections.
-        conventions: see `conventions`.
     """
 
+    config: RunConfig
     model: Model
     cameras: CameraParameters | None
     losses: tuple[StepLoss, ...]
     optimizer: optax.GradientTransformation
     schedule: Callable[[int], float]
-    load_split: Callable[[str], Views]
+    load_split: Callable[..., Views]
     draw: Callable[..., tuple]
     pixel_ids: Callable[..., Any]
     view_rays: Callable[..., Any]
     world_depth: Callable[..., Any]
     prepare: Callable[..., tuple]
-    seed: int
-    pixel_offset: float
-    ndc: bool
-    background: tuple[float, float, float] | None
-    train: SimpleNamespace
-    eval: SimpleNamespace
-    conventions: dict[str, Any]
+    background: tuple[float, ...] | None
 
 
-def build(config: ConfigDict) -> Experiment:
+def build(config: Config) -> Experiment:
     """Builds the Experiment that a resolved config describes.
 
     Raises:
-        ValueError: names the field that holds what cannot be built.
+        ValueError: names the option that holds what cannot be built.
     """
-    model, losses = build_model(config), build_losses(dict(config.losses), functools.partial(_levels, config))
-    cameras = build_cameras(config)
-    optimizer, schedule = make_optimizer(config.train, None if cameras is None else config.cameras)
+    config = read_config(config)
+    given, train = config.data, config.train
+    model = build_model(config)
+    losses, cameras = build_losses(config.losses, model), build_cameras(config)
+    _filled(config.train, "train")
+    optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
     if cameras is not None:
         model = cameras.added_to(model)
-    options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
-    batching = {"batching": config.train.batching}
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
-    if config.train.batching not in ray_batches.BATCHINGS:
-        raise ValueError(f"train.batching is {config.train.batching!r}, expected one of {ray_batches.BATCHINGS}")
+    options = {"batching": train.batching, "extras": extras}
 
     def draw(step, positions, data):
         return ray_batches.draw_batch(
-            data.seed, step, positions, data.views, data.active_pixels, extras=extras, **batching, **options
+            data.seed,
+            step,
+            positions,
+            data.views,
+            data.active_pixels,
+            pixel_offset=given.pixel_offset,
+            ndc=given.ndc,
+            **options,
         )
 
     def pixel_ids(step, positions, data):
-        return ray_batches.draw_pixels(
-            data.seed, step, positions, data.views, data.active_pixels, extras=extras, **batching
-        )[1]
+        return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **options)[1]
 
     return Experiment(
+        config=config,
         model=model,
         cameras=cameras,
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,
-        load_split=functools.partial(dataset.load_split, config.data),
+        load_split=functools.partial(dataset.load_split, given),
         draw=draw,
         pixel_ids=pixel_ids,
-        view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=config.data.ndc)),
-        world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=config.data.ndc)),
+        view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc)),
+        world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=given.ndc)),
         prepare=functools.partial(_prepare, config, model, extras),
-        seed=config.seed,
-        pixel_offset=config.data.pixel_offset,
-        ndc=config.data.ndc,
-        background=dataset.color_behind(config.data),
-        train=SimpleNamespace(**config.train),
-        eval=SimpleNamespace(**config.eval),
-        conventions=conventions(config.data),
+        background=dataset.color_behind(given),
     )
 
 
-def build_model(config: ConfigDict) -> Model:
+def build_model(config: Config) -> Model:
     """Builds the Model: the config's field under the config's sampler."""
-    return make_model(config.sampler, _context(config))
+    config = read_config(config)
+    part = SAMPLERS.get(config.sampler)
+    _check_sampling(config)
+    return part.make(
+        SamplerContext(
+            options=_filled(config.options_of(part, config.sampler), part.section or config.sampler),
+            make_field=functools.partial(_make_field, config),
+            view=config.eval,
+            background=dataset.color_behind(config.data),
+            box=_box(config),
+        )
+    )
 
 
-def build_cameras(config: ConfigDict) -> CameraParameters | None:
-    """Builds the parameters of the training images; None where none are trained, as in configs of older versions.
+def build_cameras(config: RunConfig) -> CameraParameters | None:
+    """Builds the parameters of the training images; None where none are trained.
 
     Raises:
         ValueError: if the number of training images is unknown.
     """
-    section = config.get("cameras", {})
-    if not (section.get("exposure") or section.get("refine")):
+    if not config.cameras.any:
         return None
-    if is_auto(section.num_images):
-        raise ValueError("cameras.num_images is 'auto'; resolve the config against a dataset, or set a number")
+    options = _filled(config.cameras, "cameras")
     return CameraParameters(
-        num_images=section.num_images,
-        exposure=section.exposure,
-        refine=section.refine,
+        num_images=options.num_images,
+        exposure=options.exposure,
+        refine=options.refine,
         view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
         background=dataset.background_of(config.data),
     )
 
 
-def build_losses(
-    weights: Mapping[str, Any], levels: Callable[[], Sequence[TableLevel]] = tuple
-) -> tuple[StepLoss, ...]:
-    """Builds the losses of the config's section; one whose weight is 0 is absent.
+def build_losses(weights: Mapping[str, Any], model: Model | None = None) -> tuple[StepLoss, ...]:
+    """Builds losses; one whose weight is 0 is absent.
 
     Args:
         weights: of the losses, by name.
-        levels: called where a regularizer needs them; returns those of the field's table, see `Field`.
+        model: whose fields may bring regularizers; None: no field does.
 
     Raises:
         ValueError: if no loss has a weight, a name is not registered, or a loss needs a field that no dataset provides.
@@ -170,69 +163,57 @@ def build_losses(
         if is_auto(weight) or (isinstance(weight, int | float) and weight == 0):
             continue
         loss = LOSSES.get(name)
-        if loss.on == "params" and "levels" in loss.needs:
-            loss = _of_levels(name, loss, levels())
         missing = [need for need in loss.needs if need not in _FILLED_BATCH_FIELDS]
         if missing:
             raise ValueError(
                 f"losses.{name} needs {missing[0]} in the batch, expected one of {_FILLED_BATCH_FIELDS}; set it to 0"
             )
-        losses.append(StepLoss(name, loss.function, loss.on, _weight_at(name, weight), loss.needs))
+        function = _of_fields(name, model) if loss.on == "field" else loss.function
+        losses.append(StepLoss(name, function, loss.on, _weight_at(name, weight), loss.needs))
     if not any(loss.on == "renderings" for loss in losses):
         raise ValueError("losses: no loss of the renderings has a weight; set losses.mse to 1")
     return tuple(losses)
 
 
-def check_views(config: ConfigDict, views: Views) -> None:
+def check_views(config: RunConfig, views: Views) -> None:
     """Raises a ValueError if a loss of a resolved config needs what the views lack, before training starts."""
-    losses = build_losses(dict(config.losses), functools.partial(_levels, config))
+    losses = build_losses(config.losses, build_model(config))
     if any(not set(ray_batches.DEPTH_FIELDS).isdisjoint(loss.needs) for loss in losses):
         confident_observations(views)
 
 
-def _of_levels(name, regularizer, levels):
-    """Returns the Loss of a regularizer (params, levels) -> scalar for the given levels."""
-    if not levels:
-        raise ValueError(f"losses.{name} needs a hash grid, which the field does not have; set it to 0")
-    return Loss(functools.partial(regularizer.function, levels=levels), on="params")
+def _of_fields(name, model):
+    """Returns the regularizer (params) -> scalar of that name, the sum over the fields that bring it."""
+    fields = {} if model is None else model.fields
+    found = {network: field.regularizers[name] for network, field in fields.items() if name in field.regularizers}
+    if not found:
+        raise ValueError(f"losses.{name} needs a field that brings it, as a hash grid does; set it to 0")
+
+    def regularizer(params):
+        return functools.reduce(jnp.add, (function(params[network]) for network, function in found.items()))
+
+    return regularizer
 
 
-def _levels(config):
-    """Returns the levels of the table of the final rendering's field; empty without a table."""
-    return _context(config).make_field("fine").levels
-
-
-def bake_model(config: ConfigDict, model: Model, visibility_rays, *, crop: bool = True):
+def bake_model(config: RunConfig, model: Model, visibility_rays, *, crop: bool = True):
     """Calls `bake_occupancy` for the box of a resolved config's section `occupancy`."""
-    schedule = schedule_from_section(_section(config, "occupancy"), None)
-    return bake_occupancy(model, schedule, visibility_rays, crop=crop, **view_options(_context(config)))
+    schedule = schedule_of(_filled(config.occupancy, "occupancy"), None)
+    background = dataset.color_behind(config.data)
+    return bake_occupancy(model, schedule, visibility_rays, config.eval, crop=crop, background=background)
 
 
-def load_split(config: ConfigDict, split: str | None = None) -> tuple[Views, str, dict[str, Any]]:
+def load_split(config: Config, split: str | None = None) -> tuple[Views, str, dict[str, Any]]:
     """Reads the Views of a split without building a model.
 
     Returns:
         Views; the split's name, which is eval.split where none is given; and the conventions.
     """
+    config = read_config(config)
     data, split = dataset.resolve(config.data)[0], split or config.eval.split
-    return dataset.load_split(data, split), split, conventions(data)
+    return dataset.load_split(data, split), split, dataset.conventions(data)
 
 
-def conventions(data: ConfigDict) -> dict[str, Any]:
-    """Returns the fields of a data section that an evaluation protocol records."""
-    return {name: data[name] for name in ("format", "background", "pixel_offset", "factor", "hold_out", "num_views")}
-
-
-def identity(config: ConfigDict) -> str:
-    """Returns as text the parts of a config that renderings depend on; not training, nor the dataset's folder."""
-    plain = json.loads(config.to_json_best_effort())
-    data = {name: value for name, value in plain["data"].items() if name != "dir"}
-    rest = {name: value for name, value in plain.items() if name not in ("train", "eval", "data", "losses", "cameras")}
-    rest["occupancy"].pop("update_chunk", None)  # as "auto" it depends on the device, and it changes no image
-    return json.dumps({**rest, "data": data}, sort_keys=True)
-
-
-def check_released(config: ConfigDict, origin: str) -> None:
+def check_released(config: RunConfig, origin: str) -> None:
     """Raises a ValueError if a config's networks differ from those of a released code."""
     if config.sampler != "hierarchical" or config.field != "mlp":
         raise ValueError(
@@ -240,55 +221,62 @@ def check_released(config: ConfigDict, origin: str) -> None:
             f"{origin}"
         )
     activations = ("relu", "softplus") if origin == "JaxNeRF" else ("relu",)
-    for name in ("coarse", "fine"):
-        if not config[name].encode:
+    for name, network in (("coarse", config.coarse), ("fine", config.fine)):
+        if not network.encode:
             raise ValueError(f"{name}.encode is False, expected True as in {origin}")
-        if config[name].density_bias:
-            raise ValueError(f"{name}.density_bias is {config[name].density_bias}, expected 0 as in {origin}")
-        if config[name].density_activation not in activations:
+        if network.density_bias:
+            raise ValueError(f"{name}.density_bias is {network.density_bias}, expected 0 as in {origin}")
+        if network.density_activation not in activations:
             raise ValueError(
-                f"{name}.density_activation is {config[name].density_activation!r}, expected "
+                f"{name}.density_activation is {network.density_activation!r}, expected "
                 f"{' or '.join(map(repr, activations))} as in {origin}"
             )
 
 
-def _context(config):
-    names = [name for name, value in config.items() if isinstance(value, ConfigDict)]
-    sections = {name: _section(config, name) for name in names}
-    section = sections["occupancy"]
-    box = None
-    if not (is_auto(section["lower"]) or is_auto(section["upper"])):
-        box = section["lower"], section["upper"]
-    return SamplerContext(
-        make_field=functools.partial(_make_field, config, sections, box),
-        sections=sections,
-        background=dataset.color_behind(config.data),
-    )
+def _check_sampling(config):
+    """Raises a ValueError if the section `sampling` asks for what the sampler "occupancy" does not do."""
+    sampling = config.sampling
+    if config.sampler == "occupancy" and sampling.density_noise:
+        raise ValueError(
+            f"sampling.density_noise is {sampling.density_noise} and the sampler 'occupancy', which adds no "
+            "noise; set it to 0, or use the sampler 'hierarchical'"
+        )
+    if config.sampler == "occupancy" and not sampling.stratified:
+        raise ValueError(
+            "sampling.stratified is False and the sampler 'occupancy', which draws its samples; set it to True, "
+            "or use the sampler 'hierarchical'"
+        )
 
 
-def _make_field(config, sections, box, network) -> Field:
+def _make_field(config, network) -> Field:
     """Makes the field of a network; that of "coarse" is always an MLP."""
     name = config.field if network == "fine" else "mlp"
-    options = sections[network] if name == "mlp" else sections.get(name, {})
-    if name == "mlp" and is_auto(options["num_freqs"]):
-        raise ValueError(f"{network}.num_freqs is 'auto'; resolve the config against a dataset, or set a number")
-    field = make_field(name, options, box)
+    part, box = FIELDS.get(name), _box(config)
+    section = network if name == "mlp" else name
+    options = getattr(config, network) if name == "mlp" else config.options_of(part, name)
+    field = part.make(_filled(options, section), box)
     # The paper's networks are not contracted; all other fields are defined in the box.
     in_box = config.sampler != "hierarchical" or name != "mlp"
-    if in_box and sections["occupancy"]["contracted"] is True:
+    if in_box and config.occupancy.contracted is True:
         if box is None:
             raise ValueError("occupancy.lower or occupancy.upper is 'auto'; resolve the config, or set both")
         return contract_field(field, *box)
     return field
 
 
-def _section(config, name):
-    """Returns a section as a plain dict, with tuples for the lists of a config.json."""
-    section = {field: tuple(value) if isinstance(value, list) else value for field, value in config[name].items()}
-    for field, value in section.items():
-        if name == "occupancy" and config.sampler == "occupancy" and is_auto(value):
-            raise ValueError(f"occupancy.{field} is 'auto'; resolve the config against a dataset, or set a value")
-    return section
+def _box(config):
+    corners = config.occupancy.lower, config.occupancy.upper
+    return None if any(map(is_auto, corners)) else corners
+
+
+def _filled(options, section):
+    """Returns the options; ValueError if one is "auto" that the dataset determines."""
+    values = values_of(options) if isinstance(options, Options) else options
+    free = changing(options, Changes.SPEED) if isinstance(options, Options) else ()
+    left = [name for name, value in values.items() if is_auto(value) and name not in free]
+    if left:
+        raise ValueError(f"{section}.{left[0]} is 'auto'; resolve the config against a dataset, or set a value")
+    return options
 
 
 def _weight_at(name, weight):
@@ -317,7 +305,7 @@ def _prepare(config, model, extras, views):
             views,
             model.grid_schedule,
             use_alpha=config.occupancy.use_alpha and not config.data.ndc,
-            min_views=config.occupancy.get("min_views", 0),
+            min_views=config.occupancy.min_views,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
         )

@@ -18,8 +18,51 @@ from jaxnerf.core.poses import se3_exponential
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Batch, Camera, Rays, Rendering, Views
 from jaxnerf.models.base import Model
+from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
 
 CAMERAS = "cameras"  # the entry of the parameters; all other entries are networks
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraOptions(Options):
+    """The options of parameters of the training images, which are trained with the networks."""
+
+    exposure: bool = option(
+        False,
+        "whether each image has a gain per colour channel; renderings show the scene without it",
+        changes=Changes.TRAINING,
+    )
+    exposure_lr: float = option(
+        1e-2,
+        "initial learning rate; it decays as that of the networks",
+        range=POSITIVE,
+        changes=Changes.TRAINING,
+    )
+    refine: bool = option(
+        False,
+        "whether each pose and, common to all images, the focal length are corrected",
+        changes=Changes.TRAINING,
+    )
+    refine_lr: float = option(
+        5e-4,
+        "as `exposure_lr`",
+        unit="radians, fractions of the cameras' spread and of the focal length",
+        range=POSITIVE,
+        changes=Changes.TRAINING,
+    )
+    refine_start_step: int = option(
+        300, "training step before which cameras do not move", range=at_least(0), changes=Changes.TRAINING
+    )
+    num_images: int = option("auto", "of the split `train`; do not set it", auto=True, changes=Changes.TRAINING)
+
+    def resolve(self, facts: Facts, device: Device) -> tuple["CameraOptions", list[str]]:
+        """Infers the number of images."""
+        return infer(self, num_images=(facts.num_views, ""))
+
+    @property
+    def any(self) -> bool:
+        """Whether there are such parameters."""
+        return self.exposure or self.refine
 
 
 class CameraParameters(NamedTuple):
@@ -63,16 +106,19 @@ class CameraParameters(NamedTuple):
         return dataclasses.replace(batch, rays=rays)
 
     def exposed(
-        self, params: Mapping[str, Any], renderings: Sequence[Rendering], batch: Batch
-    ) -> tuple[Rendering, ...]:
-        """Returns the renderings with the exposure of their images; as they are unless exposure is trained."""
+        self, params: Mapping[str, Any], renderings: Mapping[str, Rendering], batch: Batch
+    ) -> Mapping[str, Rendering]:
+        """Returns the renderings, by network, with the exposure of their images; as they are unless it is trained."""
         if not self.exposure:
-            return tuple(renderings)
+            return renderings
         gains = exposure_gains(params[CAMERAS]["log_gains"])[batch.image_index]
         behind = 0.0
         if self.background is not None:
             behind = (1 - batch.alpha[:, None]) * jnp.asarray(self.background, gains.dtype)[None]
-        return tuple(dataclasses.replace(each, rgb=behind + gains * (each.rgb - behind)) for each in renderings)
+        return {
+            name: dataclasses.replace(each, rgb=behind + gains * (each.rgb - behind))
+            for name, each in renderings.items()
+        }
 
     def refined_views(self, params: Mapping[str, Any], views: Views, split: str) -> Views:
         """Returns Views with the refined cameras.

@@ -2,13 +2,14 @@
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
+from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model
 from jaxnerf.training.state import TrainState
 
@@ -25,11 +26,10 @@ def count_dead_steps(
     counters: Mapping[str, Any],
     grads: Mapping[str, Any],
     errors: Mapping[str, Any],
-    input_layers: Mapping[str, Sequence[str]],
-    color_layers: Mapping[str, Sequence[str]],
+    fields: Mapping[str, Field],
     scale: Any = 1.0,
 ) -> dict[str, Any]:
-    """Counts for how many steps in a row each network has been dead, as counters "dead_<name>".
+    """Counts for how many steps in a row each network that renders images has been dead, as counters "dead_<name>".
 
     A network is dead when its rays have an error and no gradient reaches the layers that take the position, or none
     reaches the first layers that serve colour alone. In the first case its density is 0 everywhere, as the input of
@@ -45,15 +45,15 @@ def count_dead_steps(
     Args:
         counters: of the step before; int32 [].
         grads: network name -> gradient over the whole batch, of the mean squared error after it is scaled.
-        errors: network name -> mean squared error of its rendering.
-        input_layers: network name -> names of the layers that take the position; empty: all layers.
-        color_layers: network name -> names of the first layers that serve colour alone; empty: not checked.
+        errors: network name -> mean squared error of its rendering, of those that render images.
+        fields: network name -> Field, for its layers; all layers take the position where none are known.
         scale: factor of the gradients.
     """
     dead = {}
-    for name, grad in grads.items():
-        error = errors[name]
-        inputs, color = ([grad[layer] for layer in layers.get(name, ())] for layers in (input_layers, color_layers))
+    for name, error in errors.items():
+        grad, field = grads[name], fields.get(name)
+        layers = ((), ()) if field is None else (field.input_layers, field.color_layers)
+        inputs, color = ([grad[layer] for layer in names] for names in layers)
         still = scale * optax.tree.norm(inputs or grad) <= _GRADIENT * jnp.sqrt(error)
         if color:
             still |= scale * optax.tree.norm(color) <= _COLOR_GRADIENT * jnp.sqrt(error)
@@ -77,8 +77,8 @@ def make_reinitializer(experiment: Any, folder: str | os.PathLike) -> Callable[.
     Raises:
         ValueError: from that function, if more networks have died than train.max_reinits allows.
     """
-    reinitialize = make_reinitialize(experiment.model, experiment.optimizer, experiment.seed)
-    allowed = experiment.train.max_reinits
+    reinitialize = make_reinitialize(experiment.model, experiment.optimizer, experiment.config.seed)
+    allowed = experiment.config.train.max_reinits
 
     def check(step, state, metrics):
         names = dead_networks(state.counters) if allowed and step % CHECK_EVERY == 0 else ()

@@ -1,7 +1,6 @@
 """The training loop: resume, step, log, save, stop cleanly."""
 
 import contextlib
-import copy
 import dataclasses
 import functools
 import os
@@ -12,21 +11,22 @@ from typing import Any
 
 import jax
 import numpy as np
-from ml_collections import ConfigDict
 
 from jaxnerf.core.types import Views
 from jaxnerf.data.ray_batches import Gathered
 from jaxnerf.runtime import devices, memory, processes, signals
 from jaxnerf.training import build, metric_log, workdir
-from jaxnerf.training.auto_config import host_intervals, resolve, resolve_for_device
+from jaxnerf.training.auto_config import resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config import Config, changed
 from jaxnerf.training.dead_networks import make_reinitializer
+from jaxnerf.training.options import host_intervals
 from jaxnerf.training.state import TrainState, create_state
 from jaxnerf.training.step import make_train_step, repeat_step
 
 
 def train(
-    config: ConfigDict,
+    config: Config,
     folder: str | os.PathLike,
     *,
     views: Views | None = None,
@@ -37,7 +37,7 @@ def train(
     """Trains as a config says, from the last checkpoint in a workdir if there is one.
 
     Args:
-        config: see configs/default.py.
+        config: of the run.
         folder: the workdir; made if missing.
         views: of the split "train" where they have been read.
         preview: called with the state and the Views of the split "train" about every `train.preview_every` seconds;
@@ -58,12 +58,11 @@ def train(
     on_device, device_lines = resolve_for_device(config)
     build.check_views(on_device, views)
     experiment = build.build(on_device)
-    options = experiment.train
+    options = on_device.train
     num_devices = len(devices.devices_of(options.parallel))
     devices.split_positions(options.batch_size, num_devices, options.microbatch_size)
-    anywhere = copy.deepcopy(config)
-    anywhere.data.dir = ""  # machines may have the dataset at different places; its content is compared later
-    processes.check_same("config", anywhere.to_json_best_effort())
+    anywhere = changed(config, {"data.dir": ""})  # its place may differ; its content is compared later
+    processes.check_same("config", anywhere.to_json())
     with contextlib.ExitStack() as stack:
 
         def claim():
@@ -85,7 +84,7 @@ def run_training(
     observe: Callable[[TrainState, Views], None] | None = None,
 ) -> bool:
     """Runs the loop of `train` on the Views of the split "train"; returns whether it has completed."""
-    options = experiment.train
+    options = experiment.config.train
     dispatch, state, data, seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, max_to_keep=options.max_to_keep)
     state, unreadable = checkpoints.load_newest(state)
@@ -178,7 +177,7 @@ class _Dispatch:
 
 def _compile(experiment, views):
     """Returns _Dispatch, state, data, see `devices.compile_step`; and the seconds that it took, by name."""
-    options = experiment.train
+    options = experiment.config.train
     started = time.perf_counter()
     cells, data = experiment.prepare(views)
     prepared = time.perf_counter()
@@ -200,7 +199,7 @@ def _compile(experiment, views):
 
         run, *placed = memory.fit_step(
             compile_step,
-            functools.partial(create_state, experiment.model, experiment.optimizer, experiment.seed, cells),
+            functools.partial(create_state, experiment.model, experiment.optimizer, experiment.config.seed, cells),
             data,
             min(options.microbatch_size, options.batch_size // len(devices.devices_of(options.parallel))),
         )
@@ -291,7 +290,7 @@ class _Pace:
 
     def __init__(self, experiment: build.Experiment, clock: _Clock, data: Any):
         self.scale, self._data, self._clock = 1.0, data, clock
-        self._options = experiment.train
+        self._options = experiment.config.train
 
     def data_of(self, step: int) -> Any:
         if self._data.lr_scale is None:

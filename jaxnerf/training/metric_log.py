@@ -14,9 +14,9 @@ import numpy as np
 from jaxnerf.core.metrics import decibels
 from jaxnerf.core.types import Views
 from jaxnerf.runtime.atomic_files import naming, open_regular, parse_json, partial_file, read_bytes, write_text
-from jaxnerf.runtime.config_fields import UNLIMITED_STEPS
 from jaxnerf.runtime.devices import devices_of
 from jaxnerf.training.dead_networks import dead_networks
+from jaxnerf.training.options import UNLIMITED_STEPS
 from jaxnerf.training.state import TrainState
 
 _logger = logging.getLogger(__name__)
@@ -191,7 +191,7 @@ def header(
     experiment: Any, views: Views, state: TrainState, *, prepare_seconds: float, compile_seconds: float
 ) -> list[str]:
     """Returns the lines that describe a run before its first step."""
-    options = experiment.train
+    options = experiment.config.train
     devices = devices_of(options.parallel)
     processes = f", in {jax.process_count()} processes" if jax.process_count() > 1 else ""
     counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
@@ -235,7 +235,7 @@ def row(
     values = {name: np.concatenate([np.ravel(part[name]).astype(float) for part in recent]) for name in recent[0]}
     last = {name: value[-1] for name, value in values.items()}
     rays_dropped = int(last.get("rays_dropped", 0))
-    rays = step * experiment.train.batch_size - rays_dropped
+    rays = step * experiment.config.train.batch_size - rays_dropped
     return {
         "step": step,
         "seconds": seconds,
@@ -244,8 +244,7 @@ def row(
         "rays_per_second": rate(rays),
         "loss": values["loss"].mean(),
         **{name: value.mean() for name, value in values.items() if name.startswith("loss_")},
-        "psnr_coarse": float(decibels(values["mse_coarse"].mean())),
-        "psnr_fine": float(decibels(values["mse"].mean())),
+        **{f"psnr_{name}": float(decibels(values[f"mse_{name}"].mean())) for name in experiment.model.image_networks},
         "lr": float(experiment.schedule(step - 1)),
         "grad_norm": last["grad_norm"],
         "nonfinite": int(last["nonfinite"]),
@@ -289,8 +288,9 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
         notes += f"  {fraction:.0%} of rays dropped"
     notes += "".join(f"  {name} network dead" for name in dead_networks(row))
     notes += f"  {row['num_reinits']} networks reinitialized" if row["num_reinits"] else ""
+    psnr = [value for name, value in row.items() if name.startswith("psnr_")][-1]  # of the final rendering
     return (
-        f"{row['psnr_fine']:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
+        f"{psnr:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{_minutes(row['seconds'])} elapsed, {_minutes(0.0 if out_of_time else left)} left{notes}"
     )
 

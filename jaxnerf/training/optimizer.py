@@ -1,5 +1,6 @@
 """The optimizer: Adam as in the paper, or Muon for the matrices of layers and AdamW for the rest; averaging."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -7,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxnerf.runtime.config_fields import is_auto
-from jaxnerf.training.camera_parameters import CAMERAS
+from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Options, at_least, option
+from jaxnerf.training.camera_parameters import CAMERAS, CameraOptions
 from jaxnerf.training.state import TrainState
 
 _MIN_SIDE = 8  # least inputs and outputs of a layer that Muon updates; smaller layers gain nothing
@@ -25,22 +26,61 @@ _AVERAGE_ALL, _AVERAGE_EVERY = 256, 8
 _ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one, they compile once, as a loop
 
 
-def make_optimizer(train: Any, cameras: Any = None) -> tuple[optax.GradientTransformation, Callable[[Any], Any]]:
-    """Makes the optimizer of a config's section `train`.
+@dataclasses.dataclass(frozen=True)
+class OptimizerOptions(Options):
+    """The options of the optimizer."""
+
+    lr_init: float = option(5e-4, "initial learning rate", range=POSITIVE, changes=Changes.TRAINING)
+    lr_final: float = option(
+        5e-5, "learning rate that is reached at `lr_steps`", range=POSITIVE, changes=Changes.TRAINING
+    )
+    lr_decay_power: float = option(
+        1.0,
+        "The rate is lr_init (lr_final / lr_init)^((step / lr_steps)^lr_decay_power). 1: exponential decay, as in the "
+        "paper; larger: the rate stays high for most of the run and then decreases quickly.",
+        range=POSITIVE,
+        changes=Changes.TRAINING,
+    )
+    lr_steps: int = option(
+        200_000,
+        "steps of the decay; the run may end earlier or later; auto: `max_steps`",
+        range=at_least(1),
+        auto=True,
+        changes=Changes.TRAINING,
+    )
+    warmup_steps: int = option(
+        0, "steps in which the learning rate rises linearly from 0", range=at_least(0), changes=Changes.TRAINING
+    )
+    beta1: float = option(0.9, "decay of Adam's first moment", range=BELOW_ONE, changes=Changes.TRAINING)
+    beta2: float = option(0.999, "decay of Adam's second moment", range=BELOW_ONE, changes=Changes.TRAINING)
+    epsilon: float = option(1e-8, "of Adam", range=POSITIVE, changes=Changes.TRAINING)
+    muon: float = option(
+        0.0,
+        "Above 0: Muon (arXiv:2502.16982) updates the matrices of the layers instead of Adam. Its updates have this "
+        "root mean square times the learning rate; those of Adam have about 0.2.",
+        range=at_least(0),
+        changes=Changes.TRAINING,
+    )
+    averaging_power: float = option(
+        0.0,
+        "Above 0: evaluation uses parameters averaged over about the last 1 / power of all steps (arXiv:1212.1824).",
+        range=at_least(0),
+        changes=Changes.TRAINING,
+    )
+
+
+def make_optimizer(
+    train: OptimizerOptions, cameras: CameraOptions | None = None
+) -> tuple[optax.GradientTransformation, Callable[[Any], Any]]:
+    """Makes the optimizer that options describe.
 
     Args:
-        train: the section.
-        cameras: the section `cameras`; None where no parameters of images are trained.
+        train: the options.
+        cameras: those of the parameters of images; None where none are trained.
 
     Returns:
         The optimizer, and the learning rate of the networks: step -> float.
-
-    Raises:
-        ValueError: names the field that is below 0.
     """
-    for name in ("averaging_power", "muon"):
-        if train[name] < 0:
-            raise ValueError(f"train.{name} is {train[name]}, expected a number above 0, or 0 for off")
     schedule = learning_rate(train)
     moments = {"b1": train.beta1, "b2": train.beta2, "eps": train.epsilon}
     if train.muon:
@@ -79,8 +119,8 @@ def _with_cameras(optimizer, train, schedule, cameras):
 
     updates = {
         "networks": optimizer,
-        "log_gains": adam(cameras["exposure_lr"], 0),
-        "poses": adam(cameras["refine_lr"], cameras["refine_start_step"]),
+        "log_gains": adam(cameras.exposure_lr, 0),
+        "poses": adam(cameras.refine_lr, cameras.refine_start_step),
     }
 
     def label(path, _):
@@ -118,11 +158,9 @@ def _labels(params):
     return jax.tree_util.tree_map_with_path(label, params)
 
 
-def learning_rate(train: Any) -> Callable[[Any], Any]:
-    """Returns the learning rate of the networks, step -> float, of a config's section `train`."""
-    if is_auto(train.lr_steps):
-        raise ValueError("train.lr_steps is 'auto'; resolve the config against a dataset, or set a number")
-    ratio, power = train.lr_final / train.lr_init, train.get("lr_decay_power", 1.0)  # older configs lack the power
+def learning_rate(train: OptimizerOptions) -> Callable[[Any], Any]:
+    """Returns the learning rate of the networks, step -> float."""
+    ratio, power = train.lr_final / train.lr_init, train.lr_decay_power
 
     def decay(step):
         return train.lr_init * ratio ** (jnp.minimum(step / train.lr_steps, 1.0) ** power)

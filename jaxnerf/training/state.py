@@ -10,7 +10,6 @@ from jaxnerf.core.occupancy.grid import OccupancyGrid
 from jaxnerf.core.types import pytree
 from jaxnerf.models.base import Model
 from jaxnerf.models.grid_schedule import InitialCells
-from jaxnerf.training.camera_parameters import networks
 
 
 @pytree()
@@ -50,7 +49,7 @@ def create_state(
     @jax.jit  # op by op, initialization would take longer than its compilation
     def create(key, cells):
         params = model.init(key)
-        names = ["nonfinite", "nonfinite_in_a_row", "num_reinits", *(f"dead_{name}" for name in networks(params))]
+        names = ["nonfinite", "nonfinite_in_a_row", "num_reinits", *(f"dead_{name}" for name in model.image_networks)]
         grid = None
         if schedule is not None:
             names.append("rays_dropped")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.core.losses import squared_error
-from jaxnerf.core.types import Views
+from jaxnerf.core.types import Renderings, Views
 from jaxnerf.data import ray_batches
 from jaxnerf.data.active_pixels import PixelRuns
 from jaxnerf.models.base import Model
@@ -62,7 +62,7 @@ def make_train_step(
     """Makes the pure training step.
 
     Args:
-        model: see `Model`; the last of its Renderings is the final one.
+        model: see `Model`.
         optimizer: an optax gradient transformation.
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see `draw_batch`.
         losses: at least one must be a loss of the renderings.
@@ -76,15 +76,15 @@ def make_train_step(
         after the other and their gradients are summed, so the activations of only B rays must fit into the
         cache or memory. With an `axis_name` all sums also run over that axis of devices.
 
-        `metrics` are scalars: "loss", "mse" (last rendering), "mse_coarse" (first rendering), "loss_<name>" of
+        `metrics` are scalars: "loss", "mse_<name>" of each network that renders images, "loss_<name>" of
         each loss (unweighted) if there are several, "grad_norm", the number of "rays" that were not dropped,
         and the counters. These are "nonfinite", the steps whose loss or gradient was not finite, which leave
-        parameters and optimizer unchanged; "nonfinite_in_a_row"; "dead_<name>" of each network, see
+        parameters and optimizer unchanged; "nonfinite_in_a_row"; "dead_<name>" of each such network, see
         `count_dead_steps`; "num_reinits", which only reinitialization changes; and with a grid "rays_dropped",
         the rays that were ignored because some of their samples did not fit into the sample buffer.
     """
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
-    regularizers = [loss for loss in losses if loss.on == "params"]
+    regularizers = [loss for loss in losses if loss.on != "renderings"]
 
     def loss_fn(params, grid, step, keys, batch, views):
         if cameras is not None:
@@ -92,6 +92,7 @@ def make_train_step(
         renderings = model.render(keys, params, grid, batch.rays, step)
         if cameras is not None:
             renderings = cameras.exposed(params, renderings, batch)
+        renderings = Renderings(renderings, model.image_networks)
         complete = renderings[-1].num_dropped == 0
 
         def total(values):
@@ -99,11 +100,9 @@ def make_train_step(
 
         parts = {loss.name: total(loss.function(renderings, batch)) for loss in ray_losses}
         weighted = sum(_scaled(loss.weight(step), parts[loss.name]) for loss in ray_losses)
-        sums = {
-            "mse_coarse": total(squared_error(renderings[0], batch)),
-            "mse": total(squared_error(renderings[-1], batch)),
-            "rays": complete.sum(dtype=jnp.int32),
-        }
+        errors = zip(model.image_networks, renderings, strict=True)
+        sums = {f"mse_{name}": total(squared_error(rendering, batch)) for name, rendering in errors}
+        sums["rays"] = complete.sum(dtype=jnp.int32)
         if len(losses) > 1:
             sums |= {f"loss_{name}": part for name, part in parts.items()}
         return weighted, sums
@@ -133,9 +132,8 @@ def make_train_step(
         rays = sums.pop("rays")
         scale = 1 / jnp.maximum(rays, 1)
         metrics = jax.tree.map(lambda leaf: leaf * scale, sums)
-        errors = {name: metrics["mse" if name == "fine" else "mse_coarse"] for name in networks(grads)}
-        layers = model.input_layers, model.color_layers
-        dead = count_dead_steps(state.counters, networks(grads), errors, *layers, scale)
+        errors = {name: metrics[f"mse_{name}"] for name in model.image_networks}
+        dead = count_dead_steps(state.counters, networks(grads), errors, model.fields, scale)
         if regularizers:
             metrics, grads = regularize(state, metrics, jax.tree.map(lambda leaf: leaf * scale, grads))
             scale = 1.0

@@ -1,83 +1,48 @@
 """The folder of a run: its config.json, and a lock that lets one training at a time write there."""
 
 import contextlib
-import json
 import os
 import pathlib
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
-from ml_collections import ConfigDict
-
-from jaxnerf.configs import default
+from jaxnerf.options import Changes, values_of
+from jaxnerf.registry import LOSSES
 from jaxnerf.runtime import atomic_files
+from jaxnerf.training.camera_parameters import CameraOptions
+from jaxnerf.training.config import RunConfig, changed, declared, flatten, read_config
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None
 
-# A run may be resumed with other values of these fields and sections, as finished steps do not depend on them: some
-# only say how others are inferred.
-CHANGEABLE = (
-    "data.dir",
-    "train.max_steps",
-    "train.max_seconds",
-    "train.log_every",
-    "train.save_every",
-    "train.max_to_keep",
-    "hash_grid.compute_dtype",
-    "occupancy.update_chunk",
-    "train.microbatch_size",
-    "train.steps_per_dispatch",
-    "train.parallel",
-    "train.cpu_batch_size",
-    "occupancy.cpu_pool_samples_per_ray",
-    "train.max_nonfinite",
-    "train.max_reinits",
-    "train.preview_every",
-    "eval.",
-)
-# Fields that older versions had, and the value with which they trained as this one does.
-_REMOVED = {"occupancy.near_gradient_distance": 0.0}
 _FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training writes to
-SECTIONS = ("data", "coarse", "fine", "sampling", "hash_grid", "occupancy", "losses", "train", "eval")
+# Options that the config.json of an older version may lack though training depends on them, and what it did instead.
+_ADDED = {
+    "data.background_color": (),
+    "occupancy.min_views": 0,
+    "occupancy.uniform_fraction": 1.0,
+    "train.lr_decay_power": 1.0,
+}
+# Options that no longer exist, and the value with which training was as it is now.
+_REMOVED = {"occupancy.near_gradient_distance": 0.0}
 
 
-def claim(workdir: str | os.PathLike, config: ConfigDict) -> None:
+def claim(workdir: str | os.PathLike, config: RunConfig) -> None:
     """Writes a resolved config into a new workdir, or checks that it belongs to the run in an existing one.
 
     The caller holds the `workdir_lock`. Partial files of killed processes are removed.
 
     Raises:
-        ValueError: if the run in the workdir has another config; names the fields that differ.
+        ValueError: if the run in the workdir has another config; names the options that differ.
     """
     path = pathlib.Path(workdir) / "config.json"
     if path.exists():
-        old, new = _flat(read_config(workdir)), _flat(config)
-        keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
-        fixed = [key for key in keys if not key.startswith(CHANGEABLE)]
-        unknown = [key for key in fixed if key not in old]
-        if unknown:
-            raise ValueError(
-                f"{workdir}: belongs to a run of another version, whose config lacks {', '.join(unknown[:3])}; resume "
-                "it with that version, or give another --workdir. It can still be evaluated, rendered and exported"
-            )
-        gone = [key for key, value in _REMOVED.items() if old.get(key, value) != value]
-        if gone:
-            raise ValueError(
-                f"{workdir}: belongs to a run of another version, whose {gone[0]} no longer exists; resume it with "
-                "that version, or give another --workdir. It can still be evaluated, rendered and exported"
-            )
-        if fixed:
-            shown = ", ".join(f"{key} {old.get(key)!r} -> {new.get(key)!r}" for key in fixed[:3])
-            more = f" and {len(fixed) - 3} more" if len(fixed) > 3 else ""
-            raise ValueError(
-                f"{workdir}: belongs to a run with another config ({shown}{more}); "
-                "give another --workdir, or resume with the old config"
-            )
+        _check_same_run(workdir, config)
     elif (path.parent / "checkpoints").exists():
         raise ValueError(f"{workdir}: has checkpoints but no config.json; give another --workdir")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,39 +50,71 @@ def claim(workdir: str | os.PathLike, config: ConfigDict) -> None:
         for partial in path.parent.glob(f"{name}.*.tmp"):
             if not partial.is_dir():
                 partial.unlink(missing_ok=True)
-    atomic_files.write_text(path, config.to_json_best_effort(indent=2) + "\n")
+    atomic_files.write_text(path, config.to_json() + "\n")
 
 
-def read_config(workdir: str | os.PathLike) -> ConfigDict:
-    """Reads the config of the run in a workdir; raises ValueError if there is none."""
+def _check_same_run(workdir, config):
+    content, gone = migrate(_content(workdir))
+    if gone:
+        raise ValueError(
+            f"{workdir}: belongs to a run of another version, whose {gone[0]} no longer exists; resume it with "
+            "that version, or give another --workdir. It can still be evaluated, rendered and exported"
+        )
+    old, new = flatten(read_config(content).to_dict()), flatten(config.to_dict())
+    free = {name for name, option, _, _ in declared(config) if not option.changes & Changes.TRAINING}
+    fixed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key) and key not in free]
+    if fixed:
+        shown = ", ".join(f"{key} {old.get(key)!r} -> {new.get(key)!r}" for key in fixed[:3])
+        more = f" and {len(fixed) - 3} more" if len(fixed) > 3 else ""
+        raise ValueError(
+            f"{workdir}: belongs to a run with another config ({shown}{more}); "
+            "give another --workdir, or resume with the old config"
+        )
+
+
+def load_config(workdir: str | os.PathLike, **values: Any) -> RunConfig:
+    """Reads the config of the run in a workdir, with other values of some sections' options: section={option: value}.
+
+    Raises:
+        ValueError: if there is no run; names the file.
+    """
+    config = read_config(migrate(_content(workdir))[0])
+    return changed(config, flatten(values)) if values else config
+
+
+def _content(workdir):
+    """Returns what config.json holds; ValueError if it is no config."""
     path = pathlib.Path(workdir) / "config.json"
     try:
         content = atomic_files.read_json(path, "restore it or train again")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file, expected the workdir of a training run; correct --workdir") from None
-    if not isinstance(content, dict) or not all(isinstance(content.get(name), dict) for name in SECTIONS):
-        raise ValueError(f"{path}: is not a config, expected an object with {SECTIONS}; restore it or train again")
-    return ConfigDict(content, type_safe=False)  # JSON does not hold the types of "auto" fields
+    if not isinstance(content, dict) or not isinstance(content.get("train"), dict):
+        raise ValueError(f"{path}: is not a config, expected what training has written; restore it or train again")
+    return content
 
 
-def config_to_resume(workdir: str | os.PathLike) -> ConfigDict:
-    """Reads the config of the run in a workdir with the types of configs/default.py, so that flags can set its fields.
+def migrate(content: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Returns the content of a config.json, of any version, as this version writes it.
 
-    Fields that an older version did not have get the default; `claim` rejects them if finished steps depend on them.
+    Options that were added have the values with which older versions trained and rendered.
+
+    Returns:
+        The content; and the options "section.option" that no longer exist and with which training was different.
     """
-    config = default.get_config()
-    with config.ignore_type():  # JSON has lists for tuples
-        config.update(read_config(workdir))
-    return config
-
-
-def _flat(config):
-    """Returns {"section.field": value} as JSON holds it."""
-    flat = {}
-    for section, values in json.loads(config.to_json_best_effort()).items():
-        fields = values.items() if isinstance(values, dict) else [(None, values)]
-        flat.update({f"{section}.{key}" if key else section: value for key, value in fields})
-    return flat
+    content = {name: dict(part) if isinstance(part, Mapping) else part for name, part in content.items()}
+    content.setdefault("cameras", values_of(CameraOptions()))  # all are off
+    added = {name: value for name, option, _, value in declared(RunConfig()) if not option.changes & Changes.TRAINING}
+    for name, value in {**added, **_ADDED, **{f"losses.{name}": 0.0 for name in LOSSES.names()}}.items():
+        section, _, field = name.partition(".")
+        if isinstance(content.get(section), dict):
+            content[section].setdefault(field, value)
+    gone = []
+    for name, harmless in _REMOVED.items():
+        section, _, field = name.partition(".")
+        found = content[section].pop(field, harmless) if isinstance(content.get(section), dict) else harmless
+        gone += [name] if found != harmless else []
+    return content, gone
 
 
 @contextlib.contextmanager

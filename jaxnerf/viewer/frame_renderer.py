@@ -97,7 +97,7 @@ class FrameRenderer:
             views: of the split "train", for NDC and, where space is contracted, for near and far.
             chunk: rays rendered at once; None: as many as suit the device.
         """
-        own = run.experiment.eval
+        own = run.experiment.config.eval
         fast = {
             "sample_multiplier": own.sample_multiplier * _FAST_SAMPLES,
             "early_stop_eps": max(own.early_stop_eps, _FAST_STOP),
@@ -105,7 +105,7 @@ class FrameRenderer:
         models = {False: run.model_with({}), True: run.model_with(fast)}
         self._baked, self._cull = models[False].grid_schedule is None, models[False].cull
         self._chunk = chunk or _CHUNK.get(jax.default_backend(), _CHUNK_ELSEWHERE)
-        self._ndc, self._offset = run.experiment.ndc, run.experiment.pixel_offset
+        self._ndc, self._offset = run.experiment.config.data.ndc, run.experiment.config.data.pixel_offset
         self._middle = np.asarray(views.cameras.to_world)[:, :, 3].mean(axis=0)
         self._bounds = float(np.min(views.near)), float(np.max(views.far))
         height, width = (int(side) for side in views.size[0])

@@ -201,10 +201,10 @@ class Page:
             box = self._viewer.state.box
         elif schedule is not None and not schedule.contracted:  # a training has made no state yet
             box = np.array([schedule.lower, schedule.upper])
-        if box is None or not np.isfinite(box).all() or self._viewer.run.experiment.ndc:
+        if box is None or not np.isfinite(box).all() or self._viewer.run.experiment.config.data.ndc:
             reach = 2 * self._size
             middle = self._target
-            if self._viewer.run.experiment.ndc:
+            if self._viewer.run.experiment.config.data.ndc:
                 middle = self._look_at(self._poses[0])
             box = np.stack([middle - reach, middle + reach])
         step = 10.0 ** math.floor(math.log10(np.ptp(box, axis=0).max() / 100))  # round numbers, outwards
@@ -251,7 +251,7 @@ class Page:
         if self._show_grid.value is not True or state is None or state.grid is None:
             return
         points, cell = _surface_cells(state.grid)
-        if self._viewer.run.experiment.ndc:
+        if self._viewer.run.experiment.config.data.ndc:
             points = _from_ndc(points, self._viewer.views)
         if len(points):
             self._cells = self._client.scene.add_point_cloud(

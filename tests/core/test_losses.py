@@ -11,9 +11,9 @@ from jax.extend.core import jaxprs_in_params
 
 import jaxnerf
 from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compiled, full_grid, rays_past_origin
-from jaxnerf.core.losses import depth_loss, hash_decay, mse_loss, opaque_loss, total_variation
+from jaxnerf.core.losses import depth_loss, mse_loss, opaque_loss
 from jaxnerf.core.occupancy.grid import is_occupied
-from jaxnerf.core.types import TableLevel, without_samples
+from jaxnerf.core.types import without_samples
 
 pytest_plugins = ["run_fixtures"]
 
@@ -375,27 +375,3 @@ def test_the_opaque_loss_is_the_squared_transmittance_of_opaque_pixels():
     rendering = dataclasses.replace(make_rendering(np.zeros((4, 1)), None, None), opacity=opacity)
     batch = dataclasses.replace(make_batch(np.ones(4), 2.0), alpha=np.float32([1, 1, 1, 0]))
     np.testing.assert_allclose(opaque_loss([rendering], batch), [1, 0.5625, 0, 0])
-
-
-LEVELS = (TableLevel((2, 3, 2), range(12)), TableLevel((4, 4, 4), range(12, 32)), TableLevel((3, 2, 2), range(32, 44)))
-
-
-def test_hash_decay_weights_all_levels_alike():
-    table = np.float32(np.random.default_rng(0).normal(size=(44, 2)))
-    value, slope = jax.value_and_grad(lambda table: hash_decay({"fine": {"table": table}}, LEVELS))(table)
-    each = [table[level.rows.start : level.rows.stop] for level in LEVELS]
-    np.testing.assert_allclose(value, np.mean([(part**2).mean() for part in each]), rtol=1e-5)
-    np.testing.assert_allclose(slope, np.concatenate([2 * part / part.size / 3 for part in each]), rtol=1e-5)
-
-
-def test_total_variation_compares_neighbours_in_levels_that_are_not_hashed():
-    table = np.float32(np.random.default_rng(0).normal(size=(44, 2)))
-    loss = jax.value_and_grad(lambda table: total_variation({"fine": {"table": table}}, LEVELS))
-    value, slope = jax.jit(loss)(table)
-    want = 0.0
-    for level in (LEVELS[0], LEVELS[2]):
-        vertices = table[level.rows.start : level.rows.stop].reshape(*level.size, 2)
-        want += sum((np.diff(vertices, axis=axis) ** 2).mean() for axis in range(3)) / 2
-    np.testing.assert_allclose(value, want, rtol=1e-5)
-    assert not slope[12:32].any() and slope[:12].any() and abs(slope.sum()) < 1e-5
-    assert total_variation({"fine": {"table": table}}, LEVELS[1:2]) == 0

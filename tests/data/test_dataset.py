@@ -10,10 +10,10 @@ import captures
 from jaxnerf import Camera, SparsePoints, Views, load_dataset
 from jaxnerf.configs import capture
 from jaxnerf.data import dataset
-from jaxnerf.data.dataset import held_out, load_split, select_views
+from jaxnerf.data.dataset import DataOptions, held_out, load_split, select_views
 from jaxnerf.data.readers import transforms
+from jaxnerf.options import replaced
 from jaxnerf.registry import READERS, Reader
-from runs import smoke_config
 
 SIZES = [(2, 3), (1, 4), (3, 3), (2, 2)]
 
@@ -53,19 +53,22 @@ def views():
     [("train", 3, ["train_000", "train_020", "train_040"]), ("test", 99, None), ("held_out", 2, None)],
 )
 def test_at_most_some_views_are_read(split, number, names):
-    data = smoke_config().data
-    data.hold_out = 10 if split == "held_out" else 0
+    data = DataOptions(size=24, hold_out=10 if split == "held_out" else 0)
     whole, some = load_split(data, split), load_split(data, split, max_views=number)
     count = min(number, len(whole.names))
     places = np.arange(count) * len(whole.names) // count
     assert list(some.names) == [whole.names[place] for place in places] and (names is None or list(some.names) == names)
 
 
+def capture_data(**changes):
+    """Returns the options of the dataset in configs/capture.py, with some changes."""
+    return DataOptions(**{**capture.get_config().data, **changes})
+
+
 def test_a_relative_folder_is_saved_as_an_absolute_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     captures.write_transforms(tmp_path / "scene", captures.noise(captures.orbit(8)))
-    data = capture.get_config().data
-    data.dir = "scene"
+    data = capture_data(dir="scene")
     assert dataset.resolve(data)[0].dir == str(tmp_path / "scene")
     (tmp_path / "below").mkdir()
     monkeypatch.chdir(tmp_path / "below")
@@ -121,9 +124,7 @@ def test_held_out_indices_are_equally_spaced(count):
 
 
 def test_training_and_held_out_views_partition_the_split():
-    data = smoke_config().data
-    every = load_split(data, "train")
-    data.hold_out = 7
+    every, data = load_split(DataOptions(size=24), "train"), DataOptions(size=24, hold_out=7)
     train, held = load_split(data, "train"), load_split(data, "held_out")
     assert len(held.offset) == 9 and len(train.offset) == 51
     assert held.names[:2] == ("train_003", "train_010")
@@ -136,38 +137,32 @@ def test_training_and_held_out_views_partition_the_split():
 
 @pytest.mark.parametrize("hold_out", [1, -2, 61])
 def test_a_hold_out_that_leaves_no_view_is_an_error(hold_out):
-    data = smoke_config().data
-    data.hold_out = hold_out
+    data = DataOptions(size=24, hold_out=hold_out)
     for split in ("train", "held_out"):
         with pytest.raises(ValueError, match=f"data.hold_out is {hold_out} of 60 views, expected 2 to 60"):
             load_split(data, split)
 
 
 def test_nothing_is_held_out_by_default():
-    data = smoke_config().data
+    data = DataOptions(size=24)
     assert len(load_split(data, "train").offset) == 60
     with pytest.raises(ValueError, match="held_out"):
         load_split(data, "held_out")
 
 
 def test_num_views_are_evenly_spread_over_the_views_that_are_not_held_out():
-    data = smoke_config().data
-    data.hold_out = 7
-    train = load_split(data, "train")
-    data.num_views = 17
-    some = load_split(data, "train")
+    data = DataOptions(size=24, hold_out=7)
+    train, some = (load_split(each, "train") for each in (data, replaced(data, num_views=17)))
     assert some.names == train.names[::3]
     jax.tree.map(np.testing.assert_array_equal, some, select_views(train, np.arange(17) * 3))
     assert len(load_split(data, "held_out").offset) == 9
-    data.num_views = 52
     with pytest.raises(ValueError, match="data.num_views is 52 of 51 views, expected 1 to 51"):
-        load_split(data, "train")
+        load_split(replaced(data, num_views=52), "train")
 
 
 def test_num_views_of_files_reads_only_those_views(tmp_path):
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    data = capture.get_config().data
-    data.update({"dir": str(tmp_path), "num_views": 3, "hold_out": 3})
+    data = capture_data(dir=str(tmp_path), num_views=3, hold_out=3)
     assert load_split(data, "held_out").names == ("003", "006")
     train = load_split(data, "train")  # of 001, 002, 004, 005, 007
     assert train.names == ("001", "002", "005") and len(train.pixels) == 3 * 24 * 32
@@ -187,8 +182,7 @@ def test_load_dataset_infers_everything_from_the_folder(tmp_path, name):
     shots = captures.shoot(stack(8)) if name in ("colmap", "llff") else captures.noise(stack(8))
     write(tmp_path, shots)
     views = load_dataset(tmp_path)
-    data = capture.get_config().data
-    data.update({"dir": str(tmp_path), "factor": 1})
+    data = capture_data(dir=str(tmp_path), factor=1)
     resolved, _ = dataset.resolve(data)
     assert resolved.format == name and resolved.world == dict(blender="file", llff="forward").get(name, "around")
     assert (len(views.offset), views.size.tolist()[0]) == (8 if name == "blender" else 7, [24, 32])
@@ -206,7 +200,7 @@ def test_load_dataset_takes_the_fields_of_the_data_section(tmp_path):
     assert views.size.tolist() == [[12, 16]] * 7 and views.background == (0, 0, 0)
     np.testing.assert_array_equal(views.to_file, np.eye(4))
     np.testing.assert_allclose([views.near[0], views.far[0]], [2.5, 6.5])
-    with pytest.raises(ValueError, match="scale is no option, expected one of background, dir"):
+    with pytest.raises(ValueError, match="scale is no option, expected one of format, dir"):
         load_dataset(tmp_path, scale=2)
     with pytest.raises(ValueError, match="split is 'all'"):
         load_dataset(tmp_path, split="all")
@@ -228,8 +222,7 @@ def test_a_registered_format_is_detected_resolved_and_split(tmp_path, monkeypatc
     reader = Reader(read, detect=lambda folder: (folder / "renamed.json").is_file())
     monkeypatch.setattr(READERS, "_parts", dict(READERS._parts))
     READERS.add("renamed", reader)
-    data = capture.get_config().data
-    data.update({"dir": str(tmp_path), "hold_out": 3})
+    data = capture_data(dir=str(tmp_path), hold_out=3)
     resolved, lines = dataset.resolve(data)
     assert resolved.format == "renamed" and resolved.fingerprint.startswith("8 images, ")
     assert "format        renamed" in lines

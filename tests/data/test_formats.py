@@ -14,22 +14,22 @@ import pytest
 
 import captures
 from jaxnerf import Rays, render_rays
-from jaxnerf.configs import capture, default
+from jaxnerf.configs import capture
 from jaxnerf.data import dataset
 from jaxnerf.data.active_pixels import unmasked_pixels
+from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.ray_batches import pixel_colors, view_rays
 from jaxnerf.fields import still_life
+from jaxnerf.options import replaced, values_of
 from jaxnerf.training import workdir
+from jaxnerf.training.config import read_config
 
 RAYS = 64  # per view
 
 
 def a_data(folder, **changes):
     """Returns the data section of configs/capture.py for a folder, at full size."""
-    data = capture.get_config().data
-    data.dir, data.factor = str(folder), 1
-    data.update(changes)
-    return data
+    return DataOptions(**{**capture.get_config().data, "dir": str(folder), "factor": 1, **changes})
 
 
 @functools.cache
@@ -227,10 +227,10 @@ def test_resolving_again_changes_nothing(tmp_path):
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
     data, _ = dataset.resolve(a_data(tmp_path))
     again, lines = dataset.resolve(data)
-    assert again.to_dict() == data.to_dict() and not lines
-    synthetic, lines = dataset.resolve(default.get_config().data)
+    assert again == data and not lines
+    synthetic, lines = dataset.resolve(DataOptions())
     for resolved in (again, synthetic):  # the rest depends on the sampler and on the images
-        left = {name for name, value in resolved.items() if value == "auto"}
+        left = {name for name, value in values_of(resolved).items() if value == "auto"}
         assert not lines and left == {"near", "background_color"}
 
 
@@ -258,9 +258,7 @@ def test_a_dataset_that_changed_since_training_is_an_error(tmp_path):
 
 
 def to_config(data):
-    config = capture.get_config()
-    config.data = data
-    return config
+    return replaced(read_config(capture.get_config()), data=data)
 
 
 def test_ndc_require_cameras_that_look_in_one_direction(tmp_path):

@@ -30,7 +30,7 @@ def start_run(folder):
     config.data.update({"dir": "scene", "format": "auto"})
     resolved = auto_config.resolve(config).config
     workdir.claim(folder, resolved)
-    return workdir.read_config(folder)
+    return workdir.load_config(folder)
 
 
 def test_a_run_finds_a_dataset_of_a_relative_path_from_any_current_folder(scene, tmp_path, monkeypatch):

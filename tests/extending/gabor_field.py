@@ -7,10 +7,11 @@ Train with it by
 
     jaxnerf-train --plugins=gabor_field --config=embedded_small --config.field=gabor --workdir=runs/gabor
 
-where gabor_field.py is in the current folder or on PYTHONPATH. The options below may also be set in a config
-file: `config.gabor = {"num_features": 128}`.
+where gabor_field.py is in the current folder or on PYTHONPATH. `--config.gabor.num_features=128` sets an option, and
+so does a config file: `config.gabor.num_features = 128`.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -18,15 +19,31 @@ import jax.numpy as jnp
 
 import jaxnerf
 from jaxnerf.fields.base import Field
+from jaxnerf.options import POSITIVE, Options, at_least, infer, option
+
+
+@dataclasses.dataclass(frozen=True)
+class GaborOptions(Options):
+    """The options of the field: the config's section `gabor`, with flags, checks and help."""
+
+    num_features: int = option(64, "Gabor features", range=at_least(1))
+    max_frequency: float = option(
+        "auto", "standard deviation of the initial frequencies", unit="1 / world unit", range=POSITIVE, auto=True
+    )
+
+    def resolve(self, facts, device):
+        """Infers what is "auto" from plain numbers about the dataset; the line is printed when a run starts."""
+        frequency = min(1 / (8 * facts.footprint), 8.0)
+        return infer(self, max_frequency=(frequency, f"gabor         frequencies of about {frequency:.2g}"))
 
 
 def make_gabor_field(options, box):
-    """Makes the field from a config's section `gabor`; box: (lower, upper) corner of the scene, or None."""
+    """Makes the field from GaborOptions; box: (lower, upper) corner of the scene, or None."""
     lower, upper = jnp.array(box if box is not None else ((-1.5,) * 3, (1.5,) * 3))
-    return Field(functools.partial(init, lower=lower, upper=upper, **options), apply)
+    return Field(functools.partial(init, lower=lower, upper=upper, **dataclasses.asdict(options)), apply)
 
 
-def init(key, *, lower, upper, num_features=64, max_frequency=8.0):
+def init(key, *, lower, upper, num_features, max_frequency):
     """Draws the parameters: any pytree of float arrays. `key` is the only source of randomness."""
     keys = jax.random.split(key, 5)
     return {
@@ -54,4 +71,4 @@ def at_point(params, x, viewdir):
     return jax.nn.softplus(features @ params["to_density"]), jax.nn.sigmoid(rgb)
 
 
-jaxnerf.register_field("gabor", make_gabor_field)
+jaxnerf.register_field("gabor", make_gabor_field, options=GaborOptions)

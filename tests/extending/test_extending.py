@@ -16,6 +16,7 @@ import captures
 import export_sources
 import jaxnerf
 from jaxnerf.registry import EXPORTERS
+from jaxnerf.training import auto_config
 from jaxnerf.training.metric_log import read_rows
 from runs import ROOT, SMOKE_FLAGS, smoke_config, start
 
@@ -39,7 +40,7 @@ def train(workdir, change):
 def test_a_field(tmp_path):
     def use_gabor(config):
         config.field = "gabor"
-        config.gabor = {"num_features": 16}
+        config.gabor.num_features = 16
 
     train(tmp_path / "run", use_gabor)
     params, _ = jaxnerf.restore_run(tmp_path / "run").variables(STEPS)
@@ -52,7 +53,7 @@ def test_a_field(tmp_path):
 def test_a_sampler(tmp_path):
     def use_uniform(config):
         config.sampler = "uniform"
-        config.uniform = {"num_samples": 8}
+        config.uniform.num_samples = 8
 
     train(tmp_path / "run", use_uniform)
     params, _ = jaxnerf.restore_run(tmp_path / "run").variables(STEPS)
@@ -130,15 +131,29 @@ def test_the_export_program_restores_a_run_without_a_grid(trained, tmp_path):
         assert "Traceback" not in err
 
 
+def test_a_plugins_options_are_checked_and_inferred_like_all_others(tmp_path):
+    config = smoke_config(max_steps=1)
+    config.field, config.sampling.num_fine, config.gabor.num_features = "gabor", 0, 0
+    with pytest.raises(ValueError, match="--config.gabor.num_features is 0, expected at least 1; correct it"):
+        jaxnerf.train_and_evaluate(config, tmp_path / "run")
+    with pytest.raises(TypeError):
+        config.gabor.num_features = "many"
+    config.gabor.num_features = 4
+    resolved = auto_config.resolve(config)
+    assert resolved.config.plugins["gabor"].max_frequency > 0 and "uniform" not in resolved.config.plugins
+    assert any(line.startswith("gabor ") for line in resolved.lines)
+
+
 @pytest.mark.slow
 def test_the_programs_import_plugins(compiled_once, tmp_path):
     """Training with the sampler and the loss works by --plugins, and without it the message names the flag."""
     changes = ("sampler=uniform", "losses.mask=0.1", "train.max_steps=2")
     flags = [*SMOKE_FLAGS, *(f"--config.{change}" for change in changes), f"--workdir={tmp_path / 'run'}"]
     path = f"{ROOT / 'tests' / 'extending'}:{ROOT}"
-    failed = start("train", *flags, PYTHONPATH=path)
-    _, err = failed.communicate(timeout=120)
-    assert failed.returncode != 0 and "jaxnerf.register_sampler with --plugins=MODULE" in err
+    for some in (flags, [flag for flag in flags if "losses.mask" not in flag]):
+        failed = start("train", *some, PYTHONPATH=path)
+        _, err = failed.communicate(timeout=120)
+        assert failed.returncode != 0 and "with --plugins=MODULE" in err and err.count("\n") == 1
     trained = start("train", "--plugins=uniform_sampler,mask_loss", *flags, PYTHONPATH=path)
     _, err = trained.communicate(timeout=120)
     assert trained.returncode == 0, err

@@ -4,21 +4,30 @@ Train with it by
 
     jaxnerf-train --plugins=uniform_sampler --config=embedded_small --config.sampler=uniform --workdir=runs/uniform
 
-where uniform_sampler.py is in the current folder or on PYTHONPATH. A config file may set the number of samples:
-`config.uniform = {"num_samples": 256}`.
+where uniform_sampler.py is in the current folder or on PYTHONPATH. `--config.uniform.num_samples=256` sets the number
+of samples.
 """
 
+import dataclasses
 import functools
 
 import jaxnerf
 from jaxnerf.core.types import without_samples
 from jaxnerf.models.base import Model
+from jaxnerf.options import Options, at_least, option
+
+
+@dataclasses.dataclass(frozen=True)
+class UniformOptions(Options):
+    """The options of the sampler: the config's section `uniform`."""
+
+    num_samples: int = option(128, "samples per ray", range=at_least(1))
 
 
 def make_uniform_model(context):
-    """Makes the Model from a SamplerContext, which makes fields and holds the config's sections."""
+    """Makes the Model from a SamplerContext, which makes fields and holds the sampler's options."""
     field = context.make_field("fine")  # the field that the config names
-    num_samples = context.sections.get("uniform", {}).get("num_samples", 128)
+    num_samples = context.options.num_samples
     render_rays = functools.partial(jaxnerf.render_rays, num_samples=num_samples, background=context.background)
 
     def init(key):
@@ -28,8 +37,8 @@ def make_uniform_model(context):
         return functools.partial(field.apply, params["fine"])
 
     def render(keys, params, grid, rays, step):
-        """Renders a training batch: a tuple, whose last Rendering is the one that metrics report."""
-        return (render_rays(keys, scene(params, grid), rays),)
+        """Renders a training batch: a dict with the Rendering of each network."""
+        return {"fine": render_rays(keys, scene(params, grid), rays)}
 
     def view(params, grid, rays):
         """Renders images: without a key the samples are at fixed places."""
@@ -41,9 +50,8 @@ def make_uniform_model(context):
         view=view,
         scene=scene,
         samples_per_ray=num_samples,
-        input_layers={"fine": field.input_layers},
-        color_layers={"fine": field.color_layers},
+        fields={"fine": field},
     )
 
 
-jaxnerf.register_sampler("uniform", make_uniform_model)
+jaxnerf.register_sampler("uniform", make_uniform_model, options=UniformOptions)

@@ -7,8 +7,16 @@ import optax
 import pytest
 
 from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
-from jaxnerf.core.types import TableLevel
-from jaxnerf.fields.hash_grid import color_activation, harmonics, hash_grid_field, interpolate, vertices
+from jaxnerf.fields.hash_grid import (
+    TableLevel,
+    color_activation,
+    harmonics,
+    hash_decay,
+    hash_grid_field,
+    interpolate,
+    total_variation,
+    vertices,
+)
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -404,3 +412,27 @@ def test_hashed_levels_with_different_numbers_of_rows_are_named():
 def test_a_table_of_another_shape_is_named():
     with pytest.raises(ValueError, match="interpolate: table"):
         interpolate(jnp.ones(8), [jnp.zeros(3)] * 3, [TableLevel((2, 2, 2), range(8))])
+
+
+LEVELS = (TableLevel((2, 3, 2), range(12)), TableLevel((4, 4, 4), range(12, 32)), TableLevel((3, 2, 2), range(32, 44)))
+
+
+def test_hash_decay_weights_all_levels_alike():
+    table = np.float32(np.random.default_rng(0).normal(size=(44, 2)))
+    value, slope = jax.value_and_grad(lambda table: hash_decay({"table": table}, levels=LEVELS))(table)
+    each = [table[level.rows.start : level.rows.stop] for level in LEVELS]
+    np.testing.assert_allclose(value, np.mean([(part**2).mean() for part in each]), rtol=1e-5)
+    np.testing.assert_allclose(slope, np.concatenate([2 * part / part.size / 3 for part in each]), rtol=1e-5)
+
+
+def test_total_variation_compares_neighbours_in_levels_that_are_not_hashed():
+    table = np.float32(np.random.default_rng(0).normal(size=(44, 2)))
+    loss = jax.value_and_grad(lambda table: total_variation({"table": table}, levels=LEVELS))
+    value, slope = jax.jit(loss)(table)
+    want = 0.0
+    for level in (LEVELS[0], LEVELS[2]):
+        vertices = table[level.rows.start : level.rows.stop].reshape(*level.size, 2)
+        want += sum((np.diff(vertices, axis=axis) ** 2).mean() for axis in range(3)) / 2
+    np.testing.assert_allclose(value, want, rtol=1e-5)
+    assert not slope[12:32].any() and slope[:12].any() and abs(slope.sum()) < 1e-5
+    assert total_variation({"table": table}, levels=LEVELS[1:2]) == 0

@@ -189,7 +189,7 @@ def test_a_mismatch_names_the_field_to_change(tmp_path):
     assert "2 network(s), expected fine; give as many, or change sampling.num_fine" in message(sampling={"num_fine": 0})
     assert message(density_bias=1.0) == "coarse.density_bias is 1.0, expected 0 as in JaxNeRF"
     assert message(encode=False) == "coarse.encode is False, expected True as in JaxNeRF"
-    assert message(density_activation="elu").startswith("coarse.density_activation is 'elu', expected 'relu' or")
+    assert message(density_activation="elu").startswith("--config.coarse.density_activation is 'elu', expected one of")
 
 
 def test_an_extra_layer_a_used_folder_and_a_wrong_flag_are_refused(tmp_path):

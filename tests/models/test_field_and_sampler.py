@@ -40,7 +40,7 @@ def test_the_loss_falls(field, sampler):
     positions, losses = jnp.arange(config.train.batch_size)[None], []
     for _ in range(STEPS):
         state, metrics = step(state, data, positions)
-        losses.append(float(metrics["mse"]))
+        losses.append(float(metrics["mse_fine"]))
         assert metrics["loss_distortion"] >= 0
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
     assert not state.counters["nonfinite"]

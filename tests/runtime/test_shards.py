@@ -186,8 +186,7 @@ def test_views_of_other_settings_are_not_mixed(fresh, run, whole):
     other = restore_run(run[0], settings={"sample_multiplier": 2.0})
     with pytest.raises(ValueError, match=r"20.tmp: holds .* sample_multiplier 1.0, not 2.0; give --overwrite without"):
         score_run(other, run[0], shard=(1, 2))
-    config = workdir.read_config(run[0])
-    config.fine.density_bias = 0.5
+    config = workdir.load_config(run[0], fine={"density_bias": 0.5})
     with pytest.raises(ValueError, match="rendered with config"):
         score_run(restore_run(run[0], config), run[0])
     chunked = restore_run(run[0], settings={"chunk": 577})

@@ -45,15 +45,15 @@ def train_step(views, platform="gpu", **fields):
     """Returns the training step with an occupancy grid, and its arguments: state, data and positions."""
     experiment = experiment_of(views, "occupancy", platform, **fields)
     cells, data = experiment.prepare(views)
-    state = create_state(experiment.model, experiment.optimizer, experiment.seed, cells)
+    state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, cells)
     step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
-    return step, (state, data, jnp.arange(experiment.train.batch_size)[None])
+    return step, (state, data, jnp.arange(experiment.config.train.batch_size)[None])
 
 
 def image(views, sampler):
     """Returns the function that renders rays for evaluation, and its arguments."""
     experiment = experiment_of(views, sampler)
-    state = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, experiment.seed))
+    state = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, experiment.config.seed))
     rays = experiment.view_rays(views, 0, pixel_grid(4, 4, offset=0.5))
     return experiment.model.view, (state.params, state.grid, rays)
 

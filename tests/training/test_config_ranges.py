@@ -5,12 +5,13 @@ import math
 import pytest
 from ml_collections import ConfigDict
 
-from jaxnerf.configs import default
 from jaxnerf.evaluation.evaluate import train_and_evaluate
+from jaxnerf.options import is_auto
 from jaxnerf.runtime import devices
-from jaxnerf.runtime.config_fields import UNLIMITED_STEPS, is_auto
-from jaxnerf.training import build, config_ranges
+from jaxnerf.training import build
 from jaxnerf.training.auto_config import resolve_for_device
+from jaxnerf.training.config import RunConfig, declared, read_config
+from jaxnerf.training.options import UNLIMITED_STEPS
 from runs import PACKED, ROOT, smoke_config
 
 
@@ -38,9 +39,9 @@ def test_a_number_outside_its_range_makes_no_workdir(tmp_path, field, value, exp
 
 @pytest.mark.parametrize("field", ["max_steps", "lr_steps"])
 def test_a_run_that_its_time_ends_cannot_become_one_without_a_limit(field):
-    config_ranges.check_ranges(smoke_config(max_seconds=60.0, **{field: UNLIMITED_STEPS}))
+    read_config(smoke_config(max_seconds=60.0, **{field: UNLIMITED_STEPS}))
     with pytest.raises(ValueError, match=rf"--config.train.{field} is 10,000,000, .* and that is 0; set a time"):
-        config_ranges.check_ranges(smoke_config(max_seconds=0.0, **{field: UNLIMITED_STEPS}))
+        read_config(smoke_config(max_seconds=0.0, **{field: UNLIMITED_STEPS}))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +128,7 @@ def test_the_samples_of_ray_marching_are_limited(field, value, expected):
     config.update_from_flattened_dict(PACKED | {"occupancy.lower": (-1.5,) * 3, "occupancy.upper": (1.5,) * 3})
     config.update_from_flattened_dict({field: value})
     with pytest.raises(ValueError, match=f"--config.{field} is {value}, expected {expected}".replace("+", r"\+")):
-        config_ranges.check_ranges(config)
+        read_config(config)
 
 
 @pytest.mark.parametrize(
@@ -146,19 +147,19 @@ def test_what_does_not_fit_into_memory_is_rejected(field, value):
     config.update_from_flattened_dict(PACKED | {"hash_grid.resolutions": (2**20,), field: value})
     name = "hash_grid.width" if field == "hash_grid.geometry_features" else field
     with pytest.raises(ValueError, match=rf"--config.{name} is .*, which needs .* GB"):
-        config_ranges.check_ranges(config)
+        read_config(config)
 
 
-def test_every_range_is_one_of_a_number():
-    names = [name for _, _, names in config_ranges._RANGES for name in names.split()]
-    assert len(set(names)) == len(names)
-    for name in names:
-        section, field = name.split(".")
-        value = default.get_config()[section][field]
-        assert is_auto(value) or isinstance(value, int | float), name
+def test_defaults_are_of_their_types_and_in_their_ranges():
+    names = [name for name, _, _, _ in declared(RunConfig())]
+    assert len(set(names)) == len(names) > 100
+    assert read_config(RunConfig().to_dict()) == RunConfig()
+    for name, option, kind, value in declared(RunConfig()):
+        assert option.help and not (option.range and kind not in (int, float)), name
+        assert option.auto or not is_auto(value) or name == "train.parallel", name
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "configs").glob("[!_]*.py")))
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "jaxnerf" / "configs").glob("[!_]*.py")))
 def test_the_configs_are_in_their_ranges(name):
     module = __import__(f"jaxnerf.configs.{name}", fromlist=["get_config"])
-    config_ranges.check_ranges(module.get_config())
+    read_config(module.get_config())

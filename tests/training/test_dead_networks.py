@@ -13,6 +13,7 @@ import pytest
 
 from helpers import assert_same, random_rays
 from jaxnerf import Batch
+from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model
 from jaxnerf.runtime import devices
 from jaxnerf.training import dead_networks, loop, metric_log
@@ -40,7 +41,7 @@ def network(detect_color=True):
     config.fine.use_viewdirs = False
     model = build_model(config)
     if not detect_color:
-        model = model._replace(color_layers={})
+        model = model._replace(fields={name: field._replace(color_layers=()) for name, field in model.fields.items()})
 
     def draw(step, positions, batch):
         keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(step)))(positions)
@@ -239,7 +240,7 @@ def test_reinitialized_network_learns():
     _, metrics = network()[2](dead, images())
     state, counts = follow(dead_networks.make_reinitialize(model, OPTIMIZER, 0)(dead, ("fine",)), images(), 100)
     assert max(counts) == 0
-    assert network()[2](state, images())[1]["mse"] < 0.1 * metrics["mse"]
+    assert network()[2](state, images())[1]["mse_fine"] < 0.1 * metrics["mse_fine"]
 
 
 def test_run_resumed_before_the_detection_is_bit_exact(reinitialized, tmp_path):
@@ -283,18 +284,18 @@ def test_run_that_keeps_dying_stops_with_advice(tmp_path):
 
 def test_networks_of_any_structure_and_number_are_counted_by_name():
     """Parameters may be any pytree, and the order of the names says nothing about the order of the renderings."""
-    grads = {"fine": [jnp.zeros(3)], "proposal": jnp.ones(2), "warp": {"a": jnp.zeros(1)}}
+    grads = {"fine": [jnp.zeros(3)], "coarse": jnp.ones(2), "warp": {"a": jnp.zeros(1)}, "proposal": jnp.zeros(1)}
     counters = {f"dead_{name}": jnp.int32(4) for name in grads}
-    errors = {"fine": jnp.float32(0.1), "proposal": jnp.float32(0.1), "warp": jnp.float32(0.0)}
-    got = dead_networks.count_dead_steps(counters, grads, errors, {"fine": ()}, {"fine": ()})
-    assert jax.tree.map(int, got) == {"dead_fine": 5, "dead_proposal": 0, "dead_warp": 4}
+    errors = {"fine": jnp.float32(0.1), "coarse": jnp.float32(0.1), "warp": jnp.float32(0.0)}
+    got = dead_networks.count_dead_steps(counters, grads, errors, {"fine": Field(init=None, apply=None)})
+    assert jax.tree.map(int, got) == {"dead_fine": 5, "dead_coarse": 0, "dead_warp": 4}
 
 
 @pytest.mark.parametrize("num_rays", [16, 4096])
 @pytest.mark.parametrize("slope, is_dead", [(1e-6, True), (1e-2, False)])
 def test_a_small_gradient_counts_alike_for_any_number_of_rays(num_rays, slope, is_dead):
     def render(keys, params, grid, rays, step):
-        return (toy_rendering(rays.viewdirs + slope * params["fine"]["w"][None]),)
+        return {"fine": toy_rendering(rays.viewdirs + slope * params["fine"]["w"][None])}
 
     model = Model(lambda key: {"fine": {"w": jnp.zeros(3)}}, render, view=None, scene=None, samples_per_ray=1.0)
     step = jax.jit(make_train_step(model, OPTIMIZER, toy_draw, LOSSES))

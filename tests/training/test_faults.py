@@ -18,6 +18,7 @@ from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config import read_config
 from jaxnerf.training.state import create_state
 from jaxnerf.training.workdir import claim, workdir_lock
 from runs import ROOT, SMOKE_FLAGS, smoke_config
@@ -40,7 +41,7 @@ def variables(folder, step):
 def load_newest(folder, keep):
     experiment = restore_run(folder).experiment
     checkpoints = Checkpoints(folder, max_to_keep=keep)
-    like = create_state(experiment.model, experiment.optimizer, experiment.seed)
+    like = create_state(experiment.model, experiment.optimizer, experiment.config.seed)
     try:
         return checkpoints.load_newest(like)
     finally:
@@ -305,7 +306,7 @@ def test_partial_files_of_a_killed_run_are_removed_and_no_others(tmp_path):
         (tmp_path / name).write_text("partial")
     for name in ("folder.tmp", "config.json.folder.tmp"):
         (tmp_path / name).mkdir()
-    claim(tmp_path, smoke_config())
+    claim(tmp_path, read_config(smoke_config()))
     assert {path.name for path in tmp_path.iterdir()} == {
         "config.json",
         "notes.tmp",

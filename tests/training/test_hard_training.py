@@ -118,7 +118,7 @@ def test_batch_that_misses_the_scene_shows_the_background_without_gradient(kind)
     batch = a_batch(far=2.0)
     state, metrics = step(first, batch)
     error = float(((1 - batch.rgb) ** 2).mean())
-    assert metrics["mse"] == pytest.approx(error, rel=1e-6)
+    assert metrics["mse_fine"] == pytest.approx(error, rel=1e-6)
     assert metrics["mse_coarse"] == pytest.approx(error, rel=1e-6)
     assert metrics["grad_norm"] == 0
     assert_same(state.params, first.params, rtol=0, atol=0)
@@ -134,7 +134,7 @@ def test_white_image_over_a_white_background_is_learned(name, kind):
     rows = []
     for _ in range(30):
         state, metrics = step(state, batch)
-        rows.append(float(metrics["mse"]))
+        rows.append(float(metrics["mse_fine"]))
     assert rows[-1] <= 0.5 * rows[0] and rows[-1] < 1e-3
 
 

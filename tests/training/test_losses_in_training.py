@@ -86,7 +86,7 @@ def test_the_loss_is_the_weighted_sum_by_name():
     _, (row,) = train({"mse": 2.0, "distortion": 0.3})
     assert row["loss_distortion"] > 1e-4
     assert row["loss"] == pytest.approx(2 * row["loss_mse"] + 0.3 * row["loss_distortion"], rel=1e-5)
-    assert row["loss_mse"] == pytest.approx(row["mse"], rel=1e-5)
+    assert row["loss_mse"] == pytest.approx(row["mse_fine"], rel=1e-5)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -182,7 +182,7 @@ def test_the_distortion_loss_gathers_the_weights_of_a_packed_ray():
     last = [train({"mse": 2.0, "distortion": weight}, 12, packed=True)[1][-1] for weight in (1e-6, 3.0)]
     assert last[1]["loss_distortion"] < 0.9 * last[0]["loss_distortion"]
     assert last[1]["loss"] == pytest.approx(2 * last[1]["loss_mse"] + 3 * last[1]["loss_distortion"], rel=1e-5)
-    assert last[1]["loss_mse"] == last[1]["mse"]
+    assert last[1]["loss_mse"] == last[1]["mse_fine"]
     assert all(np.isfinite(row["grad_norm"]) for row in last)
 
 
@@ -247,5 +247,5 @@ def test_a_regularizer_of_levels_gets_those_of_the_hash_grid():
     (decay,) = [loss for loss in experiment.losses if loss.name == "hash_decay"]
     params = experiment.model.init(jax.random.key(0))
     assert decay.needs == () and decay.function(params) == pytest.approx(0.025**2 / 3, rel=0.1)  # uniform entries
-    with pytest.raises(ValueError, match="losses.hash_decay needs a hash grid, which the field does not have"):
+    with pytest.raises(ValueError, match="losses.hash_decay needs a field that brings it, as a hash grid does"):
         build_losses({"mse": 1.0, "hash_decay": 0.1})

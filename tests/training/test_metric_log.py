@@ -6,12 +6,12 @@ import types
 import numpy as np
 import pytest
 
-from jaxnerf.runtime.config_fields import UNLIMITED_STEPS
 from jaxnerf.training import metric_log
+from jaxnerf.training.options import UNLIMITED_STEPS
 
 STEP = {
     "loss": 0.5,
-    "mse": 0.01,
+    "mse_fine": 0.01,
     "mse_coarse": 0.1,
     "grad_norm": 1.0,
     "nonfinite": 0,
@@ -19,7 +19,11 @@ STEP = {
     "num_reinits": 0,
 }
 TRAIN = types.SimpleNamespace(batch_size=64, max_steps=100, max_seconds=0.0)
-EXPERIMENT = types.SimpleNamespace(train=TRAIN, schedule=lambda step: 1e-3 * step)
+EXPERIMENT = types.SimpleNamespace(
+    config=types.SimpleNamespace(train=TRAIN),
+    model=types.SimpleNamespace(image_networks=("coarse", "fine")),
+    schedule=lambda step: 1e-3 * step,
+)
 
 
 def row(steps, step=20):
@@ -31,7 +35,7 @@ def row(steps, step=20):
 def test_row_averages_errors_and_keeps_the_last_counters():
     found = row([{"loss": 1.0, "dead_fine": 3}])
     assert (found["loss"], found["dead_fine"], found["rays"]) == (1.0, 3, 20 * 64)
-    found = row([{"mse": 0.01, "nonfinite": 1}, {"mse": 0.03, "nonfinite": 2}])
+    found = row([{"mse_fine": 0.01, "nonfinite": 1}, {"mse_fine": 0.03, "nonfinite": 2}])
     assert found["psnr_fine"] == pytest.approx(-10 * np.log10(0.02)) and found["nonfinite"] == 2
     assert found["lr"] == pytest.approx(19e-3) and not any(name.startswith("loss_") for name in found)
 

@@ -13,7 +13,7 @@ from jaxnerf.models.base import Model
 from jaxnerf.training import dead_networks
 from jaxnerf.training.build import build
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.optimizer import averaged_params, make_optimizer, with_averaging
+from jaxnerf.training.optimizer import OptimizerOptions, averaged_params, make_optimizer, with_averaging
 from jaxnerf.training.state import TrainState, create_state
 from runs import smoke_config
 
@@ -24,7 +24,7 @@ ADAM = optax.adam(0.1, 0.9, 0.99)
 
 def optimizer(**train):
     numbers = {"lr_init": RATE, "lr_final": RATE, "beta2": 0.9, "epsilon": 1e-12, "muon": SIZE, **train}
-    return make_optimizer(smoke_config(**numbers).train)[0]
+    return make_optimizer(OptimizerOptions(**numbers))[0]
 
 
 def network(key):
@@ -102,7 +102,7 @@ def test_reinitialization_resets_the_moments():
     def init(key):
         return {"coarse": network(key), "fine": network(jax.random.fold_in(key, 1))}
 
-    model = Model(init, render=None, view=None, scene=None, samples_per_ray=1.0)
+    model = Model(init, None, view=None, scene=None, samples_per_ray=1.0, image_networks=("coarse", "fine"))
     update = optimizer(averaging_power=10.0)
     start = create_state(model, update, 0)
     used = jax.tree.map(lambda leaf: leaf + 1, start)
@@ -129,7 +129,7 @@ def test_state_is_restored_from_a_checkpoint(tmp_path):
 
 
 def test_negative_size_is_an_error():
-    with pytest.raises(ValueError, match=r"train.muon is -0.2, expected a number above 0, or 0 for off"):
+    with pytest.raises(ValueError, match=r"train.muon is -0.2, expected at least 0"):
         build(smoke_config(muon=-0.2))
 
 
@@ -214,7 +214,7 @@ def test_run_renders_its_average(unoptimized, tmp_path):
     config.fine.depth = 1
     assert train_and_evaluate(config, tmp_path)
     run = restore_run(tmp_path)
-    like = create_state(run.experiment.model, run.experiment.optimizer, run.experiment.seed)
+    like = create_state(run.experiment.model, run.experiment.optimizer, run.experiment.config.seed)
     state = Checkpoints(tmp_path).load(8, like)
     params, _ = run.variables(8)
     assert_same(params, state.opt_state.average, rtol=0, atol=0)
@@ -225,5 +225,5 @@ def test_run_renders_its_average(unoptimized, tmp_path):
 def test_negative_power_is_an_error():
     config = smoke_config()
     config.train.averaging_power = -1.0
-    with pytest.raises(ValueError, match=r"train.averaging_power is -1.0, expected a number above 0"):
+    with pytest.raises(ValueError, match=r"train.averaging_power is -1.0, expected at least 0"):
         build(config)

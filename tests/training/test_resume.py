@@ -13,9 +13,11 @@ import pytest
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.runtime.config_fields import AUTO, UNLIMITED_STEPS
+from jaxnerf.options import AUTO
 from jaxnerf.training import metric_log, workdir
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.config import changed, to_config_dict
+from jaxnerf.training.options import UNLIMITED_STEPS
 from runs import SMOKE_FLAGS, run, smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
@@ -82,7 +84,7 @@ def test_a_run_resumes_from_its_workdir_alone(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
     for step in (15, 20):
         shutil.rmtree(folder / "checkpoints" / str(step))
-    assert train_and_evaluate(workdir.config_to_resume(folder), folder)
+    assert train_and_evaluate(workdir.load_config(folder), folder)
     assert Checkpoints(folder).steps() == [10, 15, 20]
     assert_equal(variables(folder, 20), variables(trained, 20))
 
@@ -102,21 +104,26 @@ def test_a_config_to_resume_has_the_types_of_its_fields(trained, tmp_path):
     saved = json.loads((trained / "config.json").read_text())
     del saved["train"]["max_reinits"]  # as an older version would have saved it
     (tmp_path / "config.json").write_text(json.dumps(saved))
-    config = workdir.config_to_resume(tmp_path)
+    config = to_config_dict(workdir.load_config(tmp_path))
     assert config.train.max_reinits == 10 and config.train.max_steps == 20
-    workdir.claim(tmp_path, config)  # finished steps do not depend on this field
+    workdir.claim(tmp_path, workdir.load_config(tmp_path))  # finished steps do not depend on this field
     config.hash_grid.resolutions = "auto"
     config.train.lr_init = 1
     with pytest.raises(TypeError):
         config.train.max_steps = 1.5
 
 
-def test_a_run_of_a_version_with_another_schedule_is_not_resumed(trained, tmp_path):
+def test_a_run_of_an_older_version_is_resumed_with_what_that_version_did(trained, tmp_path):
     saved = json.loads((trained / "config.json").read_text())
-    del saved["train"]["lr_decay_power"]
+    del saved["train"]["lr_decay_power"], saved["occupancy"]["uniform_fraction"], saved["losses"]["depth"]
+    del saved["cameras"]
     (tmp_path / "config.json").write_text(json.dumps(saved))
-    with pytest.raises(ValueError, match="of another version, whose config lacks train.lr_decay_power; resume it"):
-        workdir.claim(tmp_path, workdir.config_to_resume(tmp_path))
+    config = workdir.load_config(tmp_path)
+    assert config.train.lr_decay_power == 1 and config.occupancy.uniform_fraction == 1 and config.losses["depth"] == 0
+    workdir.claim(tmp_path, config)
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    with pytest.raises(ValueError, match="to a run with another config .train.lr_decay_power 1.0 -> 2.0"):
+        workdir.claim(tmp_path, changed(config, {"train.lr_decay_power": 2.0}))
 
 
 def test_a_run_whose_training_no_longer_exists_is_not_resumed(trained, tmp_path):
@@ -124,7 +131,7 @@ def test_a_run_whose_training_no_longer_exists_is_not_resumed(trained, tmp_path)
     for distance in (0.0, 0.2):  # off, and on
         saved["occupancy"]["near_gradient_distance"] = distance
         (tmp_path / "config.json").write_text(json.dumps(saved))
-        config = workdir.config_to_resume(tmp_path)
+        config = workdir.load_config(tmp_path)
         if distance:
             with pytest.raises(ValueError, match="whose occupancy.near_gradient_distance no longer exists; resume it"):
                 workdir.claim(tmp_path, config)

@@ -31,7 +31,7 @@ def test_loss_decreases_and_is_the_sum_of_both_networks():
     assert rows[-1]["loss"] < 0.01 * rows[0]["loss"]
     assert int(state.step) == 100
     for row in rows:
-        assert row["loss"] == pytest.approx(row["mse"] + row["mse_coarse"], rel=1e-6)
+        assert row["loss"] == pytest.approx(row["mse_fine"] + row["mse_coarse"], rel=1e-6)
 
 
 @pytest.mark.parametrize("num_microbatches", [2, 8])

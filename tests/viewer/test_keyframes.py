@@ -8,8 +8,8 @@ import pytest
 
 import captures
 from jaxnerf import turntable
-from jaxnerf.configs import default
 from jaxnerf.data import dataset
+from jaxnerf.data.dataset import DataOptions
 from jaxnerf.evaluation.paths.camera_path import make_path
 from jaxnerf.evaluation.paths.path_files import read_path_file
 from jaxnerf.viewer.frame_renderer import FrameCamera
@@ -33,8 +33,7 @@ def test_render_reads_the_saved_path_in_the_world_of_the_run(tmp_path):
     to_file = np.diag([2.0, 2.0, 2.0, 1.0])
     to_file[:3, 3] = 1, 2, 3
     captures.write_transforms(tmp_path / "data", captures.noise(captures.orbit(3)))
-    data = default.get_config().data
-    data.dir, data.format, data.background, data.world = str(tmp_path / "data"), "transforms", "white", "file"
+    data = DataOptions(dir=str(tmp_path / "data"), format="transforms", world="file")
     views = dataclasses.replace(dataset.load_split(data, "train"), to_file=to_file)
     frames = KEYFRAMES
     file = save_path(tmp_path, "my.path-1", frames, fps=10, to_file=to_file)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from jaxnerf.training.config import RunConfig
 from jaxnerf.viewer.page import Page
 
 
@@ -12,7 +13,7 @@ from jaxnerf.viewer.page import Page
 def test_the_crop_limits_are_those_of_the_grid_that_will_be_trained(contracted, expected):
     """Contracted space has no limits; there they are twice the distance of the cameras."""
     schedule = SimpleNamespace(lower=(-1.3,) * 3, upper=(1.3,) * 3, contracted=contracted)
-    experiment = SimpleNamespace(ndc=False, model=SimpleNamespace(grid_schedule=schedule))
+    experiment = SimpleNamespace(config=RunConfig(), model=SimpleNamespace(grid_schedule=schedule))
     viewer = SimpleNamespace(state=None, run=SimpleNamespace(experiment=experiment))
     page = SimpleNamespace(_viewer=viewer, _size=4.0, _target=np.zeros(3))
     lower, upper = Page._crop_range(page)

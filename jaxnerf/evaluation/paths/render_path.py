@@ -112,7 +112,7 @@ def _write_frames(target, run, variables, views, path, *, rgba, shard):
         render = functools.partial(run.render_image, variables)
         posed, progress = camera_path.posed_views(views, path), Progress(len(frames))
         for done, index in enumerate(todo, len(frames) - len(todo) + 1):
-            pixels = camera_path.path_pixels(posed, path, index, offset=run.experiment.pixel_offset)
+            pixels = camera_path.path_pixels(posed, path, index, offset=run.experiment.config.data.pixel_offset)
             rays = run.experiment.view_rays(posed, index, pixels)
             image = render(rays)
             distance = run.experiment.world_depth(posed, index, pixels, image.depth)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import captures
-from jaxnerf.configs import capture
 from jaxnerf.data import dataset
+from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.readers import base
 
 NAMES = [f"{index:03d}" for index in range(8)]
@@ -42,9 +42,7 @@ def write(folder, shots, format):
 def test_masks_are_found_and_reported(tmp_path, shots, format, place):
     folder = write(tmp_path, shots, format)
     (folder / "masks").rename(folder / place)
-    data = capture.get_config().data
-    data.dir, data.factor = str(folder), 1
-    resolved, lines = dataset.resolve(data)
+    resolved, lines = dataset.resolve(DataOptions(format="auto", background="auto", ndc="auto", dir=str(folder)))
     assert resolved.format == format
     said = f"8 of 8 images have one, such as {folder / place / '000.png'}: dark pixels are ignored"
     assert [line for line in lines if line.startswith("masks ")] == [f"masks         {said} in training and metrics"]

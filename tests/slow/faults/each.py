@@ -215,8 +215,8 @@ def fill(place):
 
 
 def state(folder, step):
-    experiment = build.build(auto_config.resolve_for_device(workdir.read_config(folder))[0])
-    like = create_state(experiment.model, experiment.optimizer, experiment.seed)
+    experiment = build.build(auto_config.resolve_for_device(workdir.load_config(folder))[0])
+    like = create_state(experiment.model, experiment.optimizer, experiment.config.seed)
     return jax.device_get(Checkpoints(folder).load(step, like))
 
 

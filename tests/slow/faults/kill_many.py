@@ -132,8 +132,8 @@ def _compare(killed, whole, end):
 
 
 def _state(folder, step):
-    experiment = build.build(auto_config.resolve_for_device(workdir.read_config(folder))[0])
-    like = create_state(experiment.model, experiment.optimizer, experiment.seed)
+    experiment = build.build(auto_config.resolve_for_device(workdir.load_config(folder))[0])
+    like = create_state(experiment.model, experiment.optimizer, experiment.config.seed)
     return jax.device_get(Checkpoints(folder).load(step, like))
 
 

@@ -1,0 +1,385 @@
+"""Options of the parts of a run, declared beside their use.
+
+The options of a part are a frozen dataclass that inherits from `Options`; each of its fields is made by `option`, with
+its default, meaning, range, and what depends on it. The config of a run, its flags, checks and reference page are
+derived from these declarations.
+"""
+
+import dataclasses
+import enum
+import functools
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Self, TypeAlias, TypeVar, dataclass_transform
+
+AUTO = "auto"  # the only marker of a value that is inferred
+MAX_INT, MAX_FLOAT = 2**31 - 1, 3.4e38  # int32, in which JAX counts, and float32
+Schedule: TypeAlias = float | tuple[tuple[float, float], ...]  # a number, or points (step, value), linear between them
+_Part = TypeVar("_Part", bound="Options")
+
+
+class Changes(enum.Flag):
+    """What depends on an option.
+
+    Attributes:
+        NOTHING: the results of a run do not; other options may be inferred from it.
+        TRAINING: the parameters that training finds. A run is resumed with the same value only.
+        IMAGES: the images that given parameters render.
+        SPEED: the speed on a device. An "auto" value is inferred at every start, and stays "auto" in the workdir.
+    """
+
+    NOTHING = 0
+    TRAINING = enum.auto()
+    IMAGES = enum.auto()
+    SPEED = enum.auto()
+    MODEL = TRAINING | IMAGES
+
+
+class Range(NamedTuple):
+    """A range of numbers.
+
+    Attributes:
+        text: completes "expected".
+        holds: whether a number is in it.
+    """
+
+    text: str
+    holds: Callable[[float], bool]
+
+
+def at_least(low: float) -> Range:
+    """Returns the range of numbers that are not below one."""
+    return Range(f"at least {low:,g}", lambda value: value >= low)
+
+
+def between(low: float, high: float) -> Range:
+    """Returns the range from one number to another, both included."""
+    return Range(f"from {low:,g} to {high:,g}", lambda value: low <= value <= high)
+
+
+POSITIVE = Range("more than 0", lambda value: value > 0)
+FRACTION = Range("more than 0 and at most 1", lambda value: 0 < value <= 1)
+BELOW_ONE = Range("at least 0 and below 1", lambda value: 0 <= value < 1)
+DTYPES = ("float32", "bfloat16", "float16", "float64")
+
+
+class Option(NamedTuple):
+    """What an option declares beside its name, type and default; see `option`."""
+
+    help: str
+    unit: str
+    range: Range | None
+    choices: tuple[str, ...]
+    auto: bool
+    changes: Changes
+    check: Callable[[Any], str | None] | None
+    protocol: bool
+    max_int: int
+
+
+def option(
+    default: Any,
+    help: str,
+    *,
+    unit: str = "",
+    range: Range | None = None,
+    choices: tuple[str, ...] = (),
+    auto: bool = False,
+    changes: Changes = Changes.MODEL,
+    check: Callable[[Any], str | None] | None = None,
+    protocol: bool = False,
+    max_int: int = MAX_INT,
+) -> Any:
+    """Declares a field of a class of options.
+
+    Its annotation is the type of the value: bool, int, float, str, a tuple of these, or Schedule.
+
+    Args:
+        default: the value where none is set.
+        help: what it means, for the reference page; Markdown.
+        unit: of the value.
+        range: of a number.
+        choices: all values of a text; empty: any.
+        auto: whether the value may be "auto", which `Options.resolve` or `Options.resolve_for_device` replaces.
+        changes: what depends on the value.
+        check: value -> what is expected in place of it, or None where the value is right. For tuples.
+        protocol: whether an evaluation records the value, as it determines which images are compared.
+        max_int: the largest whole number.
+    """
+    declared = Option(help, unit, range, tuple(choices), auto, changes, check, protocol, max_int)
+    return dataclasses.field(default=default, metadata={"option": declared})
+
+
+_CELL_PER_PIXEL = 0.7  # cells a little finer than a pixel's footprint, the finest detail that images resolve
+_FINE_DETAIL, _MAX_ALPHA = 256, 0.5
+
+
+class Facts(NamedTuple):
+    """Plain numbers about a dataset, and about parts of the run that are resolved first.
+
+    Attributes:
+        num_views: training images.
+        side: px, that of a square image with as many pixels as an image has, the mean over the images.
+        footprint: world units that a pixel covers at the point that the cameras look at.
+        num_observations: of sparse points that at least two views show; 0 unless the run can use them.
+        has_alpha: whether alpha bounds the scene.
+        mean_alpha: of the pixels; 1 without alpha.
+        ndc: whether rays are in normalised device coordinates.
+        lower, upper: world units, the corners of the box that holds what the run renders.
+        box_reason: how the box was found.
+        contracted: whether the box holds all of space.
+        contraction_reason: why.
+        sampler: the name of the run's sampler.
+        large_field: whether an update of the field's parameters takes as long as half of a step's rays.
+        busy_rays: rays per step that keep the device busy; None: no more than on a CPU.
+        batch_size: rays per step.
+    """
+
+    num_views: int
+    side: float
+    footprint: float
+    num_observations: int = 0
+    has_alpha: bool = False
+    mean_alpha: float = 1.0
+    ndc: bool = False
+    lower: tuple[float, float, float] = (-1.0, -1.0, -1.0)
+    upper: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    box_reason: str = ""
+    contracted: bool = False
+    contraction_reason: str = ""
+    sampler: str = ""
+    large_field: bool = False
+    busy_rays: int | None = None
+    batch_size: int = 0
+
+    @property
+    def longest(self) -> float:
+        """World units, the longest side of the box."""
+        return max(high - low for low, high in zip(self.lower, self.upper, strict=True))
+
+    @property
+    def detail(self) -> int:
+        """Cells along the longest side of the box, each a little smaller than a pixel."""
+        return round(self.longest / (_CELL_PER_PIXEL * self.footprint))
+
+    @property
+    def has_fine_cells(self) -> bool:
+        """Whether fine cells of the box pay: images resolve more than 256 of them a side, and alpha empties most."""
+        fine = self.has_alpha and not self.contracted and self.sampler == "occupancy" and self.detail > _FINE_DETAIL
+        return fine and self.mean_alpha < _MAX_ALPHA
+
+    @property
+    def fills_space(self) -> bool:
+        """Whether the run evaluates the field in all of space, near the cameras and far behind what they look at."""
+        return self.contracted and self.sampler == "occupancy"
+
+
+class Device(NamedTuple):
+    """The devices of a run, and what the run's sampler asks of them.
+
+    Attributes:
+        platform: "cpu", "gpu" or "tpu".
+        num_processes: that train together.
+        chunk: rays that suit the device when images are rendered, see `Options.rays_per_chunk`.
+        samples_per_ray: of the largest network in training.
+    """
+
+    platform: str
+    num_processes: int = 1
+    chunk: int = 2**12
+    samples_per_ray: float = 1.0
+
+    @property
+    def is_cpu(self) -> bool:
+        """Whether it is a CPU, whose caches are small; otherwise it is an accelerator, which needs much work."""
+        return self.platform == "cpu"
+
+
+@dataclass_transform(frozen_default=True)
+class Options:
+    """The base of a part's options; subclasses are frozen dataclasses whose fields are made by `option`."""
+
+    def resolve(self, facts: Facts, device: Device) -> tuple[Self, list[str]]:
+        """Replaces the "auto" values that are inferred once, when a run starts; see `infer`."""
+        return self, []
+
+    def resolve_for_device(self, device: Device) -> tuple[Self, list[str]]:
+        """Replaces the "auto" values that are inferred at every start, those of Changes.SPEED; see `infer`."""
+        return self, []
+
+    def check(self) -> None:
+        """Raises a ValueError if values that are right one by one do not fit together."""
+
+    def bytes_needed(self) -> dict[str, float]:
+        """Returns, by the name of an option that determines it, bytes of memory that a run with these options needs."""
+        return {}
+
+    @property
+    def is_large(self) -> bool:
+        """Of a field: whether an update of its parameters takes as long as half of the rays of a step."""
+        return False
+
+    def busy_rays(self, device: Device) -> int | None:
+        """Of a sampler: the rays per step that keep a device busy; None: no more than on a CPU."""
+        return None
+
+    def rays_per_chunk(self, device: Device) -> int:
+        """Of a sampler: the rays that suit a device when images are rendered.
+
+        Without an occupancy grid 192 samples per ray of the paper's network take 1.6 GB a layer for 2^13 rays.
+        """
+        return 2**12 if device.is_cpu else 2**13
+
+
+def infer(options: _Part, **values: tuple[Any, str]) -> tuple[_Part, list[str]]:
+    """Fills in options that are "auto".
+
+    Args:
+        options: of a part; values that are not "auto" stay.
+        **values: by name, the value and the line that reports it. "{section}" in a line stands for the name of the
+            part's section in the config. An empty line is not reported.
+
+    Returns:
+        The options, and the lines of the values that were filled in.
+    """
+    filled = {name: value for name, (value, _) in values.items() if is_auto(getattr(options, name))}
+    return replaced(options, **filled), [values[name][1] for name in filled if values[name][1]]
+
+
+def is_auto(value: Any) -> bool:
+    """Returns whether a value still has to be inferred."""
+    return isinstance(value, str) and value == AUTO
+
+
+def is_schedule(value: Any) -> bool:
+    """Returns whether a value is a number, or points ((step, value), ...)."""
+    points = isinstance(value, tuple | list) and len(value) > 0
+    return _is_number(value) or (
+        points
+        and all(isinstance(point, tuple | list) and len(point) == 2 and all(map(_is_number, point)) for point in value)
+    )
+
+
+def replaced(options: _Part, **values: Any) -> _Part:
+    """Returns options with other values, without checks."""
+    return dataclasses.replace(options, **values)  # type: ignore[type-var]
+
+
+def declarations(kind: type[Options]) -> dict[str, tuple[Option, Any]]:
+    """Returns what the options of a class declare, and their types, by name; inherited ones first."""
+    return _declarations(kind)
+
+
+@functools.cache
+def _declarations(kind):
+    types_of = typing.get_type_hints(kind)
+    return {
+        field.name: (field.metadata["option"], types_of[field.name])
+        for field in dataclasses.fields(kind)
+        if "option" in field.metadata
+    }
+
+
+def changing(options: Options | type[Options], changes: Changes) -> list[str]:
+    """Returns the names of the options on which any of these depends."""
+    kind = options if isinstance(options, type) else type(options)
+    return [name for name, (declared, _) in declarations(kind).items() if declared.changes & changes]
+
+
+def values_of(options: Options) -> dict[str, Any]:
+    """Returns the values of a part's options by name."""
+    return {name: getattr(options, name) for name in declarations(type(options))}
+
+
+def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
+    """Makes the options of a part from values of unknown origin.
+
+    Args:
+        kind: the part's class of options.
+        values: of all options, by name; lists become tuples.
+        prefix: of the names in messages, such as "train.".
+
+    Raises:
+        ValueError: names the option, its value and what is expected, or the option that is missing or unknown.
+    """
+    known = declarations(kind)
+    missing, unknown = [name for name in known if name not in values], sorted(set(values) - set(known))
+    if missing:
+        raise ValueError(f"--config.{prefix}{missing[0]} is missing; restore the config, or set it")
+    if unknown:
+        raise ValueError(f"--config.{prefix}{unknown[0]} is no field, expected one of {sorted(known)}")
+    return kind(**{name: read_value(*known[name], values[name], f"{prefix}{name}") for name in known})
+
+
+def read_value(declared: Option, kind: Any, value: Any, name: str) -> Any:
+    """Returns the value of one option, with tuples in place of lists; ValueError where it is none."""
+    value = _tuples(value)
+
+    def refuse(expected):
+        raise ValueError(f"--config.{name} is {short_repr(value)}, expected {expected}; correct it")
+
+    if is_auto(value) and (declared.auto or AUTO in declared.choices):
+        return value
+    if not is_kind(value, kind):
+        refuse(f"{'auto or ' * declared.auto}{kind_name(kind)}")
+    limit = declared.max_int if kind is int else MAX_FLOAT
+    if not all(abs(number) <= limit for number in _numbers(value)):  # not NaN either
+        refuse(f"a finite number of at most {limit:g}")
+    if declared.range and not declared.range.holds(value):
+        refuse(declared.range.text)
+    if declared.choices and value not in declared.choices:
+        refuse(f"one of {declared.choices + (AUTO,) * declared.auto}")
+    wrong = declared.check(value) if declared.check else None
+    if wrong:
+        refuse(wrong)
+    return value
+
+
+def is_kind(value: Any, kind: Any) -> bool:
+    """Returns whether a value has the type that an annotation of an option names."""
+    if kind == Schedule:
+        return is_schedule(value)
+    if kind is float:
+        return _is_number(value)
+    if kind is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, (typing.get_origin(kind) or kind, list) if is_tuple(kind) else kind)
+
+
+def is_tuple(kind: Any) -> bool:
+    """Returns whether an annotation is that of a tuple."""
+    return kind is tuple or typing.get_origin(kind) is tuple
+
+
+def kind_name(kind: Any) -> str:
+    """Returns the name of an option's type, for messages."""
+    return "schedule" if isinstance(kind, types.UnionType) else "tuple" if is_tuple(kind) else kind.__name__
+
+
+def short_repr(value: Any) -> str:
+    """Returns a value's repr for a message: one line of at most 80 characters."""
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def numbers(count: int) -> Callable[[Any], str | None]:
+    """Returns the check of an option that is a tuple of so many numbers."""
+    return lambda value: None if len(value) == count and all(map(_is_number, value)) else f"{count} finite numbers"
+
+
+def _is_number(value):
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _numbers(value):
+    """Yields the numbers of a value, which may be a tuple of tuples, as a schedule is."""
+    for each in value if isinstance(value, tuple) else [value]:
+        if isinstance(each, tuple):
+            yield from _numbers(each)
+        elif _is_number(each):
+            yield each
+
+
+def _tuples(value):
+    return tuple(map(_tuples, value)) if isinstance(value, tuple | list) else value

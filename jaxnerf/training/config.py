@@ -1,0 +1,262 @@
+"""The config of a run: the tree of the options of its parts."""
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeAlias
+
+from ml_collections import ConfigDict
+
+from jaxnerf.data.dataset import DataOptions
+from jaxnerf.fields.hash_grid import HashGridOptions
+from jaxnerf.fields.mlp import MlpOptions
+from jaxnerf.models.hierarchical import HierarchicalOptions
+from jaxnerf.models.occupancy import OccupancyOptions
+from jaxnerf.options import (
+    Changes,
+    Option,
+    Options,
+    Schedule,
+    declarations,
+    is_auto,
+    option,
+    read,
+    read_value,
+    replaced,
+    short_repr,
+    values_of,
+)
+from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part
+from jaxnerf.runtime import memory
+from jaxnerf.runtime.config_fields import typed
+from jaxnerf.training.camera_parameters import CameraOptions
+from jaxnerf.training.options import EvalOptions, TrainOptions
+
+_MAX_SEED = 2**63 - 1  # what jax.random.key takes
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig(Options):
+    """The config of a run.
+
+    Attributes:
+        coarse: the network that guides the fine samples; sampler "hierarchical" only.
+        fine: the network of the final rendering, if the field is "mlp".
+        losses: the weight of each loss, by its registered name; 0: off.
+        plugins: the options of registered fields and samplers, by name; of a config that has been read, only of those
+            that it uses. A part without a class of options has a dict.
+    """
+
+    seed: int = option(0, "of everything random", max_int=_MAX_SEED)
+    field: str = option(
+        "mlp", "the field of the final rendering: `mlp` (section `fine`), `hash_grid`, or a registered one"
+    )
+    sampler: str = option("hierarchical", "`hierarchical` (section `sampling`), `occupancy`, or a registered one")
+    data: DataOptions = dataclasses.field(default_factory=DataOptions)
+    coarse: MlpOptions = dataclasses.field(default_factory=MlpOptions)
+    fine: MlpOptions = dataclasses.field(default_factory=MlpOptions)
+    sampling: HierarchicalOptions = dataclasses.field(default_factory=HierarchicalOptions)
+    hash_grid: HashGridOptions = dataclasses.field(default_factory=HashGridOptions)
+    occupancy: OccupancyOptions = dataclasses.field(default_factory=OccupancyOptions)
+    losses: Mapping[str, Schedule] = dataclasses.field(default_factory=lambda: default_weights())
+    cameras: CameraOptions = dataclasses.field(default_factory=CameraOptions)
+    train: TrainOptions = dataclasses.field(default_factory=TrainOptions)
+    eval: EvalOptions = dataclasses.field(default_factory=EvalOptions)
+    plugins: Mapping[str, Any] = dataclasses.field(default_factory=lambda: default_plugins())
+
+    def sections(self) -> dict[str, Options]:
+        """Returns the options of all parts, by the name of their section; those of plugins without a class excepted."""
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: part for name, part in {**own, **self.plugins}.items() if isinstance(part, Options)}
+
+    def with_sections(self, sections: Mapping[str, Any]) -> "RunConfig":
+        """Returns a config with other sections, by name."""
+        own = {name: part for name, part in sections.items() if name not in self.plugins}
+        plugins = {name: sections.get(name, part) for name, part in self.plugins.items()}
+        return dataclasses.replace(self, plugins=plugins, **own)
+
+    def options_of(self, part: Part, name: str) -> Any:
+        """Returns the options of a registered part: those of its section, or of the section of its name."""
+        if part.section is None and name in self.plugins:
+            return self.plugins[name]
+        section = getattr(self, part.section or name, None)
+        return (part.options() if part.options else {}) if section is None else section
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns {section: {option: value}}, and the values of the options that are in no section."""
+        sections = {name: values_of(part) for name, part in self.sections().items()}
+        plain = {name: dict(part) for name, part in self.plugins.items() if name not in sections}
+        return {**values_of(self), **sections, **plain, "losses": dict(self.losses)}
+
+    def to_json(self) -> str:
+        """Returns `to_dict` as JSON."""
+        return json.dumps(self.to_dict(), indent=2)
+
+
+Config: TypeAlias = RunConfig | ConfigDict | Mapping[str, Any]
+
+
+def default_weights() -> dict[str, Any]:
+    """Returns the weights of all registered losses where a config sets none."""
+    return {name: LOSSES.get(name).weight for name in LOSSES.names()}
+
+
+def default_plugins() -> dict[str, Options]:
+    """Returns the default options of all registered fields and samplers that are not built in, by name."""
+    known = {field.name for field in dataclasses.fields(RunConfig)}
+    parts = {name: registry.get(name) for registry in (FIELDS, SAMPLERS) for name in registry.names()}
+    return {
+        name: part.options()
+        for name, part in parts.items()
+        if part.options and name not in known | {"mlp", "hierarchical"}
+    }
+
+
+def read_config(config: Config) -> RunConfig:
+    """Reads a config of unknown origin, such as that of a config file or of a config.json, and checks it.
+
+    Args:
+        config: with the names and types of the options' declarations; returned as it is if it has been read.
+
+    Raises:
+        ValueError: names the flag, the value and what is expected.
+    """
+    if isinstance(config, RunConfig):
+        return config
+    content = config.to_dict() if isinstance(config, ConfigDict) else dict(config)
+    kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
+    top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "")
+    parts = {name: read(kind, _section(content, name), f"{name}.") for name, kind in kinds.items()}
+    losses = {name: _read_weight(name, weight) for name, weight in _section(content, "losses").items()}
+    plugins = {name: _read_plugin(name, section) for name, section in {**top.plugins, **content}.items()}
+    config = dataclasses.replace(top, **parts, losses=losses, plugins=plugins)
+    used = used_sections(config)
+    config = replaced(config, plugins={name: part for name, part in plugins.items() if name in used})
+    _check(config)
+    return config
+
+
+def to_config_dict(config: RunConfig) -> ConfigDict:
+    """Returns a config as a ConfigDict, whose fields have the types of the options, for flags and config files."""
+    content = config.to_dict()
+    for name, declaration, kind, value in declared(config):
+        section, dot, field = name.rpartition(".")
+        (content[section] if dot else content)[field] = typed(value, kind, auto=declaration.auto)
+    return ConfigDict(content)
+
+
+def auto_fields(config: Config) -> list[str]:
+    """Returns the dotted names of the options that are still "auto"."""
+    flat = flatten(config.to_dict() if hasattr(config, "to_dict") else config)
+    return [name for name, value in flat.items() if is_auto(value) and name != "train.parallel"]
+
+
+def flatten(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns {"section.option": value} of {section: {option: value}}."""
+    flat = {}
+    for name, value in content.items():
+        fields = value.items() if isinstance(value, Mapping) else [("", value)]
+        flat.update({f"{name}.{field}" if field else name: each for field, each in fields})
+    return flat
+
+
+def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
+    """Returns a config with other values, {"section.option": value}, checked as `read_config` does."""
+    content = config.to_dict()
+    for name, value in values.items():
+        section, dot, field = name.partition(".")
+        if dot:
+            content[section] = {**content.get(section, {}), field: value}
+        else:
+            content[section] = value
+    return read_config(content)
+
+
+def declared(config: RunConfig) -> Iterator[tuple[str, Option, Any, Any]]:
+    """Yields the dotted name of each option, its declaration, its type and its value."""
+    for section, part in {"": config, **config.sections()}.items():
+        for name, (option_, kind) in declarations(type(part)).items():
+            yield f"{section}.{name}" if section else name, option_, kind, getattr(part, name)
+    for name, weight in config.losses.items():
+        yield f"losses.{name}", weight_option(name), Schedule, weight
+
+
+def weight_option(name: str) -> Option:
+    """Returns the declaration of the weight of a loss."""
+    loss = LOSSES.get(name) if name in LOSSES.names() else None
+    weight, help = (loss.weight, loss.help) if loss else (0.0, "")
+    declaration = option(weight, help, auto=is_auto(weight), changes=Changes.TRAINING)
+    return declaration.metadata["option"]
+
+
+def identity(config: RunConfig) -> str:
+    """Returns as text the options that renderings depend on; not training, nor the dataset's folder.
+
+    Those of images alone, which evaluation may change, are absent.
+    """
+    render = {
+        name: value
+        for name, option_, _, value in declared(config)
+        if option_.changes & Changes.IMAGES and option_.changes != Changes.IMAGES
+    }
+    plain = {name: part for name, part in config.plugins.items() if not isinstance(part, Options)}
+    return json.dumps({**render, **plain}, sort_keys=True)
+
+
+def _read_weight(name, weight):
+    declaration = weight_option(name)._replace(auto=is_auto(weight))  # a loss that is not registered may have "auto"
+    return read_value(declaration, Schedule, weight, f"losses.{name}")
+
+
+def _is_section(kind):
+    return isinstance(kind, type) and issubclass(kind, Options)
+
+
+def _section(content, name):
+    if name not in content:
+        raise ValueError(f"--config.{name} is missing; restore the config")
+    section = content.pop(name)
+    if not isinstance(section, Mapping):
+        raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
+    return section
+
+
+def _read_plugin(name, section):
+    """Returns the options of a registered part; of one that is not registered, or has no class, the section itself."""
+    if isinstance(section, Options):
+        return section
+    part = next((registry.get(name) for registry in (FIELDS, SAMPLERS) if name in registry.names()), None)
+    if not isinstance(section, Mapping):
+        raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
+    if part is None or part.options is None:
+        return dict(section)
+    return read(part.options, {**values_of(part.options()), **section}, f"{name}.")
+
+
+def _check(config):
+    """Checks values that concern each other, and that what a run keeps fits into memory."""
+    free, used = memory.available(), used_sections(config)
+    for section, part in config.sections().items():
+        if section == "occupancy" and config.sampler != "occupancy":
+            continue
+        try:
+            part.check()
+        except ValueError as error:
+            raise ValueError(f"--config.{section}.{error}") from None
+        needed = part.bytes_needed() if free is not None and section in used else {}
+        for name, size in needed.items():
+            if size > free:
+                raise ValueError(
+                    f"--config.{section}.{name} is {getattr(part, name)}, which needs {size / 1e9:,.1f} GB for "
+                    f"parameters, gradients and the optimizer, the grid or rays, and {free / 1e9:,.1f} GB are free; "
+                    "reduce it"
+                )
+
+
+def used_sections(config: RunConfig) -> set[str]:
+    """Returns the names of the sections that training with a config uses."""
+    used = {"data", "train", "eval", "cameras", "losses"}
+    for name, registry in ((config.field, FIELDS), (config.sampler, SAMPLERS)):
+        part = registry.get(name) if name in registry.names() else Part(None)
+        used.add("fine" if name == "mlp" else part.section or name)
+    return used | ({"coarse"} if config.sampler == "hierarchical" else set())
