@@ -1,10 +1,10 @@
 """Measures jaxnerf on this machine's accelerator, piece by piece; called again, it continues.
 
-    JAXNERF_SCENES=... python experiments/gpu/run.py --minutes=9 [--out=runs/gpu] [--markdown=docs/results/gpu.md]
+    JAXNERF_SCENES=... python experiments/gpu/run.py --minutes=9 [--out=runs/gpu] [--markdown=FILE.md]
 
 Each piece is saved to <out>/results.json when it is done, and finished pieces are not repeated. A piece that would not
 fit into the rest of --minutes waits for the next call. docs/guides/accelerators.md describes the pieces, and how to run
-them on a lent machine.
+them on a lent machine. docs/results/gpu.md is put together from the pages of several calls.
 """
 
 import functools
