@@ -20,10 +20,10 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf.capture_check import cameras, images, report, tracks, view_evidence
-from jaxnerf.data import synthetic_capture
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import read_capture
 from jaxnerf.runtime.atomic_files import write_text
+from test_scenes import synthetic_capture
 
 SCENES = ("fern", "fox", "can", "lego")
 PERIODS = (0.12, 0.3)  # of the dots in the embedded room, world units
