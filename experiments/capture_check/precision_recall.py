@@ -103,7 +103,7 @@ def _accused(capture, keypoints, poses, scale):
     """Returns the views that errors name."""
     near = tracks.neighbours(poses)
     found = tracks.follow(keypoints, near)
-    evidence = cameras.Evidence(keypoints, near, found, poses, scale, 0.0)
+    evidence = tracks.Evidence(keypoints, near, found, poses, scale, 0.0)
     findings = cameras.judge_views(capture, evidence)
     return {view for finding in findings if finding.severity == "error" for view in finding.frames}
 
