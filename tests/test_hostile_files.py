@@ -13,7 +13,7 @@ from jaxnerf.capture_check import camera_plot
 from jaxnerf.data.images import image_files
 from jaxnerf.data.readers import colmap_model, ply, validation
 from jaxnerf.evaluation.evaluate import evaluate
-from jaxnerf.evaluation.paths.path_files import read_path_file
+from jaxnerf.evaluation.paths.camera_path import read_path_file
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.exporters.base import export_run
