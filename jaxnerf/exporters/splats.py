@@ -14,11 +14,12 @@ from scipy.spatial import cKDTree
 from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.metrics import psnr
 from jaxnerf.core.types import Camera, Vector
+from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.metrics import pixel_mask, reference
 from jaxnerf.evaluation.restore import refined_views
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.points import surface_points, thinned, write_ply
-from jaxnerf.exporters.surfaces import export_box, in_file, render_depth_images, sphere_directions
+from jaxnerf.exporters.surfaces import export_box, render_depth_images, sphere_directions
 from jaxnerf.fields.hash_grid import harmonics
 
 _NUM_DIRECTIONS = 32  # from which the colour of a point is evaluated
@@ -106,7 +107,7 @@ def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) ->
 
     The fit is linear least squares over directions, weighted by the cosine at which they meet the normals.
     """
-    rotation = in_file(np.eye(3, 4)[None], source.views.to_file)[0, :, :3]
+    rotation = poses_in_file(np.eye(3, 4)[None], source.views.to_file)[0, :, :3]
     directions = np.float32(sphere_directions(_NUM_DIRECTIONS))
     basis, in_world = harmonics(directions), jnp.float32(directions @ rotation)
     ridge = _RIDGE * jnp.diag(jnp.float32([1e-3, *[1.0] * 8]))
@@ -135,7 +136,7 @@ def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
     """
     run, split = source.run, source.run.experiment.eval.split
     views = refined_views(run, run.experiment.load_split(split), split, source.variables[0])
-    poses = in_file(np.asarray(views.cameras.to_world), views.to_file)
+    poses = poses_in_file(np.asarray(views.cameras.to_world), views.to_file)
     count = min(_NUM_SCORED, len(views.size))
     values = []
     for index in map(int, np.arange(count) * len(views.size) // count):

@@ -13,6 +13,7 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Camera, Views
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import check_pose
+from jaxnerf.data.geometry.world import poses_in_run
 from jaxnerf.data.readers.validation import is_number, read_json
 from jaxnerf.runtime.atomic_files import read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
@@ -157,7 +158,7 @@ def _from_file(file, views):
     same = CameraPath(
         name=file.stem,
         source=fingerprint(read_bytes(file)),
-        poses=_in_run(found.poses, views.to_file),
+        poses=poses_in_run(found.poses, views.to_file),
         focal=np.tile(np.float64(views.cameras.focal)[:1], (len(found.poses), 1)),
         center=np.tile(np.float64(views.cameras.center)[:1], (len(found.poses), 1)),
         width=width,
@@ -169,17 +170,6 @@ def _from_file(file, views):
     middle = np.where(own, [same.width / 2, same.height / 2], same.center)
     focal, center = np.where(own, found.focal, same.focal), found.center
     return same._replace(focal=focal, center=np.where(np.isfinite(center), center, middle))
-
-
-def _in_run(poses, to_file):
-    """Transforms poses [N, 3, 4] from the file's world to the run's; both are equal where to_file is None."""
-    if to_file is None:
-        return poses
-    to_file = np.asarray(to_file, np.float64)
-    linear = to_file[:3, :3]
-    rotation = linear / np.cbrt(abs(np.linalg.det(linear)))
-    eyes = np.linalg.solve(linear, (poses[:, :, 3] - to_file[:3, 3]).T).T
-    return np.concatenate([rotation.T @ poses[:, :, :3], eyes[:, :, None]], axis=-1)
 
 
 def _through_views(views, num_frames, closed):
