@@ -47,7 +47,7 @@ _SHARD = flags.DEFINE_string(
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.evaluation import evaluate, external, quality_search, watch
+    from jaxnerf.evaluation import evaluate, external, quality_search
     from jaxnerf.runtime import shards
 
     shard = shards.parse(_SHARD.value)
@@ -63,7 +63,7 @@ def main(argv):
             _PREDICTIONS.value, config=_reference_config(), split=_SPLIT.value, overwrite=_OVERWRITE.value
         )
     elif _WATCH.value:
-        watch.watch(_WORKDIR.value, data_dir=_DATA_DIR.value, poll_seconds=_POLL.value, **options)
+        evaluate.watch(_WORKDIR.value, data_dir=_DATA_DIR.value, poll_seconds=_POLL.value, **options)
         return
     else:
         options |= {"step": _STEP.value, "data_dir": _DATA_DIR.value, "overwrite": _OVERWRITE.value}

@@ -21,7 +21,7 @@ import type_checks  # noqa: E402
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-type_checks.install("jaxnerf")
+type_checks.install("jaxnerf", "test_scenes")
 
 
 def pytest_configure(config):

@@ -1,17 +1,10 @@
 """The scripts under experiments/ as modules."""
 
 import importlib
-import sys
 from types import ModuleType
 
-from absl import flags
-
-from runs import ROOT
-
-if str(ROOT / "experiments") not in sys.path:
-    sys.path.append(str(ROOT / "experiments"))
-
 import common  # noqa: F401  before `study` removes flags: --page stays
+from absl import flags
 
 
 def study(name: str) -> ModuleType:

@@ -12,9 +12,8 @@ from PIL import EpsImagePlugin, Image
 from jaxnerf.capture_check import camera_plot
 from jaxnerf.data.images import image_files
 from jaxnerf.data.readers import colmap_model, ply, validation
-from jaxnerf.data.synthetic_capture import GROUND_TRUTH, read_ground_truth
 from jaxnerf.evaluation.evaluate import evaluate
-from jaxnerf.evaluation.paths.path_files import read_path_file
+from jaxnerf.evaluation.paths.camera_path import read_path_file
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.exporters.base import export_run
@@ -25,6 +24,7 @@ from jaxnerf.structure_from_motion.images import is_rotated_jpeg
 from jaxnerf.training.metric_log import MetricLog, read_rows
 from jaxnerf.training.workdir import load_config, workdir_lock
 from runs import ROOT
+from test_scenes.synthetic_capture import GROUND_TRUTH, read_ground_truth
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")

@@ -50,18 +50,10 @@ def is_module(name):
     return path.is_dir() or path.with_suffix(".py").is_file()
 
 
-def nodes_at_run_time(node):
-    """Yields all nodes of a tree but those below `if TYPE_CHECKING`."""
-    for child in ast.iter_child_nodes(node):
-        if not (isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)):
-            yield child
-            yield from nodes_at_run_time(child)
-
-
-def imported_modules(source, package, walk=ast.walk):
-    """Returns the dotted names of all modules that a source imports, at the top level or inside a function."""
+def imported_modules(source, package):
+    """Returns the dotted names of all modules that a source imports, also inside functions and for types."""
     found = []
-    for node in walk(ast.parse(source)):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -104,9 +96,7 @@ def test_no_cycles():
     graph = {
         module_name(path): {
             name
-            for name in imported_modules(
-                path.read_text(), ["jaxnerf", *path.relative_to(ROOT).parts[:-1]], nodes_at_run_time
-            )
+            for name in imported_modules(path.read_text(), ["jaxnerf", *path.relative_to(ROOT).parts[:-1]])
             if name.startswith("jaxnerf.")
         }
         for path in FILES

@@ -110,14 +110,14 @@ CONFIG_KEYS = {
 EXCEPTIONS = {
     "grad_ema": "a key in checkpoints of other projects",
     "macro_block_size": "an option of ffmpeg",
-    "make_room": "the embedded scene fields/room.py",
+    "make_room": "the scene experiments/test_scenes/room.py",
     "request_share_url": "a method of viser",
-    "score_room": "the embedded scene fields/room.py",
-    "test_room": "the embedded scene fields/room.py",
+    "score_room": "the scene experiments/test_scenes/room.py",
+    "test_room": "the scene experiments/test_scenes/room.py",
 }
 
 # Whole names that are allowed, whatever the lists above hold.
-WHOLE_EXCEPTIONS = {"room": "the embedded scene fields/room.py"}
+WHOLE_EXCEPTIONS = {"room": "the scene experiments/test_scenes/room.py"}
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 

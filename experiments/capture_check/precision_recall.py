@@ -20,10 +20,10 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf.capture_check import cameras, images, report, tracks, view_evidence
-from jaxnerf.data import synthetic_capture
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import read_capture
 from jaxnerf.runtime.atomic_files import write_text
+from test_scenes import synthetic_capture
 
 SCENES = ("fern", "fox", "can", "lego")
 PERIODS = (0.12, 0.3)  # of the dots in the embedded room, world units
@@ -103,7 +103,7 @@ def _accused(capture, keypoints, poses, scale):
     """Returns the views that errors name."""
     near = tracks.neighbours(poses)
     found = tracks.follow(keypoints, near)
-    evidence = cameras.Evidence(keypoints, near, found, poses, scale, 0.0)
+    evidence = tracks.Evidence(keypoints, near, found, poses, scale, 0.0)
     findings = cameras.judge_views(capture, evidence)
     return {view for finding in findings if finding.severity == "error" for view in finding.frames}
 

@@ -36,11 +36,11 @@ import common
 from jaxnerf import Rays, render_hierarchical, render_rays
 from jaxnerf.data.ray_batches import pixel_colors
 from jaxnerf.evaluation import restore
-from jaxnerf.fields import analytic
 from jaxnerf.fields.mlp import mlp_field
 from jaxnerf.runtime import cli
 from jaxnerf.training import workdir
 from jaxnerf.training.config import to_config_dict
+from test_scenes import analytic
 
 flags.DEFINE_string("out", "runs/quadrature", "Folder of the measurements.")
 flags.DEFINE_string("plot", None, "PNG to write; out/quadrature.png when not given.")

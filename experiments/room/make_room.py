@@ -6,12 +6,15 @@
 Then `jaxnerf-train --config=capture --data_dir=DIR --workdir=W`, and score_room.py with the same folders.
 """
 
+import pathlib
+import sys
 import time
 
 from absl import flags
 
-from jaxnerf.data import synthetic_capture
+sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 from jaxnerf.runtime import cli
+from test_scenes import synthetic_capture
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the capture, missing or empty.", required=True)
 _LENS = flags.DEFINE_bool("lens", True, "Whether the lens distorts as a phone's.")

@@ -32,12 +32,12 @@ import common
 from jaxnerf.core import contraction
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Rays, SceneFn, Views
-from jaxnerf.data import synthetic_capture
 from jaxnerf.evaluation.evaluate import reference
 from jaxnerf.evaluation.metrics import image_metrics
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, restore_run
 from jaxnerf.models.grid_schedule import GridSchedule
 from jaxnerf.runtime import cli
+from test_scenes import synthetic_capture
 
 HEADS = (
     *("views", "PSNR, dB", "of seen surfaces", "colours aligned"),

@@ -2,8 +2,8 @@
 
     python experiments/structure/config_trace.py /path/to/a/checkout
 
-It trains one step of configs/smoke.py under sys.setprofile and lists, for each file of the package, the calls whose
-arguments hold the whole config or the options of a part: a ConfigDict, options, or a dict or namespace with their values.
+It trains one step of configs/smoke.py under sys.setprofile and lists the files of the package whose functions get the
+whole config, or the options of a part, as an argument: a ConfigDict, options, or a dict or a namespace of their values.
 """
 
 import collections
@@ -14,13 +14,13 @@ import sys
 
 from absl import app
 
-_TRACE = '''
+_TRACE = """
 import collections, json, pathlib, sys, tempfile
 from types import SimpleNamespace
 
 root = pathlib.Path.cwd() / "jaxnerf"
 calls = {"whole": collections.Counter(), "part": collections.Counter()}
-marks = ("batch_size", "num_coarse", "resolutions", "threshold", "num_freqs", "early_stop_eps", "pixel_offset", "refine_lr")
+marks = ("batch_size", "num_coarse", "resolutions", "threshold", "num_freqs", "early_stop_eps", "pixel_offset")
 
 
 def kind(value):
@@ -30,7 +30,7 @@ def kind(value):
     if "Options" in names or "ConfigDict" in names:
         return "part"
     fields = value if isinstance(value, dict) else vars(value) if isinstance(value, SimpleNamespace) else ()
-    return "part" if any(mark in fields for mark in marks if isinstance(mark, str)) else None
+    return "part" if any(mark in fields for mark in marks) else None
 
 
 def profile(frame, event, argument):
@@ -53,7 +53,7 @@ sys.setprofile(profile)
 loop.train(config, folder)
 sys.setprofile(None)
 print(json.dumps(calls))
-'''
+"""
 
 
 def main(argv):

@@ -17,7 +17,7 @@ from jaxnerf.capture_check.findings import Finding, axes_change, axes_name, foca
 from jaxnerf.capture_check.images import ImageSummary
 from jaxnerf.capture_check.tracks import (
     INLIER,
-    Keypoints,
+    Evidence,
     Tracks,
     circles,
     count_fits,
@@ -54,26 +54,6 @@ _MIN_OBSERVATIONS = 30  # of the reconstruction in one image, to confirm it
 _GUIDED = 0.6  # guided matches per match, above which most poses are right; mostly 0.75, at random poses 0.4 or less
 _SAMPLE = 12  # views that tell whether all poses are wrong
 _PARALLAX = np.deg2rad(1.5)  # between the rays of a point whose depth counts
-
-
-class Evidence(NamedTuple):
-    """The matches between images, and the cameras as corrected so far.
-
-    Attributes:
-        keypoints: of each view.
-        near: [V, K] neighbours of each view.
-        tracks: of all keypoints through the neighbours.
-        poses: [V, 3, 4].
-        scale: [V] px of the reduced image per unit on the plane at distance 1.
-        fraction: of the tracks that fit.
-    """
-
-    keypoints: list[Keypoints]
-    near: Int[np.ndarray, "V K"]
-    tracks: Tracks
-    poses: Float[np.ndarray, "V 3 4"]
-    scale: Float[np.ndarray, " V"]
-    fraction: float
 
 
 class Axes(NamedTuple):
@@ -123,11 +103,12 @@ def judge_axes(capture: Capture, evidence: Evidence) -> tuple[list[Finding], Evi
     if other.fraction <= max(stored.fraction + _CLEARLY, 4 / 3 * stored.fraction):
         return [], evidence
     found = (
-        f"{capture.source}: the poses are in {axes_name(other)}; {percent(other.fraction)} of the matches fit "
-        f"these, {percent(stored.fraction)} fit the poses as stored"
+        f"{capture.source}: the poses are in {axes_name(other.turn, other.inverted)}; {percent(other.fraction)} of the "
+        f"matches fit these, {percent(stored.fraction)} fit the poses as stored"
     )
     expected = "camera-to-world with x right, y up, looking along -z (or as the format defines)"
-    finding = Finding("error", "axes", found, expected, axes_change(capture.format, other))
+    change = axes_change(capture.format, other.turn, other.inverted)
+    finding = Finding("error", "axes", found, expected, change)
     return [finding], evidence._replace(poses=as_intended(evidence.poses, other), fraction=other.fraction)
 
 

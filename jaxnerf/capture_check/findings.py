@@ -1,14 +1,12 @@
 """Findings of a check: one line each, which ends in the file, field or flag to change."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxnerf.data.readers.base import Capture
-
-if TYPE_CHECKING:
-    from jaxnerf.capture_check.cameras import Axes
 
 
 class Finding(NamedTuple):
@@ -72,31 +70,37 @@ _POSE_FILES = {
 }
 
 
-def axes_change(format: str, axes: "Axes") -> str:
-    """Returns the edit that corrects a file whose cameras are stored in the given axes."""
+def axes_change(format: str, turn: Float[np.ndarray, "3 3"], inverted: bool) -> str:
+    """Returns the edit that corrects a file whose cameras are stored in other axes.
+
+    Args:
+        format: of the dataset.
+        turn: from the intended camera's axes to the stored one's, a signed permutation.
+        inverted: whether the file stores world to camera.
+    """
     file = _POSE_FILES.get(format, _PoseFile("every pose", np.eye(3), "columns", "also mirror the world"))
-    turn = file.axes @ axes.turn @ file.axes.T  # in the axes of the file
-    rows = np.abs(turn).argmax(axis=0)
-    columns = [int(round(sign * (row + 1))) for row, sign in zip(rows, turn[rows, np.arange(3)], strict=True)]
+    in_file = file.axes @ turn @ file.axes.T
+    rows = np.abs(in_file).argmax(axis=0)
+    columns = [int(round(sign * (row + 1))) for row, sign in zip(rows, in_file[rows, np.arange(3)], strict=True)]
     steps = []
-    if axes.inverted:
+    if inverted:
         steps.append("invert it (it maps world to camera)")
     if [abs(column) for column in columns] != [1, 2, 3]:
         steps.append(f"replace its {file.lines} by {', '.join(f'{column:+d}' for column in columns)} of the old ones")
     elif columns != [1, 2, 3]:
         steps.append(f"negate {file.lines} {' and '.join(str(-column) for column in columns if column < 0)}")
-    if np.linalg.det(axes.turn) < 0:
+    if np.linalg.det(turn) < 0:
         steps.append(file.mirror)
     return f"{file.poses}: {', then '.join(steps)}"
 
 
-def axes_name(axes: "Axes") -> str:
-    """Returns the name of the convention that camera axes follow."""
-    if axes.inverted:
+def axes_name(turn: Float[np.ndarray, "3 3"], inverted: bool) -> str:
+    """Returns the name of the convention that camera axes follow; see `axes_change`."""
+    if inverted:
         return "world-to-camera matrices"
-    if np.array_equal(axes.turn, _FLIP):
+    if np.array_equal(turn, _FLIP):
         return "OpenCV's axes (y down, looking along +z)"
-    if np.linalg.det(axes.turn) < 0:
+    if np.linalg.det(turn) < 0:
         return "a mirrored world"
     return "axes turned by right angles"
 

@@ -6,14 +6,13 @@ onto the other. Within each group of consecutive images the cameras are then rig
 
 import itertools
 from collections.abc import Collection
-from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.capture_check.findings import Finding
-from jaxnerf.capture_check.tracks import INLIER, count_fits, match
+from jaxnerf.capture_check.tracks import INLIER, Evidence, count_fits, match
 from jaxnerf.data.geometry.path_poses import natural_order
 from jaxnerf.data.readers.base import Capture
 
@@ -26,7 +25,7 @@ _MIN_OFF = np.radians(60.0)  # of the cameras' rotation from it
 _FLIP = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes
 
 
-def judge_folds(capture: Capture, evidence: Any, doubtful: Collection[int]) -> list[Finding]:
+def judge_folds(capture: Capture, evidence: Evidence, doubtful: Collection[int]) -> list[Finding]:
     """Returns a Finding if the cameras jump between consecutive images whose own motion is small.
 
     A jump counts only if the cameras of the groups before and after it agree with their images, so that a single wrong

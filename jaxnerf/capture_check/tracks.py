@@ -47,6 +47,26 @@ class Tracks(NamedTuple):
     shown: Bool[np.ndarray, "T K"]
 
 
+class Evidence(NamedTuple):
+    """The matches between images, and the cameras as corrected so far.
+
+    Attributes:
+        keypoints: of each view.
+        near: [V, K] neighbours of each view.
+        tracks: of all keypoints through the neighbours.
+        poses: [V, 3, 4].
+        scale: [V] px of the reduced image per unit on the plane at distance 1.
+        fraction: of the tracks that fit.
+    """
+
+    keypoints: list[Keypoints]
+    near: Int[np.ndarray, "V K"]
+    tracks: Tracks
+    poses: Float[np.ndarray, "V 3 4"]
+    scale: Float[np.ndarray, " V"]
+    fraction: float
+
+
 def neighbours(poses: Float[np.ndarray, "V 3 4"], *, count: int = 5) -> Int[np.ndarray, "V K"]:
     """Returns the indices of the views most similar to each view, nearest first.
 

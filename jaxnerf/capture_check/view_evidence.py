@@ -8,13 +8,13 @@ other cameras agree on, explains several times as many of them as its own does.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnerf.capture_check.tracks import INLIER, errors, follow, match, triangulate
+from jaxnerf.capture_check.tracks import INLIER, Evidence, errors, follow, match, triangulate
 
 _CAMERAS = 6  # nearest ones of a pose, whose guided matches count
 _WITNESSES = 8  # images that are most similar by content, whose points another pose is estimated from
@@ -52,7 +52,7 @@ class Alternative(NamedTuple):
     inliers: int
 
 
-def find_alternative(evidence: Any, view: int, *, without: Sequence[int] = ()) -> Alternative | None:
+def find_alternative(evidence: Evidence, view: int, *, without: Sequence[int] = ()) -> Alternative | None:
     """Returns the Alternative to the pose of a view with most points, or None.
 
     Args:
@@ -77,7 +77,7 @@ def find_alternative(evidence: Any, view: int, *, without: Sequence[int] = ()) -
 
 
 def support(
-    evidence: Any, view: int, pose: Float[np.ndarray, "3 4"], others: Int[np.ndarray, " K"] | Sequence[int]
+    evidence: Evidence, view: int, pose: Float[np.ndarray, "3 4"], others: Int[np.ndarray, " K"] | Sequence[int]
 ) -> Support:
     """Counts the guided matches of an image, as if taken from a pose, with other cameras."""
     rng, own = np.random.default_rng(0), evidence.keypoints[view]

@@ -1,19 +1,35 @@
-"""The export "mesh": the surfaces of a run as triangles with vertex colours."""
+"""The export "mesh": the surfaces of a run as triangles with vertex colours.
+
+Depth images are fused into a truncated signed distance field, whose zero level set is extracted (Curless and Levoy
+1996). Only voxels near a surface of some depth image are stored and updated, a few per cent of the box.
+"""
 
 import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import trimesh
+from jaxtyping import Float, Int
+from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from skimage import measure
 
+from jaxnerf.core.cameras import project
 from jaxnerf.exporters.base import ExportSource, check_memory
-from jaxnerf.exporters.fusion import fuse, grid_shape, level_set, solid_field
-from jaxnerf.exporters.surfaces import export_box, render_depth_images
+from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 from jaxnerf.runtime import atomic_files, memory
 
 _BYTES_PER_VOXEL = 16  # of the dense field, its index and what marching cubes keeps
+_TRUNCATION = 2.5  # voxels
+_FREE = 3.0  # truncations in front of a surface, from which on space counts as free whatever the surface's normal
+_MIN_WEIGHT = 0.05  # of all views of a vertex; one that sees an opaque surface at 45 degrees has 0.7
+_CHUNK = 2**18  # vertices updated at once
+_EMPTY_WEIGHT = 0.3  # of a pixel that shows empty space
 
 
 def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
@@ -62,3 +78,210 @@ def decimated(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(
         fewer.vertices, fewer.faces, vertex_colors=np.asarray(mesh.visual.vertex_colors)[nearest], process=False
     )
+
+
+class Fused(NamedTuple):
+    """A truncated signed distance field on the vertices of a grid of voxels, stored where it is known.
+
+    Attributes:
+        lower: [3] the grid's lower corner, in units of the dataset's files.
+        voxel: the spacing of the vertices.
+        shape: vertices along x, y and z.
+        index: [M] flat index of each stored vertex, ascending.
+        distance: [M] in truncations, in [-1, 1], positive outside; NaN where no view sees the vertex.
+        rgb: [M, 3] in [0, 255].
+    """
+
+    lower: Float[np.ndarray, "3"]
+    voxel: float
+    shape: tuple[int, int, int]
+    index: Int[np.ndarray, " M"]
+    distance: Float[np.ndarray, " M"]
+    rgb: Float[np.ndarray, "M 3"]
+
+
+def grid_shape(box: Float[np.ndarray, "2 3"], resolution: int) -> tuple[float, tuple[int, int, int]]:
+    """Returns the side of a voxel and the number of vertices along x, y and z."""
+    sides = box[1] - box[0]
+    voxel = float(sides.max() / resolution)
+    return voxel, tuple(int(count) for count in np.ceil(sides / voxel - 1e-9).astype(int) + 1)
+
+
+def fuse(
+    images: Sequence[DepthImage], box: Float[np.ndarray, "2 3"], resolution: int, *, closed: bool = False
+) -> Fused:
+    """Fuses depth images.
+
+    The distance of a vertex from a surface is measured along the normal at the pixel that sees the vertex, not along
+    the ray: that is exact for a plane, however obliquely it is seen. A view counts by the cosine between its ray and
+    the normal and by the light that the surface absorbs within the truncation: views along a surface and those
+    into glass or fog are least accurate. Vertices well in front of a surface, and those before empty space, count as
+    outside; those behind a surface are not seen. Pixels at the edges of surfaces are not used. What no
+    image at the pose of a training view sees, at whatever angle, is unknown unless the surface is to be closed: the
+    field was not trained there, but it often continues what it was trained on.
+
+    Args:
+        images: all of one size.
+        box: what is fused.
+        resolution: voxels along its longest side.
+        closed: whether all images count, see above.
+
+    Returns:
+        Fused, without a vertex if no surface is in the box.
+    """
+    voxel, shape = grid_shape(box, resolution)
+    truncation = _TRUNCATION * voxel
+    surfaces = [(image.points(), *image.normals()) for image in images]
+    index = _vertices_near([points[cosine > 0] for points, _, cosine in surfaces], box[0], voxel, shape)
+    x = np.float32(box[0] + voxel * np.stack(np.unravel_index(index, shape), axis=-1))
+    x = jnp.asarray(np.resize(x, (-(-max(len(x), 1) // _CHUNK), _CHUNK, 3)))  # padded with copies of the first
+    total = jnp.zeros((*x.shape[:2], 7), jnp.float32)
+    for image, (points, normal, cosine) in zip(images, surfaces, strict=True):
+        absorbed = -np.expm1(-np.maximum(image.extinction, 0) * truncation)
+        weight = np.where(np.isinf(image.depth), _EMPTY_WEIGHT, cosine * absorbed)
+        trained = np.float32((image.depth > 0) & (closed or image.name is not None))
+        planes = [np.stack([image.depth, weight, trained], axis=-1), points, normal, image.rgb]
+        planes = np.concatenate(planes, axis=-1).astype(np.float32)
+        total = _integrate(total, image.camera, planes, x, np.float32(truncation))
+    total = np.asarray(total).reshape(-1, 7)[: len(index)]
+    weight, distance, views, rgb_weight = total[:, 0], total[:, 1], total[:, 2], total[:, 3:4]
+    seen = (weight > _MIN_WEIGHT) & (views > 0)
+    distance = np.where(seen, distance / np.where(seen, weight, 1), np.nan)
+    return Fused(box[0], voxel, shape, index, distance, total[:, 4:] / np.maximum(rgb_weight, 1e-6))
+
+
+def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray, "X Y Z"]:
+    """Computes a field for `level_set` in which all space is solid that no image sees to be free.
+
+    The boundary between the two closes the holes of the surface (Curless and Levoy 1996, Section 4). It is found at
+    every second vertex.
+
+    Args:
+        images: the DepthImages that were fused.
+        fused: for its grid.
+
+    Returns:
+        [X, Y, Z] from -1, solid, to 1, free; linear in between.
+    """
+    coarse = tuple(size // 2 + 1 for size in fused.shape)
+    x = np.float32(fused.lower + 2 * fused.voxel * np.stack(np.indices(coarse), axis=-1))
+    free = jnp.zeros(coarse, bool)
+    for image in images:
+        free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
+    field = 2 * np.asarray(free, np.float32) - 1.01  # nowhere 0 below, which would make degenerate triangles
+    for axis, size in enumerate(fused.shape):
+        place = np.arange(size)
+        field = (field.take(place // 2, axis) + field.take((place + 1) // 2, axis)) / 2
+    return field
+
+
+def level_set(
+    fused: Fused, solid: Float[np.ndarray, "X Y Z"] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Extracts the surface at distance 0 by marching cubes (Lorensen and Cline 1987, in scikit-image).
+
+    Args:
+        fused: the field.
+        solid: the field where no view sees a vertex, see `solid_field`. The surface is then closed, also where it
+            meets the border of the grid. None: no face is in a voxel with a corner that no view sees.
+
+    Returns:
+        vertices [V, 3] in units of the dataset's files; faces [F, 3], counterclockwise seen from outside; and rgb
+        [V, 3] uint8, where no view sees a surface that of the nearest one. All are empty where there is no surface.
+    """
+    known = ~np.isnan(fused.distance)
+    field, row = np.ones(fused.shape, np.float32) if solid is None else solid, np.full(fused.shape, -1, np.int32)
+    field.reshape(-1)[fused.index[known]] = fused.distance[known]
+    row.reshape(-1)[fused.index[known]] = np.flatnonzero(known)
+    if solid is not None:
+        return _closed(fused, field, row)
+    cubes = row >= 0
+    for axis in range(3):  # scikit-image marches the cube below each vertex that is in the mask
+        lower = np.roll(cubes, 1, axis=axis)
+        lower[tuple(0 if i == axis else slice(None) for i in range(3))] = False
+        cubes &= lower
+    try:
+        vertices, faces, _, _ = measure.marching_cubes(field, 0.0, mask=cubes, allow_degenerate=False)
+    except (ValueError, RuntimeError):  # the level is outside the field's range, or no cube has a surface
+        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
+    return fused.lower + fused.voxel * vertices, faces, _colors(fused, row, vertices)[0]
+
+
+def _closed(fused, field, row):
+    """Returns what level_set does for a field [X, Y, Z] that is known everywhere; row: of each stored vertex, or -1."""
+    field = np.pad(field, 1, constant_values=1)  # free space around it closes the surface
+    if field.min() > 0 or not len(fused.index):
+        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
+    vertices, faces, _, _ = measure.marching_cubes(field, 0.0, allow_degenerate=False)
+    rgb, seen = _colors(fused, row, np.clip(vertices - 1, 0, np.subtract(fused.shape, 1)))
+    if seen.any():
+        rgb[~seen] = rgb[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
+    return fused.lower + fused.voxel * (vertices - 1), faces, rgb
+
+
+def _colors(fused, row, vertices):
+    """Returns rgb [V, 3] uint8 of vertices in voxels, and [V], whether both voxel corners around each are stored."""
+    low, high = np.floor(vertices).astype(int), np.ceil(vertices).astype(int)
+    fraction = (vertices - low).max(axis=1, keepdims=True)  # a vertex is on an edge, between two voxels' corners
+    rows = [row[tuple(ends.T)] for ends in (low, high)]
+    first, second = (fused.rgb[each] for each in rows)
+    rgb = np.rint(np.clip((1 - fraction) * first + fraction * second, 0, 255)).astype(np.uint8)
+    return rgb, (rows[0] >= 0) & (rows[1] >= 0)
+
+
+def _vertices_near(parts, lower, voxel, shape):
+    """Returns the flat indices of the vertices within the truncation of points, given as arrays [N, 3]."""
+    near = np.zeros(shape, bool)
+    for points in parts:
+        place = np.rint((points - lower) / voxel).astype(int)
+        place = place[inside(place, np.array([[0, 0, 0], np.subtract(shape, 1)]))]
+        near[tuple(place.T)] = True
+    reach = int(np.ceil(_TRUNCATION)) + 1  # a point is up to half a voxel from its vertex, and pixels leave gaps
+    for axis in range(3):
+        near = ndimage.maximum_filter1d(near, 2 * reach + 1, axis=axis, mode="constant")
+    return np.flatnonzero(near)
+
+
+@jax.jit
+def _mark_free(free, camera, surface, x, truncation):
+    """Returns free [X, Y, Z], also True where a view sees that x [X, Y, Z, 3] is in front of what it shows."""
+    pixel, depth, visible = _pixels_of(camera, x, surface.shape)
+    ahead = surface.reshape(-1)[pixel] - depth
+    return free | (visible & (ahead > truncation) & (surface.reshape(-1)[pixel] > 0))
+
+
+def _pixels_of(camera, x, shape):
+    """Returns the flat indices [...] of the pixels that see x [..., 3], its depth, and whether there is one."""
+    height, width = shape
+    pixels, depth = project(camera, x)
+    column, line = (jnp.floor(jnp.clip(pixels[..., axis], -1, 1e6)).astype(jnp.int32) for axis in range(2))
+    visible = (depth > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
+    return jnp.where(visible, line * width + column, 0), depth, visible
+
+
+@jax.jit
+def _integrate(total, camera, planes, x, truncation):
+    """Returns total [C, N, 7] with what one view sees of vertices x [C, N, 3].
+
+    The sums are those of weights, of weights times distances, of training views, of the weights of colours, and of
+    those times colours.
+    """
+    height, width = planes.shape[:2]
+    rows = planes.reshape(height * width, -1)
+
+    def add(part):
+        total, x = part
+        pixel, depth, visible = _pixels_of(camera, x, (height, width))
+        row = rows[pixel]
+        surface, weight, trained = row[:, 0], row[:, 1], row[:, 2]
+        points, normal, rgb = row[:, 3:6], row[:, 6:9], row[:, 9:12]
+        ahead = (surface - depth) / truncation
+        distance = jnp.clip(((x - points) * normal).sum(axis=-1) / truncation, -1, 1)
+        distance = jnp.where(ahead > _FREE, 1, distance)
+        visible &= ahead > -1
+        weight, trained = jnp.where(visible, weight, 0), jnp.where(visible, trained, 0)
+        colored = jnp.where(ahead > _FREE, 0, weight * (1 - jnp.abs(distance)))[:, None]
+        sums = jnp.stack([weight, weight * distance, trained], axis=-1)
+        return total + jnp.concatenate([sums, colored, colored * rgb], axis=-1)
+
+    return jax.lax.map(add, (total, x))

@@ -1,13 +1,15 @@
 """The export "points": a point cloud of the surfaces, with colours and normals."""
 
+import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from jaxnerf.exporters.base import ExportSource
-from jaxnerf.exporters.ply import write_ply
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
+
+_TYPES = {"f": ("float", "<f4"), "u": ("uchar", "u1")}
 
 
 def export_points(source: ExportSource, folder: pathlib.Path) -> None:
@@ -71,3 +73,22 @@ def thinned(points: np.ndarray, most: int) -> np.ndarray:
         if 0.97 * most <= len(chosen):
             break
     return np.sort(chosen)
+
+
+def write_ply(path: str | os.PathLike, properties: Mapping[str, np.ndarray]) -> None:
+    """Writes a binary PLY file (Turk 1994) with the element "vertex".
+
+    Args:
+        path: of the file.
+        properties: arrays [N] by name, in the file's order; floating-point numbers as float, uint8 as uchar.
+    """
+    kinds = {name: _TYPES[np.asarray(values).dtype.kind] for name, values in properties.items()}
+    count = len(next(iter(properties.values())))
+    rows = np.empty(count, [(name, kind) for name, (_, kind) in kinds.items()])
+    for name, values in properties.items():
+        rows[name] = values
+    lines = [f"property {kind} {name}" for name, (kind, _) in kinds.items()]
+    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header\n"])
+    with open(path, "wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(rows.tobytes())

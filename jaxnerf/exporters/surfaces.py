@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num, UInt8
+from jaxtyping import Float, Num, UInt8
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.poses import look_at
@@ -16,6 +16,7 @@ from jaxnerf.core.rendering import points_on_rays
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
+from jaxnerf.data.geometry.world import points_in_run, poses_in_file
 from jaxnerf.evaluation.output_images import to_8_bits
 from jaxnerf.evaluation.paths.camera_path import CameraPath, path_pixels, posed_views, resize
 from jaxnerf.exporters.base import ExportSource
@@ -102,7 +103,7 @@ def render_depth_images(source: ExportSource, size: int | None, *, all_around: b
     names = views.names or tuple(f"{index:04d}" for index in range(len(views.size)))
     names = [names[index] for index in _chosen(len(views.size), source.settings.num_views)]
     names += [None] * (len(path.poses) - len(names))
-    poses = in_file(path.poses, views.to_file)
+    poses = poses_in_file(path.poses, views.to_file)
     surface = _surface_function(source, posed)
     for index, name in enumerate(names):
         pixels = path_pixels(posed, path, index, offset=0.5)
@@ -131,16 +132,6 @@ def render_depth_images(source: ExportSource, size: int | None, *, all_around: b
     return images
 
 
-def in_file(poses: Float[np.ndarray, "N 3 4"], to_file: Float[Array | np.ndarray, "4 4"] | None) -> np.ndarray:
-    """Transforms poses from a run's world to that of the dataset's files, see `Views.to_file`; float64."""
-    poses = np.asarray(poses, np.float64)
-    if to_file is None:
-        return poses
-    linear, offset = np.float64(to_file)[:3, :3], np.float64(to_file)[:3, 3]
-    rotation = linear / np.cbrt(abs(np.linalg.det(linear)))
-    return np.concatenate([rotation @ poses[:, :, :3], (poses[:, :, 3] @ linear.T + offset)[:, :, None]], axis=-1)
-
-
 def inside(points: Num[np.ndarray, "*batch 3"], box: np.ndarray | None) -> np.ndarray:
     """Returns which points are in a box [2, 3]; None: all."""
     if box is None:
@@ -160,20 +151,16 @@ def export_box(source: ExportSource, images: list[DepthImage]) -> Float[np.ndarr
     points = np.concatenate(parts)
     grid = source.variables[1]
     if grid.contracted:
-        world = points if source.views.to_file is None else _in_world(points, source.views.to_file)
         lower, upper = np.asarray(grid.lower), np.asarray(grid.upper)
         quarter = (upper - lower) / 4
-        points = points[inside(world, np.stack([lower + quarter, upper - quarter]))]
+        points = points[
+            inside(points_in_run(points, source.views.to_file), np.stack([lower + quarter, upper - quarter]))
+        ]
     if not len(points):
         raise ValueError("no surface is between the cameras; give --box=X0,Y0,Z0,X1,Y1,Z1")
     lower, upper = np.quantile(points, [0.005, 0.995], axis=0)
     margin = 0.1 * (upper - lower)
     return np.stack([np.maximum(lower - margin, points.min(axis=0)), np.minimum(upper + margin, points.max(axis=0))])
-
-
-def _in_world(points, to_file):
-    to_file = np.float64(to_file)
-    return np.linalg.solve(to_file[:3, :3], (points - to_file[:3, 3]).T).T
 
 
 def _chosen(count, number):

@@ -1,8 +1,8 @@
 """The embedded scene: a still life in closed form, inside the box +-1.2.
 
 A striped pillar, a banded ring, a block of blue glass and a polished ball stand on a checked plinth. A lamp, a
-dark core in amber glass, floats above them. Only the ball's colour depends on the direction; in matt_still_life
-no colour does, in shiny_still_life those of the pillar, the ring and the lamp's core do, too.
+dark core in amber glass, floats above them. Only the ball's colour depends on the direction; with the finish "matt"
+no colour does, with "shiny" those of the pillar, the ring and the lamp's core do, too.
 
 A body is a signed distance d (negative inside), a peak density and a colour. Its density is
 peak * sigmoid(-d / width), thin enough for a crisp outline and smooth enough for a quadrature to converge.
@@ -22,7 +22,6 @@ from jaxnerf.core.types import check_shapes
 from jaxnerf.fields import portable_math
 
 _POLISH, _SHEEN = 24, 6  # exponents of highlights: small and wide ones
-_OPAQUE = 10.0  # 1 / world unit; bodies of a higher density hide what is behind them
 WIDTH = 0.015  # world units, over which a body's density falls at its outline
 FINISHES = {"usual": ("ball",), "matt": (), "shiny": ("ball", "pillar", "ring", "lamp core")}  # what has highlights
 
@@ -69,42 +68,11 @@ def still_life(x: Positions, viewdirs: Directions) -> Output:
     Raises:
         ValueError: on other shapes.
     """
-    return _still_life(x, viewdirs, "usual")
+    return finished_still_life(x, viewdirs, "usual")
 
 
-def matt_still_life(x: Positions, viewdirs: Directions) -> Output:
-    """Returns the density and the colour of the still life with a matt ball: no colour depends on viewdirs."""
-    return _still_life(x, viewdirs, "matt")
-
-
-def shiny_still_life(x: Positions, viewdirs: Directions) -> Output:
-    """Returns the density and the colour of the still life with highlights on all round opaque bodies."""
-    return _still_life(x, viewdirs, "shiny")
-
-
-def opaque_distance(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
-    """Returns the signed distance [...] of x [..., 3] from the nearest opaque body, negative inside one.
-
-    Outside the plinth it may be less than the distance; the density of a body is half its peak where it is 0.
-    """
-    return _nearest(x, [body for body in BODIES if body.peak >= _OPAQUE])
-
-
-def glass_distance(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
-    """Returns the signed distance [...] of x [..., 3] from the nearest transparent body, the brick or the lamp's glass.
-
-    That from the brick is approximate, and 0 where it should be.
-    """
-    return _nearest(x, [body for body in BODIES if body.peak < _OPAQUE])
-
-
-def _nearest(x, bodies):
-    x = jnp.asarray(x)
-    place = x[..., 0], x[..., 1], x[..., 2]
-    return jnp.min(jnp.stack([body.distance(*place) for body in bodies]), axis=0)
-
-
-def _still_life(x, viewdirs, finish):
+def finished_still_life(x: Positions, viewdirs: Directions, finish: str) -> Output:
+    """Returns the density and the colour of `still_life` with the highlights of one of the FINISHES."""
     pattern = "... 1 3" if jnp.shape(viewdirs)[-2:-1] == (1,) else "... S 3"
     check_shapes("still_life", x=(x, "... S 3"), viewdirs=(viewdirs, pattern))
     x, viewdirs = jnp.asarray(x), jnp.asarray(viewdirs)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxnerf.data.geometry.path_poses import poses_through
+from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.runtime import atomic_files
 from jaxnerf.viewer.frame_renderer import MAX_SIDE, FrameCamera
 
@@ -64,20 +65,14 @@ def save_path(
     width, height = cameras[0].width, cameras[0].height
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"the frames have {width} x {height} px, expected sides of 1 to {MAX_SIDE}")
-    frames = [{"transform_matrix": _in_file(camera.to_world, to_file), "fl_x": camera.focal} for camera in cameras]
+    poses = poses_in_file(np.stack([camera.to_world for camera in cameras]), to_file)
+    frames = [
+        {"transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]], "fl_x": camera.focal}
+        for pose, camera in zip(poses, cameras, strict=True)
+    ]
     folder = pathlib.Path(workdir) / FOLDER
     atomic_files.check_tree(folder)
     folder.mkdir(exist_ok=True)
     path = folder / f"{name}.json"
     atomic_files.write_text(path, json.dumps({"w": width, "h": height, "fps": fps, "frames": frames}, indent=1) + "\n")
     return path
-
-
-def _in_file(pose, to_file):
-    """Returns a pose [3, 4] of the run's world as rows [4][4] in the file's; a similarity lies between them."""
-    full = np.eye(4)
-    full[:3] = pose
-    if to_file is not None:
-        full = np.asarray(to_file, np.float64) @ full
-        full[:3, :3] /= np.cbrt(np.linalg.det(full[:3, :3]))
-    return full.tolist()

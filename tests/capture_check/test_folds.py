@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxnerf.capture_check import cameras, folds, report, tracks
+from jaxnerf.capture_check import folds, report, tracks
 from jaxnerf.core import poses as core_poses
 from jaxnerf.core.types import Camera
 from jaxnerf.data.readers import base
@@ -35,7 +35,7 @@ def orbit(names=None):
 
 def evidence(keypoints, poses):
     near = tracks.neighbours(poses)
-    return cameras.Evidence(keypoints, near, tracks.follow(keypoints, near), poses, np.full(len(poses), FOCAL), 1.0)
+    return tracks.Evidence(keypoints, near, tracks.follow(keypoints, near), poses, np.full(len(poses), FOCAL), 1.0)
 
 
 def turned(found, views):

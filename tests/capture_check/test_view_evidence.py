@@ -36,7 +36,7 @@ def evidence(kinds=None, *, seed=0):
 
 def _with_poses(keypoints, poses):
     near = tracks.neighbours(poses)
-    return cameras.Evidence(keypoints, near, tracks.follow(keypoints, near), poses, np.full(len(poses), FOCAL), 1.0)
+    return tracks.Evidence(keypoints, near, tracks.follow(keypoints, near), poses, np.full(len(poses), FOCAL), 1.0)
 
 
 def capture():

@@ -22,7 +22,7 @@ from jaxnerf import (
     samples_from_edges,
 )
 from jaxnerf.core.volume_rendering import opacity
-from jaxnerf.fields import analytic
+from test_scenes import analytic
 
 SLOPE = ((0.0, 0.0, 0.2), (0.1, -0.1, -0.15), (0.05, 0.05, -0.2))
 COLOURED = {"rgb": (0.4, 0.5, 0.6), "rgb_slope": SLOPE}

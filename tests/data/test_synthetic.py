@@ -1,6 +1,7 @@
 """The embedded dataset: its difficulty, its accuracy and its cache."""
 
 import dataclasses
+import functools
 import hashlib
 
 import jax
@@ -66,7 +67,7 @@ def test_the_pixels_are_those_of_the_scene(finish):
     stack = jax.tree.map(lambda leaf: leaf[:2], synthetic._cameras("val", 20))
     rays = jax.tree.map(np.float32, synthetic.scene_rays(stack))
     rays = dataclasses.replace(rays, far=np.maximum(rays.near, rays.far))
-    scene = {"usual": still_life.still_life, "shiny": still_life.shiny_still_life}[finish]
+    scene = functools.partial(still_life.finished_still_life, finish=finish)
     seen = jax.jit(lambda rays: rendering.render_rays(None, scene, rays, num_samples=384, background=jnp.ones(3)))(rays)
     np.testing.assert_allclose(_over_white(synthetic.render_views(stack, finish)), seen.rgb, atol=5e-4)
 
@@ -171,7 +172,7 @@ def test_only_the_balls_colour_depends_on_the_direction():
     np.testing.assert_array_equal(density, same)
     changed = np.abs(bright - dark).max(axis=(1, 2))
     assert changed[0] > 0.3 and (changed[1:] < 1e-6).all() and (density > 1).all()
-    matt = jax.jit(still_life.matt_still_life)
+    matt = jax.jit(functools.partial(still_life.finished_still_life, finish="matt"))
     (matt_density, matt_bright), (_, matt_dark) = matt(x, down), matt(x, -down)
     np.testing.assert_array_equal(matt_density, density)
     np.testing.assert_array_equal(matt_bright, matt_dark)
@@ -183,7 +184,7 @@ def test_round_opaque_objects_of_the_shiny_scene_have_highlights():
     light = jnp.array([0.48, -0.36, 0.80])
     around = jax.random.uniform(jax.random.key(0), (3, 8000, 3), minval=-0.9, maxval=0.9)
     x = around + jnp.array(list(centers.values()))[:, None, :]
-    scenes = [jax.jit(scene) for scene in (still_life.shiny_still_life, still_life.matt_still_life)]
+    scenes = [jax.jit(functools.partial(still_life.finished_still_life, finish=finish)) for finish in ("shiny", "matt")]
     (density, shiny), (same, matt) = (scene(x, jnp.broadcast_to(-light, (3, 1, 3))) for scene in scenes)
     np.testing.assert_array_equal(density, same)
     assert (jnp.where(density[..., None] > 25, shiny - matt, 0).max(axis=(1, 2)) > 0.4).all()

@@ -13,9 +13,8 @@ import pytest
 import oracle
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.evaluation import external
-from jaxnerf.evaluation.evaluate import evaluate, reference, score_run
+from jaxnerf.evaluation.evaluate import evaluate, reference, score_run, watch
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.evaluation.watch import watch
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import build
 from runs import smoke_config, start

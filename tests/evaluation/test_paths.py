@@ -16,7 +16,7 @@ from jaxnerf.core import poses as poses_module
 from jaxnerf.data.geometry.poses import up_of
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.evaluation.paths import camera_path as camera_paths
-from jaxnerf.evaluation.paths.path_files import read_path_file
+from jaxnerf.evaluation.paths.camera_path import read_path_file
 
 UP = np.float32([0, 0, 1])
 look_at, interpolate = (

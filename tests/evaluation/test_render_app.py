@@ -12,7 +12,7 @@ import pytest
 from jaxnerf import Camera, load_scene, rays_from_pixels, render_image
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.evaluation import output_images
-from jaxnerf.evaluation.paths import video
+from jaxnerf.evaluation.paths import render_path as render_path_module
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.runtime import memory
 from runs import run as run_program
@@ -146,10 +146,10 @@ def test_wrong_arguments_are_errors(run, monkeypatch):
             render_path(run, name=name)
     with pytest.raises(ValueError, match="video is 'avi', expected one of auto, mp4"):
         render_path(run, kind="avi")
-    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
-    assert video.video_suffix("auto") == ".gif"
+    monkeypatch.setattr(render_path_module.importlib.util, "find_spec", lambda name: None)
+    assert render_path_module.video_suffix("auto") == ".gif"
     with pytest.raises(ValueError, match="no ffmpeg; pip install imageio-ffmpeg"):
-        video.video_suffix("mp4")
+        render_path_module.video_suffix("mp4")
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")  # of reading it again
@@ -160,7 +160,7 @@ def test_an_mp4_of_odd_sides_is_cropped_by_one_row_and_column(tmp_path):
         frame[-1], frame[:, -1] = 255, 255
         output_images.write_image(tmp_path / f"{index}.png", frame)
     target = tmp_path / "a.b.mp4"
-    video.write_video(target, sorted(tmp_path.glob("*.png")), 10)
+    render_path_module.write_video(target, sorted(tmp_path.glob("*.png")), 10)
     found = iio.imread(target)
     assert found.shape == (4, 16, 24, 3)
     np.testing.assert_allclose(found.mean(axis=(1, 2, 3)), [0, 60, 120, 180], atol=4)

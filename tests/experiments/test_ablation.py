@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from jaxnerf import Rays
-from jaxnerf.data.dataset import load_split
+from jaxnerf.data.dataset import DataOptions, load_split
+from jaxnerf.options import replaced
 from jaxnerf.training.build import build_model
 from runs import smoke_config
 from studies import common, study
@@ -93,16 +94,14 @@ def test_without_stratification_no_random_numbers_are_drawn_along_rays():
 
 
 def test_fewer_views_are_evenly_spread_and_other_splits_stay():
-    data = smoke_config().data
-    every = load_split(data, "train")
-    data.num_views = 15
+    every, data = load_split(DataOptions(size=24), "train"), DataOptions(size=24, num_views=15)
     some = load_split(data, "train")
     assert some.names == every.names[::4] and len(load_split(data, "test").names) == 8
-    data.hold_out = 6  # comes first
+    data = replaced(data, hold_out=6)  # comes first
     held = load_split(data, "held_out")
     assert len(held.names) == 10 and not set(held.names) & set(load_split(data, "train").names)
     for wrong in (-1, 51):
-        data.num_views = wrong
+        data = replaced(data, num_views=wrong)
         with pytest.raises(ValueError, match=f"data.num_views is {wrong} of 50 views"):
             load_split(data, "train")
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxnerf.core.types import Rays, Rendering
-from jaxnerf.data import ray_batches, synthetic_capture
+from jaxnerf.data import ray_batches
 from jaxnerf.data.dataset import load_dataset
-from jaxnerf.fields import room
 from studies import study
+from test_scenes import room, synthetic_capture
 
 pytestmark = pytest.mark.slow
 score_room = study("room/score_room")

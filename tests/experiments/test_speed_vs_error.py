@@ -11,6 +11,7 @@ from captures import orbit, shoot, write_transforms
 from jaxnerf.core.sampling import inverse_cdf
 from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.training import workdir
+from jaxnerf.training.config import read_config
 from studies import common, study
 
 speed = study("speed/speed_vs_error")
@@ -62,7 +63,7 @@ def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, t
     assert config.train.max_steps == "auto"
 
     def train(config, where):
-        workdir.claim(where, common.changed(config, {"train.max_steps": 7}))
+        workdir.claim(where, read_config(common.changed(config, {"train.max_steps": 7})))
         return True
 
     names = ("psnr", "ssim", "seconds_per_frame", "views", "parameters", "rays_seen", "compile_seconds")

@@ -9,10 +9,10 @@ import trimesh
 
 from export_sources import CENTER, RADIUS, SIZE, source_of
 from jaxnerf.core.types import Camera
-from jaxnerf.exporters import base, fusion, gaussians, surfaces
+from jaxnerf.exporters import base, splats, surfaces
 from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.exporters.depth import export_depth
-from jaxnerf.exporters.mesh import export_mesh, keep_large_pieces
+from jaxnerf.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field
 from jaxnerf.exporters.points import export_points, thinned
 from jaxnerf.exporters.splats import export_splats, score
 
@@ -97,10 +97,10 @@ def test_surfaces_that_no_view_sees_are_absent(images):
     """From one side, there is half a ball."""
     front = [image for image in images if image.camera.to_world[2, 3] > CENTER[2] + 2]
     box = np.stack([CENTER - 1.2, CENTER + 1.2])
-    vertices, faces, _ = fusion.level_set(fusion.fuse(front, box, 32))
+    vertices, faces, _ = level_set(fuse(front, box, 32))
     assert len(faces) and vertices[:, 2].min() > CENTER[2] - 0.8
-    fused = fusion.fuse(front, box, 32)
-    closed = trimesh.Trimesh(*fusion.level_set(fused, fusion.solid_field(front, fused))[:2])
+    fused = fuse(front, box, 32)
+    closed = trimesh.Trimesh(*level_set(fused, solid_field(front, fused))[:2])
     assert closed.is_watertight and closed.volume > 4 / 3 * np.pi * IN_FILE**3  # with what the ball hides
 
 
@@ -142,14 +142,14 @@ def test_splats_look_like_the_scene(images, tmp_path):
     assert "PSNR" in lines[0]
     read = splats_of(data)
     image = images[3]
-    drawn = gaussians.rasterize(read, image.camera)
+    drawn = splats.rasterize(read, image.camera)
     error = np.mean((np.clip(drawn, 0, 1) - image.rgb / 255.0) ** 2)
     assert -10 * np.log10(error) > 18
 
 
 def test_splats_are_scored_over_the_colour_behind_the_scene():
     """The views are black, and far away Gaussians cover none of them."""
-    none = gaussians.Gaussians(
+    none = splats.Gaussians(
         np.full((1, 3), 1e4), np.float64([[1, 0, 0, 0]]), np.full((1, 3), 1e-3), np.ones(1), np.zeros((1, 9, 3))
     )
     value, _ = score(source_of(background=(0.1, 0.1, 0.1)), none)
@@ -165,7 +165,7 @@ def splats_of(data):
 
     harmonics = np.zeros((len(data), 9, 3))
     harmonics[:, 0] = stack("f_dc_0", "f_dc_1", "f_dc_2")
-    return gaussians.Gaussians(
+    return splats.Gaussians(
         stack("x", "y", "z"),
         stack("rot_0", "rot_1", "rot_2", "rot_3"),
         np.exp(stack("scale_0", "scale_1", "scale_2")),
@@ -181,14 +181,14 @@ def test_the_rasterizer_composites_by_depth():
     )
     harmonics = np.zeros((2, 9, 3))
     harmonics[:, 0] = (np.array([[1, 0, 0], [0, 1, 0]]) - 0.5) / 0.28209479
-    pair = gaussians.Gaussians(
+    pair = splats.Gaussians(
         mean=np.array([[0, 0, -4.0], [0, 0, -2.0]]),
         rotation=np.tile([1.0, 0, 0, 0], (2, 1)),
         scale=np.full((2, 3), 0.1),
         opacity=np.array([0.8, 0.5]),
         harmonics=harmonics,
     )
-    image = gaussians.rasterize(pair, camera, np.array([0, 0, 1.0]))
+    image = splats.rasterize(pair, camera, np.array([0, 0, 1.0]))
     np.testing.assert_allclose(image[8, 8], [0.5 * 0.8, 0.5, 0.5 * 0.2], atol=1e-6)
     np.testing.assert_allclose(image[0, 0], [0, 0, 1], atol=0.02)
     variance = (50 * 0.1 / 2) ** 2 + 0.3  # of the near one, px^2

@@ -10,8 +10,7 @@ import captures
 from jaxnerf import turntable
 from jaxnerf.data import dataset
 from jaxnerf.data.dataset import DataOptions
-from jaxnerf.evaluation.paths.camera_path import make_path
-from jaxnerf.evaluation.paths.path_files import read_path_file
+from jaxnerf.evaluation.paths.camera_path import make_path, read_path_file
 from jaxnerf.viewer.frame_renderer import FrameCamera
 from jaxnerf.viewer.keyframes import cameras_through, save_path
 

@@ -1,8 +1,9 @@
-"""Normalisation of a dataset's world: a similarity of the file's world, and its inverse."""
+"""Normalisation of a dataset's world: a similarity of the file's world, and its inverse. numpy on the host."""
 
 import dataclasses
 
 import numpy as np
+from jax import Array
 from jaxtyping import Float
 
 from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
@@ -12,6 +13,43 @@ from jaxnerf.data.readers.base import Capture
 def unit_of(to_file: Float[np.ndarray, "4 4"]) -> float:
     """Returns the length in the file's units of one unit of a normalised world, from the matrix in float32."""
     return float(np.cbrt(np.linalg.det(np.float64(np.float32(to_file))[:3, :3])))
+
+
+def poses_in_file(
+    poses: Float[Array | np.ndarray, "N 3 4"], to_file: Float[Array | np.ndarray, "4 4"] | None
+) -> Float[np.ndarray, "N 3 4"]:
+    """Transforms poses from a run's world to that of the dataset's files, see `Views.to_file`; float64."""
+    poses = np.asarray(poses, np.float64)
+    if to_file is None:
+        return poses
+    linear, offset, rotation = _parts(to_file)
+    return np.concatenate([rotation @ poses[:, :, :3], (poses[:, :, 3] @ linear.T + offset)[:, :, None]], axis=-1)
+
+
+def poses_in_run(
+    poses: Float[np.ndarray, "N 3 4"], to_file: Float[Array | np.ndarray, "4 4"] | None
+) -> Float[np.ndarray, "N 3 4"]:
+    """Computes the inverse of `poses_in_file`."""
+    if to_file is None:
+        return poses
+    rotation, eyes = _parts(to_file)[2], points_in_run(poses[:, :, 3], to_file)
+    return np.concatenate([rotation.T @ poses[:, :, :3], eyes[:, :, None]], axis=-1)
+
+
+def points_in_run(
+    points: Float[np.ndarray, "N 3"], to_file: Float[Array | np.ndarray, "4 4"] | None
+) -> Float[np.ndarray, "N 3"]:
+    """Transforms points from the world of the dataset's files to a run's, see `Views.to_file`."""
+    if to_file is None:
+        return points
+    linear, offset, _ = _parts(to_file)
+    return np.linalg.solve(linear, (points - offset).T).T
+
+
+def _parts(to_file):
+    """Returns the linear part of a similarity, its offset, and its rotation."""
+    linear, offset = np.float64(to_file)[:3, :3], np.float64(to_file)[:3, 3]
+    return linear, offset, linear / np.cbrt(abs(np.linalg.det(linear)))
 
 
 def poses_of(capture: Capture) -> Float[np.ndarray, "V 3 4"]:

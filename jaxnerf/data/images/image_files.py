@@ -186,17 +186,8 @@ def average_tiles(
 
     Returns:
         [H / factor, W / factor, 3 or 4] with straight alpha, rounded to nearest.
-
-    Raises:
-        ValueError: if factor does not divide the size; the message lists the divisors.
     """
-    height, width, channels = pixels.shape
-    if height % factor or width % factor:
-        common = np.gcd(height, width)
-        works = ", ".join(str(k) for k in range(1, common + 1) if common % k == 0)
-        raise ValueError(
-            f"factor {factor} does not divide {width} x {height}, expected a divisor; choose one of {works}"
-        )
+    channels = pixels.shape[-1]
     # Contiguous channels, one after the other, are much faster than interleaved ones.
     planes = np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
     largest = np.iinfo(pixels.dtype).max

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera, SparsePoints, Views
 from jaxnerf.data.images.downscaled_copies import choose_copies
 from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_image, read_mask
 from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers
-from jaxnerf.data.readers.base import Capture
+from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.validation import check_background, check_factor
 
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # number of coefficients
@@ -77,12 +77,32 @@ def load_capture(
     frames, shrink = choose_copies(capture.frames, factor)
     chosen = [frames[index] for index in split_indices(capture, split, hold=hold)]
     chosen = chosen if select is None else [chosen[index] for index in select(len(chosen))]
+    return load_frames(chosen, shrink, background=background, source=capture.source, points=capture.points)
+
+
+def load_frames(
+    chosen: Sequence[Frame],
+    shrink: int,
+    *,
+    background: tuple[float, ...] | None,
+    source: Path,
+    points: Float[np.ndarray, "N 3"] | None = None,
+) -> Views:
+    """Reads frames, whose cameras have a height and width, as `load_capture` does.
+
+    Args:
+        chosen: with bounds.
+        shrink: see `load_capture.factor`; the frames' images are used.
+        background: see `load_capture`.
+        source: for messages.
+        points: see `Capture`.
+    """
     with ThreadPoolExecutor(num_workers()) as pool:
         forms = list(pool.map(functools.partial(_form, shrink=shrink, background=background), chosen))
     sizes = np.array([form.size for form in forms])
     ends = np.cumsum(sizes.prod(axis=1))
     if ends[-1] >= 2**31:  # offsets and pixel ids are int32
-        raise ValueError(f"{capture.source}: has {ends[-1]} pixels, expected fewer than 2^31; raise data.factor")
+        raise ValueError(f"{source}: has {ends[-1]} pixels, expected fewer than 2^31; raise data.factor")
     offset = np.append(0, ends[:-1]).astype(np.int32)
     pixels = _read_pixels(chosen, forms, offset, shrink, background)
     masks = _read_masks(chosen, forms, shrink)
@@ -98,7 +118,7 @@ def load_capture(
         mask=masks,
         names=tuple(frame.name for frame in chosen),
         background=background if pixels.shape[-1] == 4 else None,
-        sparse=_sparse_points(capture.points, chosen, forms, shrink),
+        sparse=_sparse_points(points, chosen, forms, shrink),
     )
 
 

@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES
 from jaxnerf.data.readers.colmap_model import check_complete
-from jaxnerf.data.readers.masks import find_masks
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
+
+_MASK_FOLDERS = ("images_mask", "images_masks", "masks")
 
 
 class Frame(NamedTuple):
@@ -106,8 +108,33 @@ def _with_masks(capture, folder):
     """Returns the Capture with the masks that lie in its folder, unless its format states masks."""
     if any(frame.mask is not None for frame in capture.frames):
         return capture
-    masks, notes = find_masks(folder, [(frame.name, frame.image.suffix) for frame in capture.frames])
+    masks, notes = _find_masks(folder, [(frame.name, frame.image.suffix) for frame in capture.frames])
     frames = capture.frames
     if masks is not None:
         frames = tuple(frame._replace(mask=mask) for frame, mask in zip(frames, masks, strict=True))
     return capture._replace(frames=frames, notes=(*capture.notes, *notes))
+
+
+def _find_masks(folder, images):
+    """Returns the mask of each image, None if there are none; and a note for each folder that holds no image's mask.
+
+    Images are given as (name, suffix). The mask of ("side/0001", ".jpg") is masks/side/0001.png or, as COLMAP names it,
+    masks/side/0001.jpg.png.
+    """
+    notes = []
+    for place in (folder / name for name in _MASK_FOLDERS):
+        if not place.is_dir():
+            continue
+        paths = sorted(path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        files = {path.relative_to(place).with_suffix("").as_posix(): path for path in paths}
+        masks = [files.get(name) or files.get(name + suffix) for name, suffix in images]
+        if None not in masks:
+            return masks, notes
+        first, count = images[masks.index(None)][0], sum(mask is not None for mask in masks)
+        if count:
+            raise ValueError(
+                f"{place}: has no {first}.png, but masks of {count} of {len(masks)} images, expected one for each; "
+                "add the missing ones, or rename the folder to train without masks"
+            )
+        notes.append(f"{place}: has no {first}.png and no other image's mask, so its files are not used")
+    return None, notes

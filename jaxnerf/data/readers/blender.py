@@ -1,6 +1,5 @@
 """Reader of the format of the NeRF paper's Blender renders: transforms_<split>.json beside PNG files."""
 
-import functools
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -10,8 +9,8 @@ import numpy as np
 
 from jaxnerf.core.types import Camera, Views
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.images.image_files import average_tiles, image_size, read_image
-from jaxnerf.data.images.pixel_cache import fill_pixels
+from jaxnerf.data.images.image_files import image_form
+from jaxnerf.data.images.load_images import load_frames
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.validation import (
     check_background,
@@ -54,29 +53,16 @@ def load_blender(
     factor, background = check_factor(factor), check_background(background)
     check_range(near, far)
     source, content = _read_transforms(folder, split)
-    angle, frames = _angle(content, source), _frames(content, source)
-    frames = frames if select is None else [frames[index] for index in select(len(frames))]
-    paths = [_image_path(source, frame, where) for where, frame in frames]
-    matrices = [(required(frame, "transform_matrix", where), where) for where, frame in frames]
-    poses = [check_pose(matrix, source=where) for matrix, where in matrices]
-    pixels, offset, (height, width) = _read_pixels(paths, factor, background, _declared_size(content, source))
-    count = len(paths)
-    return Views(
-        pixels=pixels,
-        offset=offset,
-        size=np.tile(np.int32([[height, width]]), (count, 1)),
-        cameras=Camera(
-            to_world=np.stack(poses).astype(np.float32),
-            focal=np.full((count, 2), 0.5 * width / math.tan(0.5 * angle), np.float32),
-            center=np.tile(np.float32([[width / 2, height / 2]]), (count, 1)),
-            height=height,
-            width=width,
-        ),
-        near=np.full(count, near, np.float32),
-        far=np.full(count, far, np.float32),
-        names=tuple(path.stem for path in paths),
-        background=background,
-    )
+    frames, forms = _frames(content, source, select)
+    for frame, form in zip(frames, forms, strict=True):
+        _check_image(frame.image, form, factor, background, _declared_size(content, source))
+        if form[0][:2] != forms[0][0][:2] or form[1] != forms[0][1]:
+            size, expected = (f"{width} x {height} {dtype}" for (height, width, _), dtype in (form, forms[0]))
+            raise ValueError(
+                f"{frame.image}: is {size}, expected {expected} as {frames[0].image.name}; render all alike"
+            )
+    frames = [frame._replace(bounds=(near, far)) for frame in frames]
+    return load_frames(frames, factor, background=background, source=source)
 
 
 def read_capture(folder: Path) -> Capture:
@@ -90,20 +76,9 @@ def read_capture(folder: Path) -> Capture:
         if split != "train" and not (Path(folder) / f"transforms_{split}.json").is_file():
             continue
         source, content = _read_transforms(folder, split)
-        angle, first = _angle(content, source), len(frames)
-        for where, frame in _frames(content, source):
-            path = _image_path(source, frame, where)
-            pose = check_pose(required(frame, "transform_matrix", where), source=where)
-            width, height = image_size(path)
-            camera = Camera(
-                to_world=pose,
-                focal=np.full(2, 0.5 * width / math.tan(0.5 * angle)),
-                center=np.array([width, height]) / 2,
-                height=height,
-                width=width,
-            )
-            frames.append(Frame(f"{split}/{path.stem}", path, camera))
-        splits[split] = tuple(range(first, len(frames)))
+        own = [frame._replace(name=f"{split}/{frame.name}") for frame in _frames(content, source)[0]]
+        splits[split] = tuple(range(len(frames), len(frames) + len(own)))
+        frames += own
     return Capture("blender", Path(folder), tuple(frames), splits)
 
 
@@ -128,12 +103,23 @@ def _angle(content, source):
     return angle
 
 
-def _frames(content, source):
-    frames = required(content, "frames", source)
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        found = "an empty list" if frames == [] else f"{str(frames)[:40]!r}"
+def _frames(content, source, select=None):
+    """Returns the Frames that a file lists, or those that are selected, and the `image_form` of each."""
+    angle, listed = _angle(content, source), required(content, "frames", source)
+    if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
+        found = "an empty list" if listed == [] else f"{str(listed)[:40]!r}"
         raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
-    return [(f"{source}, frame {index}", frame) for index, frame in enumerate(frames)]
+    frames, forms = [], []
+    for index in range(len(listed)) if select is None else select(len(listed)):
+        where = f"{source}, frame {index}"
+        path = _image_path(source, listed[index], where)
+        pose = check_pose(required(listed[index], "transform_matrix", where), source=where)
+        forms.append(image_form(path))
+        height, width, _ = forms[-1][0]
+        focal, center = np.full(2, 0.5 * width / math.tan(0.5 * angle)), np.array([width, height]) / 2
+        camera = Camera(to_world=pose, focal=focal, center=center, height=height, width=width)
+        frames.append(Frame(path.stem, path, camera))
+    return frames, forms
 
 
 def _declared_size(content, source):
@@ -155,36 +141,9 @@ def _image_path(source, frame, where):
     return found[0]
 
 
-def _read_pixels(paths, factor, background, declared):
-    """Returns pixels [V H W, C], each image's first pixel [V] int32, and their common (height, width)."""
-    first = _read_frame(paths[0], factor, background, declared)
-    _check_count(paths, first)
-
-    def read(path):
-        image = _read_frame(path, factor, background, declared)
-        if image.shape != first.shape or image.dtype != first.dtype:
-            size, expected = (f"{a.shape[1]} x {a.shape[0]} {a.dtype}" for a in (image, first))
-            raise ValueError(
-                f"{path}: is {size} after factor {factor}, expected {expected} as {paths[0].name}; render all alike"
-            )
-        return image
-
-    height, width, channels = first.shape
-    offset = np.arange(len(paths), dtype=np.int32) * np.int32(height * width)
-    pixels = fill_pixels(
-        paths,
-        [functools.partial(read, path) for path in paths],
-        shape=(len(paths) * height * width, channels),
-        dtype=first.dtype,
-        offsets=offset,
-        depends=("blender", factor, background),
-    )
-    return pixels, offset, (height, width)
-
-
-def _read_frame(path, factor, background, declared):
-    image = read_image(path)
-    height, width, channels = image.shape
+def _check_image(path, form, factor, background, declared):
+    """Raises a ValueError if an image has no alpha behind which to composite, or not the stated or a divisible size."""
+    (height, width, channels), _ = form
     if background is not None and channels != 4:
         raise ValueError(
             f"{path}: has no alpha, expected RGBA; set data.background to 'none' (background=None) for RGB"
@@ -192,19 +151,11 @@ def _read_frame(path, factor, background, declared):
     if any(side not in (None, have) for side, have in zip(declared, (height, width), strict=True)):
         expected = f"w = {declared[1]}, h = {declared[0]} as its JSON file states"
         raise ValueError(f"{path}: is {width} x {height}, expected {expected}; correct one of them")
-    if background is None:
-        image = image[..., :3]
-    try:
-        return image if factor == 1 else average_tiles(image, factor, background=background)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
-def _check_count(paths, image):
-    height, width, _ = image.shape
-    if len(paths) * height * width >= 2**31:  # offsets and pixel ids are int32
-        found = f"{len(paths)} images of {width} x {height}"
-        raise ValueError(f"{paths[0].parent}: has {found}, expected fewer than 2^31 pixels; raise data.factor")
+    if height % factor or width % factor:
+        common = math.gcd(height, width)
+        works = ", ".join(str(k) for k in range(1, common + 1) if common % k == 0)
+        found = f"factor {factor} does not divide {width} x {height}"
+        raise ValueError(f"{path}: {found}, expected a divisor; choose one of {works}")
 
 
 READER = Reader(read_capture, detect=lambda folder: (folder / "transforms_train.json").is_file())

@@ -1,21 +1,28 @@
 """Renders a trained run along a camera path, resumes where it was interrupted, and makes a video."""
 
 import functools
+import glob
+import importlib.util
 import os
 import pathlib
 import sys
+import warnings
+from collections.abc import Iterable
 from typing import Any
 
+import imageio.v2
 import numpy as np
 
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
-from jaxnerf.evaluation.paths import camera_path, video
+from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import newest_step, refined_views, render_settings, restore_run
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.metric_log import Progress
+
+VIDEO_KINDS = ("auto", "mp4", "gif", "none")
 
 
 def render_path(
@@ -54,7 +61,7 @@ def render_path(
         name: in place of the path's in the names of folder and video.
         rgba: whether rgba/0000.png is written, too: straight alpha, without the background.
         depth: whether there is a video of the depth, too.
-        kind: of video, see `video.video_suffix`.
+        kind: of video, see `video_suffix`.
         overwrite: whether frames of that name are deleted first.
         shard: (index, count): only every count-th frame, from frame `index` on. The process that finds all
             frames finished makes the depth images and the videos.
@@ -65,7 +72,7 @@ def render_path(
     Raises:
         ValueError: if there is no such run, checkpoint or path, or frames of that name have another origin.
     """
-    suffix = video.video_suffix(kind)
+    suffix = video_suffix(kind)
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
     run = restore_run(workdir, data_dir=data_dir, settings=settings)
@@ -87,7 +94,7 @@ def render_path(
         if suffix:
             written.append(target.with_name(f"{target.name}{end}{suffix}"))
             files = [target / folder / f"{index:04d}.png" for index in range(len(path.poses))]
-            video.write_video(written[-1], files, fps or path.fps or 24.0)
+            write_video(written[-1], files, fps or path.fps or 24.0)
     return written
 
 
@@ -161,3 +168,52 @@ def _write_depth_images(files):
     near, far = output_images.depth_range(map(read_stored, files))
     for file in files:
         output_images.write_image(file.with_suffix(".png"), output_images.depth_image(read_stored(file), near, far))
+
+
+def video_suffix(kind: str) -> str | None:
+    """Returns ".mp4" or ".gif", or None for "none"; "auto" is MP4 where imageio finds ffmpeg.
+
+    Raises:
+        ValueError: on another kind, or on "mp4" without ffmpeg.
+    """
+    if kind not in VIDEO_KINDS:
+        raise ValueError(f"video is {kind!r}, expected one of {', '.join(VIDEO_KINDS)}")
+    ffmpeg = importlib.util.find_spec("imageio_ffmpeg")
+    if kind == "mp4" and not ffmpeg:
+        raise ValueError("video is 'mp4', but imageio finds no ffmpeg; pip install imageio-ffmpeg")
+    if kind == "none":
+        return None
+    return ".mp4" if ffmpeg and kind != "gif" else ".gif"
+
+
+def write_video(path: pathlib.Path, frames: Iterable[pathlib.Path], fps: float) -> None:
+    """Writes a video, whole or not at all.
+
+    Args:
+        path: ends in .mp4 or .gif.
+        frames: paths of PNGs of one size, grey or RGB; read one at a time.
+        fps: frames per second. A GIF stores the duration of a frame in hundredths of a second.
+    """
+    unfinished = f".tmp{path.suffix}"  # ffmpeg infers the format from it
+    with atomic_files.partial_file(path, unfinished) as partial, warnings.catch_warnings():
+        # JAX warns of forks; this one runs ffmpeg at once and no Python.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        with imageio.v2.get_writer(partial, **_video_options(path.suffix, fps)) as writer:
+            for frame in frames:
+                pixels = read_stored(frame)
+                pixels = np.repeat(pixels[..., None], 3, axis=-1) if pixels.ndim == 2 else pixels
+                writer.append_data(_even(pixels) if path.suffix == ".mp4" else pixels)
+    atomic_files.sweep(path.parent, f"{glob.escape(path.name)}.*{unfinished}")
+
+
+def _video_options(suffix, fps):
+    if suffix == ".gif":
+        return {"duration": 1000 / fps, "loop": 0}
+    return {"fps": fps, "codec": "libx264", "macro_block_size": 1, "quality": 8, "pixelformat": "yuv420p"}
+
+
+def _even(pixels):
+    """Crops an image to even sides, which the codec requires; a side of 1 is repeated."""
+    pixels = np.pad(pixels, [(0, int(side == 1)) for side in pixels.shape[:2]] + [(0, 0)], mode="edge")
+    height, width = (side - side % 2 for side in pixels.shape[:2])
+    return pixels[:height, :width]

@@ -14,7 +14,7 @@ from jaxnerf.core import volume_rendering
 from jaxnerf.core.occupancy import packed as packed_module
 from jaxnerf.core.occupancy.grid import is_occupied
 from jaxnerf.core.types import without_samples
-from jaxnerf.fields import analytic
+from test_scenes import analytic
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")

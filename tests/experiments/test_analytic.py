@@ -15,7 +15,7 @@ import scipy.special
 
 from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import Rays
-from jaxnerf.fields import analytic
+from test_scenes import analytic
 
 SLOPE = ((0.1, -0.05, 0.2), (0.0, 0.1, -0.1), (-0.2, 0.0, 0.05))
 RGB = (0.4, 0.5, 0.6)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from jaxnerf.core.cameras import pixel_grid, rays_from_pixels
-from jaxnerf.data import synthetic_capture
 from jaxnerf.data.dataset import load_dataset
 from jaxnerf.data.readers.transforms import read_capture
-from jaxnerf.fields import room
+from test_scenes import room, synthetic_capture
 
 SIZES = {"num_views": 24, "num_held_out": 2, "num_far": 2, "width": 40, "height": 30, "num_points": 200}
 

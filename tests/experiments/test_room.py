@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxnerf.fields import room
+from test_scenes import room
 
 
 @pytest.fixture(scope="module")
