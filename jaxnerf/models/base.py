@@ -16,6 +16,7 @@ class Model(NamedTuple):
 
     Attributes:
         init: key -> params, a dict with an entry for each network. "fine" is the network of the final rendering.
+            All other functions find the progress of training in an entry "progress" as well, where `needs` names it.
         render: (keys [B], params, grid, Rays [B], step) -> Renderings [B] for training, that of "fine" last.
             They carry weights and samples, for losses.
         view: (params, grid, Rays [...]) -> Rendering [...] without weights and samples, for images. With
@@ -26,6 +27,7 @@ class Model(NamedTuple):
         input_layers, color_layers: by network, see `Field`.
         cull: (grid, Rays [...], median_depth=False) -> bool [...], which rays may hit an occupied cell, and the
             Rendering [...] of those that cannot; None where all may.
+        needs: what the fields ask for, see `core.scene.NEEDS`: the optional fields of Rays that are filled.
     """
 
     init: Callable[[jax.Array], Any]
@@ -37,6 +39,7 @@ class Model(NamedTuple):
     input_layers: Mapping[str, tuple[str, ...]] = {}
     cull: Callable[..., tuple] | None = None
     color_layers: Mapping[str, tuple[str, ...]] = {}
+    needs: tuple[str, ...] = ()
 
 
 class SamplerContext(NamedTuple):
