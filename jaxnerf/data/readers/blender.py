@@ -12,7 +12,7 @@ from jaxnerf.core.types import Camera, Views
 from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.images.image_files import average_tiles, image_size, read_image
 from jaxnerf.data.images.pixel_cache import fill_pixels
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.base import Capture, Frame, frame_times
 from jaxnerf.data.readers.validation import (
     check_background,
     check_factor,
@@ -20,6 +20,7 @@ from jaxnerf.data.readers.validation import (
     check_range,
     is_number,
     read_json,
+    read_times,
     required,
 )
 from jaxnerf.registry import Reader
@@ -55,7 +56,9 @@ def load_blender(
     check_range(near, far)
     source, content = _read_transforms(folder, split)
     angle, frames = _angle(content, source), _frames(content, source)
-    frames = frames if select is None else [frames[index] for index in select(len(frames))]
+    times = read_times(frames)
+    chosen = list(range(len(frames)) if select is None else select(len(frames)))
+    frames, times = ([each[index] for index in chosen] for each in (frames, times))
     paths = [_image_path(source, frame, where) for where, frame in frames]
     matrices = [(required(frame, "transform_matrix", where), where) for where, frame in frames]
     poses = [check_pose(matrix, source=where) for matrix, where in matrices]
@@ -76,6 +79,7 @@ def load_blender(
         far=np.full(count, far, np.float32),
         names=tuple(path.stem for path in paths),
         background=background,
+        time=frame_times(times),
     )
 
 
@@ -91,7 +95,8 @@ def read_capture(folder: Path) -> Capture:
             continue
         source, content = _read_transforms(folder, split)
         angle, first = _angle(content, source), len(frames)
-        for where, frame in _frames(content, source):
+        listed = _frames(content, source)
+        for (where, frame), time in zip(listed, read_times(listed), strict=True):
             path = _image_path(source, frame, where)
             pose = check_pose(required(frame, "transform_matrix", where), source=where)
             width, height = image_size(path)
@@ -102,7 +107,7 @@ def read_capture(folder: Path) -> Capture:
                 height=height,
                 width=width,
             )
-            frames.append(Frame(f"{split}/{path.stem}", path, camera))
+            frames.append(Frame(f"{split}/{path.stem}", path, camera, time=time))
         splits[split] = tuple(range(first, len(frames)))
     return Capture("blender", Path(folder), tuple(frames), splits)
 
