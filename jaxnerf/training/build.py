@@ -28,7 +28,7 @@ from jaxnerf.registry import LOSSES, Loss
 from jaxnerf.runtime.config_fields import is_auto
 from jaxnerf.training.camera_parameters import CameraParameters
 from jaxnerf.training.optimizer import make_optimizer
-from jaxnerf.training.step import StepLoss, TrainData
+from jaxnerf.training.step import ProgressData, StepLoss, TrainData
 
 # The optional fields that datasets provide.
 _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIELDS)
@@ -84,11 +84,11 @@ def build(config: ConfigDict) -> Experiment:
         ValueError: names the field that holds what cannot be built.
     """
     model, losses = build_model(config), build_losses(dict(config.losses), functools.partial(_levels, config))
-    cameras = build_cameras(config)
+    cameras = build_cameras(config, model.needs)
     optimizer, schedule = make_optimizer(config.train, None if cameras is None else config.cameras)
     if cameras is not None:
         model = cameras.added_to(model)
-    options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc}
+    options = {"pixel_offset": config.data.pixel_offset, "ndc": config.data.ndc, "needs": model.needs}
     batching = {"batching": config.train.batching}
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
@@ -111,10 +111,10 @@ def build(config: ConfigDict) -> Experiment:
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,
-        load_split=functools.partial(dataset.load_split, config.data),
+        load_split=functools.partial(_load_views, config.data, model.needs),
         draw=draw,
         pixel_ids=pixel_ids,
-        view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=config.data.ndc)),
+        view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=config.data.ndc, needs=model.needs)),
         world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=config.data.ndc)),
         prepare=functools.partial(_prepare, config, model, extras),
         seed=config.seed,
@@ -132,8 +132,12 @@ def build_model(config: ConfigDict) -> Model:
     return make_model(config.sampler, _context(config))
 
 
-def build_cameras(config: ConfigDict) -> CameraParameters | None:
+def build_cameras(config: ConfigDict, needs: tuple[str, ...] = ()) -> CameraParameters | None:
     """Builds the parameters of the training images; None where none are trained, as in configs of older versions.
+
+    Args:
+        config: resolved.
+        needs: see `Model`.
 
     Raises:
         ValueError: if the number of training images is unknown.
@@ -147,7 +151,7 @@ def build_cameras(config: ConfigDict) -> CameraParameters | None:
         num_images=section.num_images,
         exposure=section.exposure,
         refine=section.refine,
-        view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
+        view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc, needs=needs),
         background=dataset.background_of(config.data),
     )
 
@@ -316,8 +320,9 @@ def _prepare(config, model, extras, views):
         cells, active, indices = active_region(
             views,
             model.grid_schedule,
-            use_alpha=config.occupancy.use_alpha and not config.data.ndc,
-            min_views=config.occupancy.get("min_views", 0),
+            # What is empty in one image of a scene that moves may hold matter in others.
+            use_alpha=config.occupancy.use_alpha and not config.data.ndc and views.time is None,
+            min_views=config.occupancy.get("min_views", 0) if views.time is None else 0,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
         )
@@ -328,5 +333,17 @@ def _prepare(config, model, extras, views):
         if not config.data.ndc:
             between = interpolated_depths(dataclasses.replace(views, sparse=sparse))
             sparse = dataclasses.replace(sparse, between=between)
+    progress = None
+    if "progress" in model.needs:
+        progress = ProgressData(np.float32(config.train.max_steps), np.float32(0))
     # The mask is part of the active pixels.
-    return cells, TrainData(seed, dataclasses.replace(views, mask=None, sparse=sparse), active, indices)
+    views = dataclasses.replace(views, mask=None, sparse=sparse)
+    return cells, TrainData(seed, views, active, indices, progress=progress)
+
+
+def _load_views(data, needs, split, **options):
+    """Returns the Views of a split; a scene that asks for the image_index gets 0 for views that are not trained on."""
+    views = dataset.load_split(data, split, **options)
+    if split == "train" or "image_index" not in needs:
+        return views
+    return dataclasses.replace(views, image_index=np.zeros(len(views.size), np.int32))

@@ -12,6 +12,8 @@ from jaxnerf.models.base import Model
 from jaxnerf.models.grid_schedule import InitialCells
 from jaxnerf.training.camera_parameters import networks
 
+PROGRESS = "progress"  # the entry of the counters, and of the parameters that a model's functions receive
+
 
 @pytree()
 class TrainState:
@@ -22,7 +24,8 @@ class TrainState:
         params: network name -> its parameters, float32; and "cameras" -> those of the training images, if any.
         opt_state: of the optax optimizer.
         grid: OccupancyGrid; None where the model has none.
-        counters: name -> int32 [], see `make_train_step`.
+        counters: name -> int32 [], see `make_train_step`; and where the model asks for it "progress" -> float32 [],
+            the fraction of training that is done.
     """
 
     step: jax.Array
@@ -57,6 +60,8 @@ def create_state(
             grid = schedule.create(*cells)
         zero = jnp.zeros((), jnp.int32)
         counters = dict.fromkeys(names, zero)
+        if PROGRESS in model.needs:
+            counters[PROGRESS] = jnp.zeros((), jnp.float32)
         return TrainState(step=zero, params=params, opt_state=optimizer.init(params), grid=grid, counters=counters)
 
     return create(jax.random.key(seed), cells)
