@@ -91,6 +91,15 @@ def test_mypy_finds_wrong_arguments(mypy, tmp_path):
     assert [number for number in range(2, 7) if f"wrong.py:{number}: error" not in output] == []
 
 
+@pytest.mark.slow
+def test_mypy_finds_options_that_do_not_exist(mypy, tmp_path):
+    path = tmp_path / "wrong.py"
+    head = "from jaxnerf.training.config import RunConfig\n\nconfig = RunConfig()\n"
+    path.write_text(f"{head}print(config.train.batch_size, config.fine.width + 1)\nprint(config.train.batch_sise)\n")
+    status, output = mypy(path)
+    assert status == 1 and output.count("error:") == 1 and 'has no attribute "batch_sise"' in output, output
+
+
 def test_a_wrong_shape_that_a_function_accepts_is_found():
     @checked
     def total(values: Float[ArrayLike, "*batch samples"], far: Float[ArrayLike, "*batch"]) -> Float[ArrayLike, ""]:

@@ -108,6 +108,9 @@ CONFIG_KEYS = {
 
 # Names that contain a word of the lists above with another meaning.
 EXCEPTIONS = {
+    "ask_for": "a scene asks by name for what it needs",
+    "asks_for": "a scene asks by name for what it needs",
+    "asked_for": "a scene asks by name for what it needs",
     "grad_ema": "a key in checkpoints of other projects",
     "macro_block_size": "an option of ffmpeg",
     "make_room": "the scene experiments/test_scenes/room.py",

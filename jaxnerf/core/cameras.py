@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from jaxnerf.core.safe_math import divide, norm, normalize
+from jaxnerf.core.safe_math import at_least_float32, divide, norm, normalize
 from jaxnerf.core.types import Camera, Rays, check_shapes
 
 
@@ -112,6 +112,30 @@ def rays_from_pixels(
     )
 
 
+def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Array, "*batch"]:
+    """Computes the radius of the cone of each pixel's ray at t = 1 (arXiv:2103.13415, Section 3.1).
+
+    It is 2 / sqrt(12) times the side of a square with the area of the pixel on the plane at distance 1: the disk then
+    has the variance of the pixel. Multiplied by t it is the radius at x(t) of the rays of `rays_from_pixels`.
+
+    Args:
+        camera: one Camera (use jax.vmap for a stack).
+        pixels: [..., 2] px, as from pixel_grid.
+
+    Returns:
+        [...] world units per t. For a lens it is that of the pixel's area after `undistort`; 0 without a preimage.
+
+    Raises:
+        ValueError: on other shapes or an unknown lens.
+    """
+    (pixels,) = at_least_float32(pixels)
+    check_shapes("pixel_radius", pixels=(pixels, "... 2"), focal=(camera.focal, "2"))
+    steps = [jnp.broadcast_to(jnp.eye(2, dtype=pixels.dtype)[axis], pixels.shape) for axis in range(2)]
+    right, down = (jax.jvp(lambda at: undistort(camera, at)[0], (pixels,), (step,))[1] for step in steps)
+    area = jnp.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
+    return jnp.where(area > 0, 2 / math.sqrt(12) * jnp.sqrt(jnp.where(area > 0, area, 1)), 0)
+
+
 def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
     """Projects points of the world into the image, the inverse of `rays_from_pixels`.
 
@@ -167,7 +191,8 @@ def ndc_rays(rays: Rays, camera: Camera, *, near_plane: Num[ArrayLike, ""] = 1.0
         near_plane: distance in world units.
 
     Returns:
-        Rays [...] with near 0 and far 1 and the same viewdirs. A ray that does not run towards -z, or is so
+        Rays [...] with near 0 and far 1, the same viewdirs, time and image_index, and no radius, as the image of a
+        cone is no cone. A ray that does not run towards -z, or is so
         nearly perpendicular to it that its position or gradient overflows, misses the box: near = far = 0.
 
     Raises:
@@ -198,6 +223,8 @@ def ndc_rays(rays: Rays, camera: Camera, *, near_plane: Num[ArrayLike, ""] = 1.0
         viewdirs=rays.viewdirs,
         near=jnp.zeros_like(plane[..., 0]),
         far=jnp.where(forward, plane[..., 0], 0),
+        time=rays.time,
+        image_index=rays.image_index,
     )
 
 

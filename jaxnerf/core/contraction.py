@@ -30,6 +30,28 @@ def contract(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
     return jnp.where(outside, x / safe * (2 - 1 / safe), x)
 
 
+def length_scale(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
+    """Computes the factor by which `contract` scales lengths at x, alike in all directions (arXiv:2304.06706).
+
+    It is the cube root of the determinant of the Jacobian: 1 where m = max |x_i| is at most 1, and
+    ((2 m - 1) / m^3)^(2/3) outside.
+
+    Args:
+        x: [..., 3], see `contract`.
+
+    Returns:
+        [...] in [0, 1]; 0 at infinity.
+
+    Raises:
+        ValueError: on other shapes.
+    """
+    check_shapes("length_scale", x=(x, "... 3"))
+    largest = _largest(jnp.clip(x, -1e30, 1e30))[..., 0]
+    inverse = 1 / jnp.maximum(largest, 1)
+    # Roots of factors, as the inverse of m^3 would underflow.
+    return jnp.where(largest > 1, (jnp.cbrt(2 - inverse) * jnp.cbrt(inverse) ** 2) ** 2, 1)
+
+
 def expand(y: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
     """Inverts `contract`: returns x with contract(x) = y, for components |y_i| < 2.
 

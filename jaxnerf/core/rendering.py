@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core import sampling, volume_rendering
 from jaxnerf.core.safe_math import norm
+from jaxnerf.core.scene import inputs_of
 from jaxnerf.core.types import Background, Keys, Rays, Rendering, Samples, SceneFn, check_shapes, without_samples
 
 
@@ -30,7 +31,8 @@ def render_samples(
     """Renders rays through a scene that is evaluated at the given samples (Eq. 3).
 
     Args:
-        scene: (x [..., S, 3], viewdirs [..., 1, 3]) -> (density [..., S], rgb [..., S, 3]).
+        scene: (x [..., S, 3], viewdirs [..., 1, 3]) -> (density [..., S], rgb [..., S, 3]). What else it needs, it
+            asks for by keyword-only parameters: radius, length, time or image_index, see core.scene.NEEDS.
         rays: Rays [...].
         samples: Samples [..., S]. Where delta is 0, the scene is evaluated at the near end of the ray, and
             the result, even NaN, affects neither value nor gradient.
@@ -41,7 +43,7 @@ def render_samples(
         Rendering [...]. An empty ray has the background's colour, depth far and disparity 0.
 
     Raises:
-        ValueError: if an argument or the scene's result has another shape.
+        ValueError: if an argument or the scene's result has another shape, or the rays lack what the scene asks for.
     """
     check_shapes(
         "render_samples",
@@ -56,7 +58,10 @@ def render_samples(
     t = jnp.where(kept, samples.t, jnp.broadcast_to(jnp.asarray(rays.near)[..., None], samples.t.shape))
     x = points_on_rays(rays, t)
     x = jnp.where(kept[..., None], x, jax.lax.stop_gradient(x))  # a NaN gradient must not reach the rays
-    density, rgb = scene(x, rays.viewdirs[..., None, :])
+    inputs = sample_inputs("render_samples", scene, rays, t, samples.delta)
+    per_sample = {name: value for name, value in inputs.items() if value.shape == kept.shape}
+    inputs |= {name: jnp.where(kept, value, jax.lax.stop_gradient(value)) for name, value in per_sample.items()}
+    density, rgb = scene(x, rays.viewdirs[..., None, :], **inputs)
     check_scene_output("render_samples", density, rgb, x)
     density = jnp.where(kept, density, 0)
     rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # channel by channel, as in composite
@@ -233,6 +238,52 @@ def check_scene_output(function: str, density: Array, rgb: Array, x: Float[Array
             f"{function}: the scene returned density {density.shape} and rgb {rgb.shape} for positions "
             f"{x.shape}, expected {x.shape[:-1]} and {x.shape}"
         )
+
+
+def sample_inputs(
+    function: str,
+    scene: SceneFn,
+    rays: Rays,
+    t: Num[ArrayLike, "*batch samples"],
+    delta: Num[ArrayLike, "*batch samples"],
+) -> dict[str, Num[Array, "..."]]:
+    """Computes what a scene asks for at samples of rays, the keyword arguments of its evaluation there.
+
+    Args:
+        function: name of the calling function, for messages.
+        scene: see render_samples.
+        rays: Rays [...].
+        t: [..., S] in t.
+        delta: [..., S] length in t; a negative one counts as 0.
+
+    Returns:
+        By name of core.scene.NEEDS: radius and length [..., S], time and image_index [..., 1]. Empty for a scene that
+        asks for nothing.
+
+    Raises:
+        ValueError: if the rays lack what it asks for, or have it in another shape than near.
+    """
+
+    def of_rays(name):
+        value = getattr(rays, name)
+        if value is None:
+            return None
+
+        def compute():
+            check_shapes(function, near=(rays.near, "..."), **{name: (value, "...")})
+            return jnp.asarray(value)[..., None]
+
+        return compute
+
+    at_one = of_rays("radius")
+    return inputs_of(
+        function,
+        scene,
+        radius=at_one and (lambda: at_one() * t),
+        length=lambda: segment_lengths(jnp.maximum(delta, 0), rays),
+        time=of_rays("time"),
+        image_index=of_rays("image_index"),
+    )
 
 
 def segment_lengths(delta: Num[ArrayLike, "*batch samples"], rays: Rays) -> Float[Array, "*batch samples"]:

@@ -32,11 +32,9 @@ def pytree(*, static: Iterable[str] = ()) -> Callable[[type[_T]], type[_T]]:
     return decorate
 
 
-# (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S] in 1 / world unit, rgb [..., S, 3]).
-SceneFn: TypeAlias = Callable[
-    [Float[Array, "*batch samples 3"], Float[Array, "*batch #samples 3"]],
-    tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]],
-]
+# (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S] in 1 / world unit, rgb [..., S, 3]). A scene that
+# needs more asks for it by keyword-only parameters: radius, length, time, image_index, progress, see core.scene.NEEDS.
+SceneFn: TypeAlias = Callable[..., tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]]
 
 # One key or an array of keys, typed or raw; functions say whether they take one key per ray.
 Keys: TypeAlias = Key[Array, "..."] | UInt32[ArrayLike, "... 2"]
@@ -57,6 +55,11 @@ class Rays:
         viewdirs: [..., 3] unit length, the direction that a field receives.
         near: [...] in t.
         far: [...] in t. A ray whose far equals its near shows only the background.
+        radius: [...] world units per t, that of the cone around the ray at t = 1, see cameras.pixel_radius.
+        time: [...] in [0, 1], of the image.
+        image_index: [...] int32, of the training image.
+
+    The last three are for scenes that ask for them, and None otherwise.
     """
 
     origins: Float[Array, "*batch 3"]
@@ -64,6 +67,9 @@ class Rays:
     viewdirs: Float[Array, "*batch 3"]
     near: Float[Array, "*batch"]
     far: Float[Array, "*batch"]
+    radius: Float[Array, "*batch"] | None = None
+    time: Float[Array, "*batch"] | None = None
+    image_index: Int[Array, "*batch"] | None = None
 
 
 @pytree(static=("rule",))
@@ -217,6 +223,9 @@ class Views:
             its points tell; 0 where they do not, None: not known.
         to_file: [4, 4] maps this world to that of the dataset's files; None where they are the same.
         sparse: points of the dataset's own model and their observations in these views; None without points.
+        time: [V] in [0, 1], when each image was taken in a scene that moves; None: not stated.
+        image_index: [V] int32, which training image each view counts as for a scene that asks for `image_index`; None:
+            its own index here.
     """
 
     pixels: UInt[Array, "P C"]
@@ -232,6 +241,8 @@ class Views:
     to_file: Float[Array, "4 4"] | None = None
     free_until: Float[Array, " V"] | None = None
     sparse: SparsePoints | None = None
+    time: Float[Array, " V"] | None = None
+    image_index: Int[Array, " V"] | None = None
 
 
 @pytree()

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, Num, UInt
 
-from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
+from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_radius, rays_from_pixels
 from jaxnerf.core.loops import search_sorted
 from jaxnerf.core.safe_math import norm
-from jaxnerf.core.types import Batch, Rays, Vector, Views, pytree
+from jaxnerf.core.types import Batch, Camera, Rays, Vector, Views, pytree
 
 BATCHINGS = ("all_images", "single_image")
 DEPTH_STRIDE = 4  # px between the places of `SparsePoints.between`
@@ -82,13 +82,58 @@ def pixel_colors(pixels: UInt[ArrayLike, "*batch C"], background: Vector | None)
 
 
 def view_rays(
-    views: Views, index: Int[ArrayLike, ""], pixels: Num[ArrayLike, "*batch 2"], *, ndc: bool = False
+    views: Views,
+    index: Int[ArrayLike, ""],
+    pixels: Num[ArrayLike, "*batch 2"],
+    *,
+    ndc: bool = False,
+    needs: Iterable[str] = (),
 ) -> Rays:
-    """Returns the Rays [*batch] of one view through pixel positions (x, y); ndc: in normalised device coordinates."""
+    """Returns the Rays [*batch] of one view through pixel positions (x, y).
+
+    Args:
+        views: with their cameras on the device or the host.
+        index: of the view.
+        pixels: px.
+        ndc: whether the rays are in normalised device coordinates.
+        needs: what a scene asks for, see `with_needs`. Rays have a time only if the views do.
+    """
     camera = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], views.cameras)
     near, far = jnp.asarray(views.near)[index], jnp.asarray(views.far)[index]
     rays = rays_from_pixels(camera, pixels, near=near, far=far)
+    if needs:
+        time = None if views.time is None else jnp.asarray(views.time)[index]
+        image_index = index if views.image_index is None else jnp.asarray(views.image_index)[index]
+        rays = with_needs(rays, camera, pixels, needs, time=time, image_index=image_index)
     return ndc_rays(rays, camera) if ndc else rays
+
+
+def with_needs(
+    rays: Rays,
+    camera: Camera,
+    pixels: Num[ArrayLike, "*batch 2"],
+    needs: Iterable[str],
+    *,
+    time: Float[ArrayLike, ""] | None = 0.0,
+    image_index: Int[ArrayLike, ""] = 0,
+) -> Rays:
+    """Fills those optional fields of rays that a scene asks for.
+
+    Args:
+        rays: Rays [...] of rays_from_pixels.
+        camera, pixels: from which they were made.
+        needs: names of `core.scene.NEEDS`, those of fields of Rays count.
+        time: of all rays; None: unknown, and not filled.
+        image_index: of all rays.
+    """
+    shape, known = rays.near.shape, {}
+    if "radius" in needs:
+        known["radius"] = pixel_radius(camera, pixels)
+    if "time" in needs and time is not None:
+        known["time"] = jnp.broadcast_to(jnp.asarray(time, jnp.float32), shape)
+    if "image_index" in needs:
+        known["image_index"] = jnp.broadcast_to(jnp.asarray(image_index, jnp.int32), shape)
+    return dataclasses.replace(rays, **known)
 
 
 def world_depth(
@@ -124,6 +169,7 @@ def draw_batch(
     pixel_offset: float = 0.5,
     ndc: bool = False,
     extras: Iterable[str] = (),
+    needs: Iterable[str] = (),
 ) -> tuple[Key[Array, " B"], Batch]:
     """Draws random rays with their colours: a part of one step's batch.
 
@@ -143,6 +189,7 @@ def draw_batch(
         extras: the optional fields of Batch to fill. For "depth" and "depth_weight", one ray in 16 goes through a
             random observation of `views.sparse` instead, and has the colour of the pixel around it. The depth of the
             others is interpolated, if `views.sparse.between` is known.
+        needs: the optional fields of Rays to fill, see `view_rays`.
 
     Returns:
         One key per ray, for sampling along the rays; and the Batch [B].
@@ -159,7 +206,7 @@ def draw_batch(
     if observed:  # an observation is measured as the pixels are where their rays go through their centres
         at = jnp.asarray(views.sparse.pixel)[chosen] + (pixel_offset - 0.5)
         pixels = jnp.where((chosen >= 0)[:, None], at, pixels)
-    rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc))(view, pixels)
+    rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc, needs=needs))(view, pixels)
     stored = views.pixels
     colors = stored.rows[positions] if isinstance(stored, Gathered) else stored[index]
     batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background))

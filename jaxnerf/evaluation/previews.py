@@ -16,10 +16,9 @@ from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.types import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask, reference
-from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
+from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_run
 from jaxnerf.runtime import atomic_files, memory, processes
 from jaxnerf.training import metric_log
-from jaxnerf.training.optimizer import averaged_params
 from jaxnerf.training.state import TrainState
 
 _MAX_VIEWS = 8  # of a split that the summary scores
@@ -47,7 +46,7 @@ class Previews:
             views: of the split "train", used where there are no held-out views.
         """
         try:
-            return self._write(_on_one_device((averaged_params(state), state.grid)), int(state.step), views)
+            return self._write(_on_one_device((image_params(state), state.grid)), int(state.step), views)
         except _FAILURES as error:
             return f"preview       none: {error}"
 

@@ -17,7 +17,7 @@ from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
 from jaxnerf.training.optimizer import averaged_params
-from jaxnerf.training.state import create_state
+from jaxnerf.training.state import PROGRESS, TrainState, create_state
 from jaxnerf.training.workdir import load_config
 
 
@@ -32,7 +32,7 @@ class TrainedRun(NamedTuple):
         identity: text that is equal for configs that render alike, see `config.identity`.
         render_image: (variables, Rays [...], chunk=None, median_depth=False) -> Rendering [...] as `render`, in
             chunks that fit into memory.
-        variables_of: (averaged parameters, grid) of a state of training -> (params, grid) as `variables` returns them.
+        variables_of: (`image_params`, grid) of a state of training -> (params, grid) as `variables` returns them.
         model_with: settings of the section `eval`, by name -> the Model that renders with these in place of the run's
             own. It takes the same variables.
     """
@@ -115,7 +115,7 @@ def _restore(workdir, config, data_dir, settings, *, crop):
 
     def variables(step):
         state = checkpoints.load(step, template())
-        return variables_of(averaged_params(state), state.grid)
+        return variables_of(image_params(state), state.grid)
 
     def model_with(settings):
         other = _with_settings(config, settings)
@@ -157,6 +157,15 @@ def _with_settings(config, settings):
     return changed(config, {f"eval.{name}": value for name, value in settings.items()}) if settings else config
 
 
+def image_params(state: TrainState) -> dict[str, Any]:
+    """Returns the parameters with which images of a state are rendered.
+
+    They are averaged, see `averaged_params`. Where the model asks for it, "progress" is that of the state.
+    """
+    progress = {PROGRESS: state.counters[PROGRESS]} if PROGRESS in state.counters else {}
+    return {**averaged_params(state), **progress}
+
+
 def render_settings(run: TrainedRun) -> dict[str, Any]:
     """Returns the settings of the config's section `eval` that change what a run renders, by name."""
     options = run.experiment.config.eval
@@ -190,7 +199,8 @@ def load_scene(workdir: str | os.PathLike) -> tuple[SceneFn, Callable[[Rays], Re
         workdir: the folder that training wrote.
 
     Returns:
-        scene, the trained field as a function (x, viewdirs) -> (density, rgb); and render, a function
+        scene, the trained field as a function (x, viewdirs) -> (density, rgb), which asks for what the field asks for
+        except the progress of training, which is the checkpoint's; and render, a function
         Rays [...] -> Rendering [...] with the samples and background of the run's evaluation. It renders in chunks
         that fit into memory, and skips rays that hit nothing; inside a jitted function it renders all rays at once.
 

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.metrics import psnr
+from jaxnerf.core.occupancy.grid import cell_inputs
 from jaxnerf.core.types import Camera, Vector
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.metrics import pixel_mask, reference
@@ -116,7 +117,8 @@ def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) ->
     def fit(params, grid, x, normals):
         scene = source.run.experiment.model.scene(params, grid)
         shape = (len(x), *directions.shape)
-        _, rgb = scene(jnp.broadcast_to(x[:, None], shape), jnp.broadcast_to(in_world[None], shape))
+        x = jnp.broadcast_to(x[:, None], shape)
+        _, rgb = scene(x, jnp.broadcast_to(in_world[None], shape), **cell_inputs("export", scene, grid, x))
         weights = jnp.maximum(-normals @ directions.T, 0)
         square = jnp.einsum("nd,dk,dl->nkl", weights, basis, basis) + ridge[None]
         return jnp.linalg.solve(square, jnp.einsum("nd,dk,ndc->nkc", weights, basis, rgb - 0.5))

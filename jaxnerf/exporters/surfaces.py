@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Num, UInt8
 
 from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.core.occupancy.grid import cell_inputs
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.rendering import points_on_rays
 from jaxnerf.core.safe_math import norm
@@ -215,9 +216,11 @@ def _surface_function(source, posed):
         x = points_on_rays(rays, median[..., None])[..., 0, :]
         scene = run.experiment.model.scene(params, grid)
         flat = x.reshape(-1, 3), rays.viewdirs.reshape(-1, 3)
+        flat = *flat, cell_inputs("export", scene, grid, flat[0])
 
         def density_at(place):
-            return scene(place[0][None, None], place[1][None, None])[0][0, 0]
+            x, viewdir, inputs = jax.tree.map(lambda leaf: leaf[None, None], place)
+            return scene(x, viewdir, **inputs)[0][0, 0]
 
         density = jax.lax.map(density_at, flat, batch_size=min(_CHUNK, flat[0].shape[0])).reshape(median.shape)
         return distance, density * norm(rays.directions) / slope, x

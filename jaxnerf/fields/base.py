@@ -1,5 +1,6 @@
 """The interface of fields: parameters, and a function of them that is a scene."""
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -7,10 +8,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import linen
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaxnerf.core import contraction
-from jaxnerf.core.types import Vector
+from jaxnerf.core.scene import needs_of
+from jaxnerf.core.types import SceneFn, Vector
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
 
@@ -25,7 +27,8 @@ class Field(NamedTuple):
     Attributes:
         init: key -> params, any pytree of float arrays.
         apply: (params, x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S] in 1 / world unit, rgb
-            [..., S, 3] in [0, 1]). A field may take `key` and `density_noise` as keywords, see `mlp_field`.
+            [..., S, 3] in [0, 1]). A field may take `key` and `density_noise` as keywords, see `mlp_field`, and
+            keyword-only what a scene may ask for, see `core.scene.NEEDS`.
         input_layers: keys of params: the layers that receive the position; empty: all layers. A field is dead
             if no gradient reaches these layers; training then reinitializes it.
         regularizers: by the name of a registered loss, the function (params) -> scalar; see `register_loss`.
@@ -44,17 +47,42 @@ def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
     """Makes a Field that covers all of space from one that covers a box.
 
     The inner half of the box from lower [3] to upper [3] is evaluated as it is; the outer half holds the rest
-    of space, see `contraction.contract`.
+    of space, see `contraction.contract`. If the field asks for radius or length, they are scaled as the contraction
+    scales lengths there, see `contraction.length_scale`; more than 1e30 counts as 1e30.
     """
     middle = (jnp.asarray(lower) + jnp.asarray(upper)) / 2
     quarter = (jnp.asarray(upper) - jnp.asarray(lower)) / 4
 
+    @functools.wraps(field.apply)
     def apply(params, x, viewdirs, **options):
         lead = (1,) * (x.ndim - 1)
         center, scale = middle.reshape(*lead, 3), quarter.reshape(*lead, 3)
+        for name in ("radius", "length"):
+            if name in options:
+                sizes = jnp.minimum(options[name], 1e30)  # infinity times 0 would be NaN
+                options[name] = sizes * contraction.length_scale((x - center) / scale)
         return field.apply(params, center + scale * contraction.contract((x - center) / scale), viewdirs, **options)
 
     return field._replace(apply=apply)
+
+
+def field_scene(field: Field, params: Mapping[str, Any], name: str = "fine", **options: Any) -> SceneFn:
+    """Makes the scene of a network: its field with its parameters.
+
+    Args:
+        field: Field.
+        params: of a model; their entry "progress", if there is one, is bound where the field asks for it.
+        name: of the network.
+        **options: keywords of `field.apply`.
+    """
+    if "progress" in params and "progress" in needs_of(field.apply):
+        options["progress"] = params["progress"]
+    return functools.partial(field.apply, params[name], **options)
+
+
+def needs_of_fields(*fields: Field) -> tuple[str, ...]:
+    """Returns all that fields ask for, see `Model.needs`."""
+    return tuple(sorted({name for field in fields for name in needs_of(field.apply)}))
 
 
 def apply_network(
@@ -62,6 +90,7 @@ def apply_network(
     params: Any,
     x: Float[ArrayLike, "*batch samples 3"],
     viewdirs: Float[ArrayLike, "*batch #samples 3"],
+    **inputs: Num[ArrayLike, "..."],
 ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
     """Evaluates a network at positions in a layout that suits a CPU's cache.
 
@@ -73,6 +102,7 @@ def apply_network(
         params: of the network.
         x: [..., S, 3].
         viewdirs: [..., 1 or S, 3].
+        **inputs: what else the network's call takes, by name: each [..., 1 or S], or a number.
 
     Returns:
         [..., S] and [..., S, 3], the same as without padding.
@@ -80,12 +110,14 @@ def apply_network(
     *leading, samples = shape = x.shape[:-1]
     rays = math.prod(leading)
     if not rays * samples or rays * samples % _CACHE_ROW:
-        return network.apply({"params": params}, x, viewdirs)
+        return network.apply({"params": params}, x, viewdirs, **inputs)
     more = (0, _MORE_SAMPLES) if rays < _FEW_RAYS else (1, 0)
 
     def pad(vectors):
-        vectors = jnp.broadcast_to(vectors, (*leading, *vectors.shape[-2:])).reshape(rays, -1, 3)
+        size = vectors.shape[-2:]
+        vectors = jnp.broadcast_to(vectors, (*leading, *size)).reshape(rays, *size)
         return jnp.pad(vectors, [(0, more[0]), (0, more[1] * (vectors.shape[1] > 1)), (0, 0)])
 
-    density, rgb = network.apply({"params": params}, pad(x), pad(viewdirs))
+    padded = {name: pad(value[..., None])[..., 0] if jnp.ndim(value) else value for name, value in inputs.items()}
+    density, rgb = network.apply({"params": params}, pad(x), pad(viewdirs), **padded)
     return density[:rays, :samples].reshape(shape), rgb[:rays, :samples].reshape(*shape, 3)

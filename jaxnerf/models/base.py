@@ -60,7 +60,8 @@ class Model(NamedTuple):
     """Pure functions of parameters, an occupancy grid (None if the model has none) and rays.
 
     Attributes:
-        init: key -> params, a dict with an entry for each network.
+        init: key -> params, a dict with an entry for each network. All other functions find the progress of training
+            in an entry "progress", too, where `needs` names it.
         render: (keys [B], params, grid, Rays [B], step) -> for training, a dict with the Rendering [B] of each
             network. They carry weights and samples, for losses.
         view: (params, grid, Rays [...]) -> Rendering [...] without weights and samples, for images. With
@@ -73,6 +74,7 @@ class Model(NamedTuple):
         grid_schedule: how the occupancy grid is created and updated; None without one.
         cull: (grid, Rays [...], median_depth=False) -> bool [...], which rays may hit an occupied cell, and the
             Rendering [...] of those that cannot; None where all may.
+        needs: what the fields ask for, see `core.scene.NEEDS`: the optional fields of Rays that are filled.
     """
 
     init: Callable[[jax.Array], Any]
@@ -84,6 +86,7 @@ class Model(NamedTuple):
     image_networks: tuple[str, ...] = ("fine",)
     grid_schedule: GridSchedule | None = None
     cull: Callable[..., tuple] | None = None
+    needs: tuple[str, ...] = ()
 
 
 class SamplerContext(NamedTuple):

@@ -1,6 +1,5 @@
 """The occupancy grid of a model: its box, and when training updates which cells."""
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, update_grid
-from jaxnerf.fields.base import Field
+from jaxnerf.fields.base import Field, field_scene
 
 Corner = tuple[float, float, float]
 
@@ -132,7 +131,7 @@ def make_grid_schedule(
             return update_grid(
                 key,
                 grid,
-                functools.partial(field.apply, params["fine"]),
+                field_scene(field, params),
                 chosen,
                 threshold=empty_below,
                 spacing=spacing,

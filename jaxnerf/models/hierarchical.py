@@ -1,7 +1,6 @@
 """The paper's sampler: a coarse network guides the samples of a fine one (Section 5.2 of arXiv:2003.08934)."""
 
 import dataclasses
-import functools
 import inspect
 from collections.abc import Mapping
 
@@ -10,7 +9,7 @@ import jax
 from jaxnerf.core.rendering import render_hierarchical, render_rays
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import Background, without_samples
-from jaxnerf.fields.base import Field
+from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.options import Options, at_least, option
 from jaxnerf.registry import Part
@@ -90,9 +89,7 @@ def hierarchical_model(
         noise = sampling.density_noise if keys is not None else 0.0
         keys, *noise_keys = split_key(keys, 1 + len(fields)) if noise else (keys, *[None] * len(fields))
         scenes = [
-            functools.partial(
-                field.apply, params[name], **({"key": noise_key, "density_noise": noise} if noise else {})
-            )
+            field_scene(field, params, name, **({"key": noise_key, "density_noise": noise} if noise else {}))
             for (name, field), noise_key in zip(fields.items(), noise_keys, strict=True)
         ]
         keys = keys if sampling.stratified else None
@@ -111,7 +108,7 @@ def hierarchical_model(
 
     def scene(params, grid):
         del grid
-        return functools.partial(fields["fine"].apply, params["fine"])
+        return field_scene(fields["fine"], params)
 
     return Model(
         init=init,
@@ -121,4 +118,5 @@ def hierarchical_model(
         samples_per_ray=sampling.num_coarse + sampling.num_fine,
         fields=fields,
         image_networks=tuple(fields),
+        needs=needs_of_fields(*fields.values()),
     )

@@ -1,7 +1,6 @@
 """The occupancy sampler: one field, evaluated only in the occupied cells of a grid (after arXiv:2201.05989)."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,7 +15,7 @@ from jaxnerf.core.occupancy.packed import render_packed, render_placed
 from jaxnerf.core.occupancy.ray_culling import rays_may_hit, render_background
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import Background, Rays, Rendering, SceneFn
-from jaxnerf.fields.base import Field
+from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.models.base import Model, SamplerContext, ViewOptions
 from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 from jaxnerf.options import (
@@ -230,7 +229,7 @@ def occupancy_model(
     """
 
     def scene(params):
-        return functools.partial(field.apply, params["fine"])
+        return field_scene(field, params)
 
     def render(keys, params, grid, rays, step):
         buffer = math.ceil(options.pool_samples_per_ray * rays.near.size)
@@ -260,6 +259,7 @@ def occupancy_model(
         fields={"fine": field},
         grid_schedule=schedule,
         cull=_cull(schedule, background),
+        needs=needs_of_fields(field),
     )
 
 

@@ -23,7 +23,8 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.training.camera_parameters import CameraParameters
 from jaxnerf.training.config import Config, RunConfig, read_config
 from jaxnerf.training.optimizer import make_optimizer
-from jaxnerf.training.step import StepLoss, TrainData
+from jaxnerf.training.options import UNLIMITED_STEPS
+from jaxnerf.training.step import ProgressData, StepLoss, TrainData
 
 # The optional fields that datasets provide.
 _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIELDS)
@@ -72,7 +73,7 @@ def build(config: Config) -> Experiment:
     config = read_config(config)
     given, train = config.data, config.train
     model = build_model(config)
-    losses, cameras = build_losses(config.losses, model), build_cameras(config)
+    losses, cameras = build_losses(config.losses, model), build_cameras(config, model.needs)
     _filled(config.train, "train")
     optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
     if cameras is not None:
@@ -90,6 +91,7 @@ def build(config: Config) -> Experiment:
             data.active_pixels,
             pixel_offset=given.pixel_offset,
             ndc=given.ndc,
+            needs=model.needs,
             **options,
         )
 
@@ -103,10 +105,10 @@ def build(config: Config) -> Experiment:
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,
-        load_split=functools.partial(dataset.load_split, given),
+        load_split=functools.partial(_load_views, given, model.needs),
         draw=draw,
         pixel_ids=pixel_ids,
-        view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc)),
+        view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc, needs=model.needs)),
         world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=given.ndc)),
         prepare=functools.partial(_prepare, config, model, extras),
         background=dataset.color_behind(given),
@@ -129,8 +131,12 @@ def build_model(config: Config) -> Model:
     )
 
 
-def build_cameras(config: RunConfig) -> CameraParameters | None:
+def build_cameras(config: RunConfig, needs: tuple[str, ...] = ()) -> CameraParameters | None:
     """Builds the parameters of the training images; None where none are trained.
+
+    Args:
+        config: resolved.
+        needs: see `Model`.
 
     Raises:
         ValueError: if the number of training images is unknown.
@@ -142,7 +148,7 @@ def build_cameras(config: RunConfig) -> CameraParameters | None:
         num_images=options.num_images,
         exposure=options.exposure,
         refine=options.refine,
-        view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc),
+        view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc, needs=needs),
         background=dataset.background_of(config.data),
     )
 
@@ -304,8 +310,9 @@ def _prepare(config, model, extras, views):
         cells, active, indices = active_region(
             views,
             model.grid_schedule,
-            use_alpha=config.occupancy.use_alpha and not config.data.ndc,
-            min_views=config.occupancy.min_views,
+            # What is empty in one image of a scene that moves may hold matter in others.
+            use_alpha=config.occupancy.use_alpha and not config.data.ndc and views.time is None,
+            min_views=config.occupancy.min_views if views.time is None else 0,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
         )
@@ -316,5 +323,19 @@ def _prepare(config, model, extras, views):
         if not config.data.ndc:
             between = interpolated_depths(dataclasses.replace(views, sparse=sparse))
             sparse = dataclasses.replace(sparse, between=between)
+    progress = None
+    if "progress" in model.needs:
+        train = config.train  # of several processes that only time ends, the learning rate has a planned end
+        steps = train.lr_steps if train.max_steps >= UNLIMITED_STEPS else train.max_steps
+        progress = ProgressData(np.float32(steps), np.float32(0))
     # The mask is part of the active pixels.
-    return cells, TrainData(seed, dataclasses.replace(views, mask=None, sparse=sparse), active, indices)
+    views = dataclasses.replace(views, mask=None, sparse=sparse)
+    return cells, TrainData(seed, views, active, indices, progress=progress)
+
+
+def _load_views(data, needs, split, **options):
+    """Returns the Views of a split; a scene that asks for the image_index gets 0 for views that are not trained on."""
+    views = dataset.load_split(data, split, **options)
+    if split == "train" or "image_index" not in needs:
+        return views
+    return dataclasses.replace(views, image_index=np.zeros(len(views.size), np.int32))

@@ -94,7 +94,7 @@ def make_reinitializer(experiment: Any, folder: str | os.PathLike) -> Callable[.
             )
         state = reinitialize(state, names)
         # Copies, as the next step consumes the state.
-        return state, {**metrics, **jax.tree.map(int, state.counters)}
+        return state, {**metrics, **jax.tree.map(lambda counter: counter.item(), state.counters)}
 
     return check
 

@@ -281,11 +281,10 @@ class _Clock:
 
 
 class _Pace:
-    """The learning rate of a run of limited time: it reaches its end when the time does, if not before.
+    """The learning rate and the progress of a run of limited time: they reach their end when the time does.
 
-    It depends on the fraction of the steps that are done or on that of the time that has passed, whichever is larger.
-    Such a run depends on the clock. Several processes have several clocks, so their learning rate depends on the
-    steps alone.
+    They depend on the fraction of the steps that are done or on that of the time that has passed, whichever is larger.
+    Such a run depends on the clock. Several processes have several clocks, so theirs depend on the steps alone.
     """
 
     def __init__(self, experiment: build.Experiment, clock: _Clock, data: Any):
@@ -293,13 +292,19 @@ class _Pace:
         self._options = experiment.config.train
 
     def data_of(self, step: int) -> Any:
-        if self._data.lr_scale is None:
-            return self._data
-        by_steps = min((step - 1) / self._options.lr_steps, 1.0)
-        by_time = min(self._clock.seconds() / self._options.max_seconds, 1.0)
-        ratio, power = self._options.lr_final / self._options.lr_init, self._options.lr_decay_power
+        data, options = self._data, self._options
+        if data.lr_scale is None and data.progress is None or not options.max_seconds or jax.process_count() > 1:
+            return data
+        by_time = min(self._clock.seconds() / options.max_seconds, 1.0)
+        if data.progress is not None:
+            passed = devices.place(np.float32(by_time), data.progress.time_fraction.sharding)
+            data = data._replace(progress=data.progress._replace(time_fraction=passed))
+        if data.lr_scale is None:
+            return data
+        by_steps = min((step - 1) / options.lr_steps, 1.0)
+        ratio, power = options.lr_final / options.lr_init, options.lr_decay_power
         self.scale = ratio ** (max(by_steps, by_time) ** power - by_steps**power)
-        return self._data._replace(lr_scale=devices.place(np.float32(self.scale), self._data.lr_scale.sharding))
+        return data._replace(lr_scale=devices.place(np.float32(self.scale), data.lr_scale.sharding))
 
 
 class _PreviewTimes:

@@ -11,6 +11,8 @@ from jaxnerf.core.types import pytree
 from jaxnerf.models.base import Model
 from jaxnerf.models.grid_schedule import InitialCells
 
+PROGRESS = "progress"  # the entry of the counters, and of the parameters that a model's functions receive
+
 
 @pytree()
 class TrainState:
@@ -21,7 +23,8 @@ class TrainState:
         params: network name -> its parameters, float32; and "cameras" -> those of the training images, if any.
         opt_state: of the optax optimizer.
         grid: OccupancyGrid; None where the model has none.
-        counters: name -> int32 [], see `make_train_step`.
+        counters: name -> int32 [], see `make_train_step`; and where the model asks for it "progress" -> float32 [],
+            the fraction of training that is done.
     """
 
     step: jax.Array
@@ -56,6 +59,8 @@ def create_state(
             grid = schedule.create(*cells)
         zero = jnp.zeros((), jnp.int32)
         counters = dict.fromkeys(names, zero)
+        if PROGRESS in model.needs:
+            counters[PROGRESS] = jnp.zeros((), jnp.float32)
         return TrainState(step=zero, params=params, opt_state=optimizer.init(params), grid=grid, counters=counters)
 
     return create(jax.random.key(seed), cells)

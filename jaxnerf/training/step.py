@@ -14,7 +14,24 @@ from jaxnerf.data.active_pixels import PixelRuns
 from jaxnerf.models.base import Model
 from jaxnerf.training.camera_parameters import CameraParameters, networks
 from jaxnerf.training.dead_networks import count_dead_steps
-from jaxnerf.training.state import TrainState
+from jaxnerf.training.state import PROGRESS, TrainState
+
+
+class ProgressData(NamedTuple):
+    """What the progress of training depends on beside the step; data, so that it is no constant of a compiled step.
+
+    Attributes:
+        max_steps: float32 [], steps of the run.
+        time_fraction: float32 [], the fraction that has passed of a limited time; 0 where it is not limited.
+    """
+
+    max_steps: Any
+    time_fraction: Any
+
+    def at(self, step: jax.typing.ArrayLike) -> jax.Array:
+        """Returns the progress in [0, 1] when a number of steps are done: by steps or by time, which is larger."""
+        by_steps = jnp.asarray(step, jnp.float32) / self.max_steps
+        return jnp.clip(jnp.maximum(by_steps, self.time_fraction), 0, 1)
 
 
 class TrainData(NamedTuple):
@@ -25,8 +42,8 @@ class TrainData(NamedTuple):
         views: of the split "train".
         active_pixels: the pixels to draw from; None: all.
         cells: [M] int32, the cells of the grid that are updated; None without a grid.
-        lr_scale: float32 [], the factor of the learning rate in a run of limited time, the only value here that
-            changes; None: 1.
+        lr_scale: float32 [], the factor of the learning rate in a run of limited time, which changes; None: 1.
+        progress: ProgressData; None where the model does not ask for the progress.
     """
 
     seed: Any
@@ -34,6 +51,7 @@ class TrainData(NamedTuple):
     active_pixels: PixelRuns | None
     cells: Any
     lr_scale: Any = None
+    progress: Any = None
 
 
 class StepLoss(NamedTuple):
@@ -80,16 +98,20 @@ def make_train_step(
         each loss (unweighted) if there are several, "grad_norm", the number of "rays" that were not dropped,
         and the counters. These are "nonfinite", the steps whose loss or gradient was not finite, which leave
         parameters and optimizer unchanged; "nonfinite_in_a_row"; "dead_<name>" of each such network, see
-        `count_dead_steps`; "num_reinits", which only reinitialization changes; and with a grid "rays_dropped",
-        the rays that were ignored because some of their samples did not fit into the sample buffer.
+        `count_dead_steps`; "num_reinits", which only reinitialization changes; with a grid "rays_dropped",
+        the rays that were ignored because some of their samples did not fit into the sample buffer; and "progress"
+        if the model asks for it.
     """
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
     regularizers = [loss for loss in losses if loss.on != "renderings"]
 
-    def loss_fn(params, grid, step, keys, batch, views):
+    def progress_at(step, data):
+        return {PROGRESS: data.progress.at(step)} if PROGRESS in model.needs else {}
+
+    def loss_fn(params, grid, step, keys, batch, views, progress):
         if cameras is not None:
             batch = cameras.refined_batch(params, batch, views)
-        renderings = model.render(keys, params, grid, batch.rays, step)
+        renderings = model.render(keys, {**params, **progress}, grid, batch.rays, step)
         if cameras is not None:
             renderings = cameras.exposed(params, renderings, batch)
         renderings = Renderings(renderings, model.image_networks)
@@ -109,8 +131,9 @@ def make_train_step(
 
     def microbatch(state, data, positions):
         keys, batch = draw(state.step, positions, data)
+        views, progress = None if cameras is None else data.views, progress_at(state.step, data)
         (loss, sums), grads = jax.value_and_grad(loss_fn, has_aux=True)(
-            state.params, state.grid, state.step, keys, batch, None if cameras is None else data.views
+            state.params, state.grid, state.step, keys, batch, views, progress
         )
         return {"loss": loss, **sums}, grads
 
@@ -163,7 +186,9 @@ def make_train_step(
             counters["rays_dropped"] = state.counters["rays_dropped"] + drawn - rays
             # No ray has this position in the batch, so the key is unused otherwise.
             key = jax.random.fold_in(ray_batches.step_key(data.seed, state.step), 2**32 - 2)
-            grid = model.grid_schedule.update(key, state.step, params, grid, data.cells)
+            now = {**params, **progress_at(state.step, data)}
+            grid = model.grid_schedule.update(key, state.step, now, grid, data.cells)
+        counters |= progress_at(state.step + 1, data)
         state = TrainState(step=state.step + 1, params=params, opt_state=opt_state, grid=grid, counters=counters)
         return state, {**metrics, "rays": rays, **counters}
 

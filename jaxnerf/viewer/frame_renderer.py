@@ -18,6 +18,7 @@ from jaxnerf.core.occupancy.from_scene import crop_grid
 from jaxnerf.core.occupancy.grid import clip_rays
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera, Views
+from jaxnerf.data.ray_batches import with_needs
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.restore import TrainedRun
 
@@ -106,6 +107,7 @@ class FrameRenderer:
         self._baked, self._cull = models[False].grid_schedule is None, models[False].cull
         self._chunk = chunk or _CHUNK.get(jax.default_backend(), _CHUNK_ELSEWHERE)
         self._ndc, self._offset = run.experiment.config.data.ndc, run.experiment.config.data.pixel_offset
+        self._needs = run.experiment.model.needs
         self._middle = np.asarray(views.cameras.to_world)[:, :, 3].mean(axis=0)
         self._bounds = float(np.min(views.near)), float(np.max(views.far))
         height, width = (int(side) for side in views.size[0])
@@ -149,7 +151,8 @@ class FrameRenderer:
         """Renders a frame.
 
         Rays begin at the camera and end where the box of the scene does, whatever near and far the training views
-        have; where space is contracted, they end as far away as those views may see.
+        have; where space is contracted, they end as far away as those views may see. A scene that asks for time or
+        image_index gets 0.
 
         Args:
             state: what to render.
@@ -212,7 +215,7 @@ class FrameRenderer:
         pixels = jnp.stack([ids % arrays["width"], ids // arrays["width"]], axis=-1) + self._offset
         camera = Camera(**{name: arrays[name] for name in ("to_world", "focal", "center")})
         near, far = arrays["bounds"]
-        world = rays_from_pixels(camera, pixels, near=near, far=far)
+        world = with_needs(rays_from_pixels(camera, pixels, near=near, far=far), camera, pixels, self._needs)
         world = rays = clip_rays(world, *arrays["crop"])
         if self._ndc:
             rays = ndc_rays(world, self._lens)

@@ -10,10 +10,9 @@ import jax
 import numpy as np
 
 from jaxnerf.core.types import Views
-from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
+from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_with_grid
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import metric_log
-from jaxnerf.training.optimizer import averaged_params
 from jaxnerf.training.state import TrainState
 from jaxnerf.viewer.server import HOST, PORT, Viewer, check_port, import_viser
 
@@ -106,7 +105,7 @@ class LiveViewer:
             self._thread.start()
         if self._wanted:
             self._wanted = False
-            copied = jax.tree.map(np.array, (averaged_params(state), state.grid))
+            copied = jax.tree.map(np.array, (image_params(state), state.grid))
             with self._changed:
                 self._copied = int(state.step), *copied
                 self._changed.notify_all()

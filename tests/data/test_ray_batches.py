@@ -278,3 +278,32 @@ def test_a_depth_without_observations_is_an_error():
             draw_with(0, np.arange(2), scene)
     assert draw_with(0, np.arange(2), views(), extras=()).depth is None
     assert set(ray_batches.DEPTH_FIELDS) < {field.name for field in dataclasses.fields(Batch)}
+
+
+def test_rays_have_the_fields_that_are_needed():
+    scene = dataclasses.replace(views(), time=np.float32([0.1, 0.2, 0.3]))
+    pixels = np.float32([[0.5, 0.5], [2.5, 1.5]])
+    bare = ray_batches.view_rays(scene, 1, pixels)
+    assert (bare.radius, bare.time, bare.image_index) == (None, None, None)
+    rays = ray_batches.view_rays(scene, 1, pixels, needs=("radius", "time", "image_index", "length", "progress"))
+    np.testing.assert_allclose(rays.radius, 2 / np.sqrt(12) / FOCAL, rtol=1e-6)
+    np.testing.assert_array_equal(rays.time, np.float32([0.2, 0.2]))
+    np.testing.assert_array_equal(rays.image_index, np.int32([1, 1]))
+    np.testing.assert_array_equal(rays.directions, bare.directions)
+    still = ray_batches.view_rays(views(), 1, pixels, needs=("time",))
+    assert still.time is None and still.radius is None
+    held_out = dataclasses.replace(scene, image_index=np.zeros(3, np.int32))
+    assert not ray_batches.view_rays(held_out, 2, pixels, needs=("image_index",)).image_index.any()
+
+
+def test_each_drawn_ray_has_the_time_and_the_index_of_its_view():
+    scene = dataclasses.replace(views(), time=np.float32([0.1, 0.2, 0.3]))
+    _, batch = ray_batches.draw_batch(7, 0, jnp.arange(64), scene, needs=("time", "image_index", "radius"))
+    view, _ = pixel_ids(batch.rays)
+    np.testing.assert_array_equal(batch.rays.image_index, view)
+    np.testing.assert_array_equal(batch.rays.time, scene.time[view])
+    _, same = draw(0, jnp.arange(64), scene)
+    np.testing.assert_allclose(batch.rgb, same.rgb, rtol=1e-6)
+    assert same.rays.time is None
+    rays = ray_batches.random_rays(scene, 9, functools.partial(ray_batches.view_rays, needs=("time",)))
+    np.testing.assert_array_equal(rays.time, np.float32([0.1, 0.2, 0.3]).repeat(3))

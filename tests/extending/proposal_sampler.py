@@ -1,4 +1,4 @@
-"""An example of a sampler with two networks and a loss of its own: a proposal network says where the field is evaluated.
+"""An example of a sampler with two networks and a loss of its own: a proposal network says where to evaluate the field.
 
 The proposal network has a density and no colour. The samples of the run's field are drawn where it has weight, and it
 is trained to bound the field's weights from above (arXiv:2111.12077, Section 3). Train with it by

@@ -13,10 +13,12 @@ from jaxnerf.core.occupancy.grid import (
 )
 from jaxnerf.core.occupancy.packed import visible_samples
 from jaxnerf.core.occupancy.ray_marching import march_rays
+from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Background, Rays, SceneFn, Vector
 from jaxnerf.core.varying import vary_like
 
 _CHUNK = 2**11  # rays
+_NUM_TIMES = 32  # at which the density of a scene that moves is evaluated in each cell
 _MAX_ERROR = 1 / 512  # of a colour: half a step of 8 bits
 
 
@@ -42,7 +44,8 @@ def visible_grid(
 
     A cell is occupied if the rays need it for colours within half a step of 8 bits, or if it lies between two
     such cells. A network that was trained along whole rays has white fog in front of white surfaces, fog thinner
-    than the threshold in front of everything dense, and matter inside objects; none of these is kept.
+    than the threshold in front of everything dense, and matter inside objects; none of these is kept. In a scene that
+    asks for time, a cell is dense if it is at one of 32 random times, and visible at the times of the rays.
 
     Args:
         scene: see render_samples.
@@ -56,6 +59,8 @@ def visible_grid(
     """
     bounds = (jnp.asarray(bound, jnp.float32) for bound in (lower, upper))
     options = {"threshold": threshold, "contracted": contracted}
+    if "time" in needs_of(scene):
+        options["num_updates"] = _NUM_TIMES
     grid = grid_from_scene(jax.random.key(0), scene, *bounds, shape, **options)
     dense = drop_thin_density(scene, grid, threshold)
     cell = tuple((high - low) / count for low, high, count in zip(lower, upper, shape, strict=True))

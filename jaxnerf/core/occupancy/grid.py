@@ -5,14 +5,16 @@ rendered with its grid.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from jaxnerf.core import contraction, volume_rendering
 from jaxnerf.core.safe_math import at_least_float32
+from jaxnerf.core.scene import inputs_of, needs_of
 from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, check_shapes, pytree
 from jaxnerf.core.varying import vary_like
 
@@ -109,7 +111,8 @@ def update_grid(
     Args:
         key: for the point in each cell.
         grid: OccupancyGrid.
-        scene: see render_samples.
+        scene: see render_samples. A scene that asks for more gets what `cell_inputs` computes, with the spacing as
+            length, and a random time for each cell: a cell is occupied if matter is there at any time.
         cells: [M] int32, flat indices x first, each at most once; indices past the last cell are ignored.
         threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there empties cells
             that absorb less than 1 % of the light.
@@ -134,21 +137,33 @@ def update_grid(
         # A draw of nearly 1 rounds up to the far end of the last cell, which is at infinity.
         place = (contraction.expand(jnp.clip(4 * place - 2, -_JUST_INSIDE, _JUST_INSIDE)) + 2) / 4
     x = grid.lower[None] + place * (grid.upper - grid.lower)[None]
-    # Density has no direction; any will do.
-    density_at = lambda x: scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]))[0][0, 0]  # noqa: E731
-    found = jax.lax.map(density_at, x, batch_size=min(chunk, cells.size)).astype(grid.density_max.dtype)
+    length = _spacings(grid, threshold, spacing)[cells] if needs_of(scene) else None
+    inputs = cell_inputs("update_grid", scene, grid, x, length=length, key=key)
+
+    def density_at(at):
+        x, inputs = at
+        # Density has no direction; any will do.
+        given = {name: value[None, None] for name, value in inputs.items()}
+        return scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]), **given)[0][0, 0]
+
+    found = jax.lax.map(density_at, (x, inputs), batch_size=min(chunk, cells.size)).astype(grid.density_max.dtype)
     largest, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
     largest = largest.at[cells].set(jnp.maximum(decay * largest[cells], found)).reshape(grid.density_max.shape)
     # Light passes beside the matter in a cell. A mean of densities would make a half-empty cell opaque.
-    if spacing is None:
-        spacing = _ABSORBED / jnp.maximum(threshold, _SMALLEST_THRESHOLD)
-    spacing = jnp.broadcast_to(spacing, grid.occupied.shape).reshape(-1)[cells]
+    spacing = _spacings(grid, threshold, spacing)[cells]
     through = (1 - smoothing) * jnp.exp(-spacing * mean[cells]) + smoothing * jnp.exp(-spacing * found)
     uniform = -jnp.log(jnp.clip(through, _LEAST_LIGHT, 1)) / spacing  # a negative density would be an empty cell
     mean = mean.at[cells].set(uniform.astype(mean.dtype)).reshape(grid.density_mean.shape)
     dense = ~(largest <= threshold)  # NaN counts as dense, so that it is visible
     occupied = jnp.where(spread, widen(dense), dense) & grid.valid
     return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
+
+
+def _spacings(grid, threshold, spacing):
+    """Returns the spacing of samples [X Y Z] of each cell, see update_grid."""
+    if spacing is None:
+        spacing = _ABSORBED / jnp.maximum(threshold, _SMALLEST_THRESHOLD)
+    return jnp.broadcast_to(spacing, grid.occupied.shape).reshape(-1)
 
 
 def grid_from_scene(
@@ -188,6 +203,58 @@ def grid_from_scene(
         return update_grid(jax.random.fold_in(key, index), grid, scene, cells, **options)
 
     return jax.lax.fori_loop(0, num_updates, update, vary_like(grid, jax.eval_shape(update, 0, grid)))
+
+
+def cell_inputs(
+    function: str,
+    scene: SceneFn,
+    grid: OccupancyGrid,
+    x: Float[ArrayLike, "*batch 3"],
+    *,
+    length: Num[ArrayLike, "*batch"] | None = None,
+    key: Keys | None = None,
+) -> dict[str, Num[Array, "*batch"]]:
+    """Computes what a scene asks for at positions that are on no ray, such as those in the cells of a grid.
+
+    Args:
+        function: name of the calling function, for messages.
+        scene: see render_samples.
+        grid: OccupancyGrid.
+        x: [..., 3] world units.
+        length: [...] world units; None: the size of the cell around x, the cube root of its volume.
+        key: of the times; None: all are 0.
+
+    Returns:
+        By name, each [...]: radius, half the size of the cell; length; time, uniform in [0, 1) or 0; image_index, 0.
+
+    Raises:
+        ValueError: if the scene asks for progress, which must be bound.
+    """
+    shape = x.shape[:-1]
+
+    def time():
+        # Another key than that of the places in the cells, which thus do not depend on what the scene asks for.
+        return jnp.zeros(shape) if key is None else jax.random.uniform(jax.random.fold_in(key, 1), shape)
+
+    return inputs_of(
+        function,
+        scene,
+        radius=lambda: _cell_sizes(grid, x) / 2,
+        length=lambda: _cell_sizes(grid, x) if length is None else length,
+        time=time,
+        image_index=lambda: jnp.zeros(shape, jnp.int32),
+    )
+
+
+def _cell_sizes(grid, x):
+    """Returns [...], the cube root of the volume of the cell around positions x [..., 3], in world units."""
+    lead = (1,) * (x.ndim - 1)
+    sides = grid.upper - grid.lower
+    size = jnp.cbrt(jnp.prod(sides / jnp.array(grid.occupied.shape)))
+    if not grid.contracted:
+        return jnp.full(x.shape[:-1], size)
+    middle = (grid.lower + grid.upper) / 2
+    return size / contraction.length_scale((x - middle.reshape(*lead, 3)) / (sides / 4).reshape(*lead, 3))
 
 
 def cells_along(grid: OccupancyGrid, rays: Rays, samples: Samples) -> Int[Array, "*batch samples"]:
@@ -301,13 +368,20 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
         that it is visible.
     """
 
-    def masked(x, viewdirs):
+    @functools.wraps(scene)
+    def masked(x, viewdirs, **inputs):
         index, inside = _cells_around(grid, x)
         kept = (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(x).any(axis=-1)
         flat = x.reshape(-1, 3)
         # Where the scene is undefined, the gradient of what is masked would be NaN.
-        safe = jax.lax.stop_gradient(flat[jnp.argmax(kept.reshape(-1))]) if flat.size else jnp.zeros(3)
-        density, rgb = scene(jnp.where(kept[..., None], x, safe.reshape(*(1,) * (x.ndim - 1), 3)), viewdirs)
+        first = jnp.argmax(kept.reshape(-1)) if flat.size else None
+        safe = jax.lax.stop_gradient(flat[first]) if flat.size else jnp.zeros(3)
+        x = jnp.where(kept[..., None], x, safe.reshape(*(1,) * (x.ndim - 1), 3))
+        if flat.size:
+            per_sample = {name: value for name, value in inputs.items() if value.shape == kept.shape}
+            fixed = {name: jax.lax.stop_gradient(value.reshape(-1)[first]) for name, value in per_sample.items()}
+            inputs |= {name: jnp.where(kept, value, fixed[name]) for name, value in per_sample.items()}
+        density, rgb = scene(x, viewdirs, **inputs)
         return jnp.where(kept, density, 0), rgb
 
     return masked
@@ -325,8 +399,9 @@ def drop_thin_density(
     """
     threshold = jnp.asarray(threshold, jnp.float32)
 
-    def thinned(x, viewdirs):
-        density, rgb = scene(x, viewdirs)
+    @functools.wraps(scene)
+    def thinned(x, viewdirs, **inputs):
+        density, rgb = scene(x, viewdirs, **inputs)
         least = threshold.reshape(-1)[_cells_around(grid, x)[0]] if threshold.ndim else threshold
         return jnp.where(density <= least, 0, density), rgb
 

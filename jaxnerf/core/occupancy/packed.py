@@ -5,7 +5,9 @@ size and composites them there. Images march each ray only until it is opaque.
 """
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
+from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
 from jaxnerf.core.varying import vary_like
 
@@ -169,7 +172,8 @@ def visible_samples(
         slot = index * max_samples + jnp.arange(max_samples, dtype=jnp.int32)
         buffer = _fill(occupied, slot, slot < occupied.ends[-1])
         t = samples.t[buffer.ray, buffer.source]
-        density, rgb = _evaluate(name, scene, rays, t, buffer.ray, buffer.used)
+        delta = lambda: samples.delta[buffer.ray, buffer.source]  # noqa: E731
+        density, rgb = _evaluate(name, scene, rays, t, buffer.ray, buffer.used, delta)
         place = jnp.where(buffer.used, buffer.ray * shape[-1] + buffer.source, outputs.shape[0])
         return outputs.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
 
@@ -225,7 +229,14 @@ class _Sums(NamedTuple):
 
 def _without_gradient_if_empty(scene, rays):
     """Returns the scene; without rays no position is safe to evaluate, so that its gradient may be NaN."""
-    return (lambda x, viewdirs: jax.lax.stop_gradient(scene(x, viewdirs))) if math.prod(rays.near.shape) == 0 else scene
+    if math.prod(rays.near.shape):
+        return scene
+
+    @functools.wraps(scene)
+    def constant(x, viewdirs, **inputs):
+        return jax.lax.stop_gradient(scene(x, viewdirs, **inputs))
+
+    return constant
 
 
 def _flattened(function, rays, samples, max_samples):
@@ -356,8 +367,8 @@ def _fill(occupied, place, used):
     return _Buffer(word % width * 32 + _nth_bit(flags, place - before), word // width, used)
 
 
-def _evaluate(function, scene, rays, t, ray_index, used):
-    """Evaluates the scene at samples t [K] of rays.
+def _evaluate(function, scene, rays, t, ray_index, used, delta):
+    """Evaluates the scene at samples t [K] of rays; delta: a function that returns their lengths [K] in t.
 
     Unused slots evaluate the scene where the first slot does, so that they add no place at which it may be undefined,
     with a gradient that is NaN. If no slot is used, that place is the near end of a ray, as in render_samples.
@@ -371,15 +382,25 @@ def _evaluate(function, scene, rays, t, ray_index, used):
     own = jax.tree.map(lambda leaf: leaf[index], rays)
     x = own.origins + t[:, None] * own.directions
     x = jnp.where(used[:, None], x, jax.lax.stop_gradient(x))[None]
-    density, rgb = scene(x, own.viewdirs[None])
+    inputs = _packed_inputs(function, scene, own, t, used, delta) if needs_of(scene) else {}
+    density, rgb = scene(x, own.viewdirs[None], **inputs)
     rendering.check_scene_output(function, density, rgb, x)
     return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
+
+
+def _packed_inputs(function, scene, own, t, used, delta: Callable[[], Array]):
+    """Returns what the scene asks for at samples [K] of Rays [K], each value [1, K]; see _evaluate."""
+    lengths = delta()
+    lengths = jnp.where(used, lengths, jnp.where(used[0], lengths[0], 0))
+    inputs = rendering.sample_inputs(function, scene, own, t[:, None], lengths[:, None])
+    values = {name: value.reshape(1, -1) for name, value in inputs.items()}
+    return {name: jnp.where(used[None], value, jax.lax.stop_gradient(value)) for name, value in values.items()}
 
 
 def _composite(function, scene, rays, placed, *, rule, longest, median_depth=False):
     """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
     t, ray = placed.t, placed.ray_index
-    density, rgb = _evaluate(function, scene, rays, t, ray, placed.used)
+    density, rgb = _evaluate(function, scene, rays, t, ray, placed.used, lambda: placed.delta)
     speed, unknown = (of_ray[ray] for of_ray in rendering.speeds(rays))
     length = jnp.where(placed.used, rendering.lengths_at_speeds(placed.delta, speed, unknown), 0)
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
@@ -539,7 +560,7 @@ def _sum_run(function, scene, rays, samples, used, rule, transmittance):
     """
     t, delta = samples
     x = rendering.points_on_rays(rays, t)
-    density, rgb = scene(x, rays.viewdirs[:, None])
+    density, rgb = scene(x, rays.viewdirs[:, None], **rendering.sample_inputs(function, scene, rays, t, delta))
     rendering.check_scene_output(function, density, rgb, x)
     density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
     length = rendering.segment_lengths(delta, rays)

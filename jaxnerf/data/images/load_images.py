@@ -14,7 +14,7 @@ from jaxnerf.core.types import Camera, SparsePoints, Views
 from jaxnerf.data.images.downscaled_copies import choose_copies
 from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_image, read_mask
 from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.base import Capture, Frame, frame_times
 from jaxnerf.data.readers.validation import check_background, check_factor
 
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # number of coefficients
@@ -119,6 +119,7 @@ def load_frames(
         names=tuple(frame.name for frame in chosen),
         background=background if pixels.shape[-1] == 4 else None,
         sparse=_sparse_points(points, chosen, forms, shrink),
+        time=frame_times(frame.time for frame in chosen),
     )
 
 

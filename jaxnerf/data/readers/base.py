@@ -1,6 +1,7 @@
 """The result of every reader: posed images in the world of the dataset's files, not yet decoded."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ class Frame(NamedTuple):
         bounds: nearest and farthest matter along the camera's axis, world units; None: not known.
         seen: [M] indices into the Capture's points that this image shows; None: not known.
         seen_at: [M, 2] px, where it shows them.
+        time: in [0, 1], when it was taken in a scene that moves; None: not stated, which holds for all frames or none.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Frame(NamedTuple):
     bounds: tuple[float, float] | None = None
     seen: Int[np.ndarray, " M"] | None = None
     seen_at: Float[np.ndarray, "M 2"] | None = None
+    time: float | None = None
 
 
 class Capture(NamedTuple):
@@ -73,7 +76,15 @@ def fingerprint(capture: Capture) -> str:
         parts += [np.float32(array) for array in arrays if array is not None]
         if frame.mask is not None:
             parts.append(f"mask {frame.mask.name}")
+        if frame.time is not None:
+            parts.append(f"time {frame.time}")
     return f"{len(capture.frames)} images, {content_fingerprint(*parts)[:8]}"
+
+
+def frame_times(times: Iterable[float | None]) -> Float[np.ndarray, " V"] | None:
+    """Returns the times of frames as float32; None if any has none."""
+    times = list(times)
+    return None if None in times else np.float32(times)
 
 
 def detect_formats(folder: str | os.PathLike) -> list[str]:

@@ -19,6 +19,7 @@ from jaxnerf.data.readers.validation import (
     check_range,
     is_number,
     read_json,
+    read_times,
     required,
 )
 from jaxnerf.registry import Reader
@@ -110,6 +111,7 @@ def _frames(content, source, select=None):
         found = "an empty list" if listed == [] else f"{str(listed)[:40]!r}"
         raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
     frames, forms = [], []
+    times = read_times([(f"{source}, frame {index}", frame) for index, frame in enumerate(listed)])
     for index in range(len(listed)) if select is None else select(len(listed)):
         where = f"{source}, frame {index}"
         path = _image_path(source, listed[index], where)
@@ -118,7 +120,7 @@ def _frames(content, source, select=None):
         height, width, _ = forms[-1][0]
         focal, center = np.full(2, 0.5 * width / math.tan(0.5 * angle)), np.array([width, height]) / 2
         camera = Camera(to_world=pose, focal=focal, center=center, height=height, width=width)
-        frames.append(Frame(path.stem, path, camera))
+        frames.append(Frame(path.stem, path, camera, time=times[index]))
     return frames, forms
 
 

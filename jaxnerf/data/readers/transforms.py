@@ -13,7 +13,7 @@ from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.ply import read_points
-from jaxnerf.data.readers.validation import check_inside, is_number, read_json, required, short_repr
+from jaxnerf.data.readers.validation import check_inside, is_number, read_json, read_times, required, short_repr
 from jaxnerf.registry import Reader
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
@@ -52,7 +52,7 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     content = read_json(source)
     entries, notes = _entries(content, source)
     kept = [entry for entry in entries if entry.image is not None]
-    masks = _masks(entries, kept, source)
+    masks, times = _masks(entries, kept, source), read_times([(entry.where, entry.content) for entry in kept])
     _check_applied(content, source)
     points, points_notes = _points(content, source)
     box, box_notes = _box(content, source)
@@ -60,8 +60,8 @@ def read_capture(folder: str | os.PathLike) -> Capture:
         format="transforms",
         source=source,
         frames=tuple(
-            Frame(entry.name, entry.image, _camera(content, source, entry), mask)
-            for entry, mask in zip(kept, masks, strict=True)
+            Frame(entry.name, entry.image, _camera(content, source, entry), mask, time=time)
+            for entry, mask, time in zip(kept, masks, times, strict=True)
         ),
         splits=_splits(content, source, entries, kept),
         points=points,

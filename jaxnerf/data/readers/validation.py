@@ -4,7 +4,7 @@ import math
 import operator
 import os
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -112,6 +112,31 @@ def required(entries: Mapping[str, Any], key: str, source: Any) -> Any:
         existing = ", ".join(repr(key)[1:-1] for key in sorted(entries))[:200] or "none"
         raise ValueError(f"{source}: has no {key}, only {existing}; expected {key}; export the file again")
     return entries[key]
+
+
+def read_times(frames: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[float | None]:
+    """Returns the "time" of each frame of a JSON file, or None for all of them if none states one.
+
+    Times are fractions of the sequence in [0, 1], as in the format of D-NeRF (arXiv:2011.13961).
+
+    Args:
+        frames: (where, entries of the frame); where: for the message.
+
+    Raises:
+        ValueError: if some frames state a time and others do not, or one is no number in [0, 1].
+    """
+    without = [where for where, frame in frames if "time" not in frame]
+    if len(without) == len(frames):
+        return [None] * len(frames)
+    if without:
+        raise ValueError(f"{without[0]}: has no time, other frames have; expected all or none; complete them")
+    for where, frame in frames:
+        if not is_number(frame["time"]) or not 0 <= frame["time"] <= 1:
+            raise ValueError(
+                f"{where}: time is {short_repr(frame['time'])}, expected a number in [0, 1], the fraction of the "
+                "sequence; divide all times by the last, or remove them if nothing moves"
+            )
+    return [float(frame["time"]) for _, frame in frames]
 
 
 def check_inside(name: Any, *, key: str, source: Any) -> str:

@@ -97,7 +97,8 @@ def posed_views(views: Views, path: CameraPath) -> Views:
     """Returns Views without pixels, in the poses of a CameraPath, all with the first view's pinhole.
 
     NDC depend on a camera's focal length and size, so no frame's own may replace them; see `path_pixels`. Near and
-    far are those of the views nearby, see `frame_bounds`.
+    far are those of the views nearby, see `frame_bounds`. For a scene that asks for them, all frames have the time 0,
+    if the views have a time, and the image_index 0: a path shows one instant.
     """
     count = len(path.poses)
     near, far = frame_bounds(path.poses, views)
@@ -119,6 +120,8 @@ def posed_views(views: Views, path: CameraPath) -> Views:
         far=far,
         mask=None,
         names=tuple(f"{index:04d}" for index in range(count)),
+        time=None if views.time is None else np.zeros(count, np.float32),
+        image_index=np.zeros(count, np.int32),
     )
 
 

@@ -9,7 +9,8 @@ from PIL import Image
 
 from captures import write_png16
 from jaxnerf.data.images.image_files import average_tiles, read_image, to_straight
-from jaxnerf.data.readers.blender import load_blender
+from jaxnerf.data.images.load_images import load_capture
+from jaxnerf.data.readers.blender import load_blender, read_capture
 
 _POSE = [[1.0, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
 
@@ -226,3 +227,51 @@ def test_the_real_lego(scenes_dir):
     np.testing.assert_allclose(np.linalg.norm(train.cameras.to_world[:, :, 3], axis=-1), 4.0311, rtol=1e-3)
     with pytest.raises(ValueError, match=r"transforms_test\.json, transforms_train\.json"):
         load_blender(scenes_dir / "lego", split="val")
+
+
+def _timed(*times):
+    """Returns a change that gives the first frames these times."""
+
+    def change(content):
+        for frame, time in zip(content["frames"], times, strict=False):
+            frame["time"] = time
+
+    return change
+
+
+def test_times_are_those_of_the_frames(dataset):
+    """As in the format of D-NeRF."""
+    views = load_blender(dataset(_timed(0.0, 0.75)))
+    np.testing.assert_array_equal(views.time, np.float32([0, 0.75]))
+    np.testing.assert_array_equal(load_blender(dataset(), select=lambda count: [1]).time, np.float32([0.75]))
+    capture = read_capture(dataset())
+    assert [frame.time for frame in capture.frames] == [0.0, 0.75]
+    assert load_capture(capture._replace(frames=bounded(capture.frames))).time.tolist() == [0, 0.75]
+
+
+def bounded(frames):
+    return tuple(frame._replace(bounds=(1.0, 2.0)) for frame in frames)
+
+
+def test_without_times_views_have_none(dataset):
+    assert load_blender(dataset()).time is None
+    assert [frame.time for frame in read_capture(dataset()).frames] == [None, None]
+
+
+@pytest.mark.parametrize(
+    "times, message",
+    [
+        ((0.5,), "frame 1: has no time, other frames have; expected all or none"),
+        ((0.5, "late"), "frame 1: time is 'late', expected a number in"),
+        ((0.5, 2.0), "frame 1: time is 2.0, expected .* divide all times by the last"),
+        ((-0.1, 0.5), "frame 0: time is -0.1"),
+        ((0.5, True), "frame 1: time is True"),
+        ((0.5, float("nan")), "NaN|nan"),
+        ((0.5, None), "frame 1: time is None"),
+    ],
+)
+def test_wrong_times_are_named(dataset, times, message):
+    folder = dataset(_timed(*times))
+    for read in (load_blender, read_capture):
+        with pytest.raises(ValueError, match=message):
+            read(folder)

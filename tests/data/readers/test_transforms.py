@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import captures
+import jaxnerf
 from jaxnerf.data import synthetic
 from jaxnerf.data.images.image_files import read_image
+from jaxnerf.data.readers.base import fingerprint
 from jaxnerf.data.readers.ply import read_points
 from jaxnerf.data.readers.transforms import read_capture
 
@@ -546,3 +548,28 @@ def test_the_real_fox(scenes_dir):
     eyes = np.stack([frame.camera.to_world[:, 3] for frame in capture.frames])
     assert ((lower < eyes) & (eyes < upper)).all()
     assert all(frame.image.parent.name == "images" for frame in capture.frames)
+
+
+def test_times_are_all_or_none(dataset):
+    """Those of D-NeRF's and nerfstudio's files; they follow their frames through sorting, splits and selection."""
+    plain = read_capture(dataset())
+    assert {frame.time for frame in plain.frames} == {None}
+
+    def timed(content):
+        for index, frame in enumerate(content["frames"]):
+            frame["time"] = index / 10
+        content["frames"].reverse()
+
+    folder = dataset(timed)
+    capture = read_capture(folder)
+    assert [frame.time for frame in capture.frames] == [index / 10 for index in range(8)]
+    assert fingerprint(capture) != fingerprint(plain)
+    views = jaxnerf.load_dataset(folder, world="file", num_views=3)
+    assert [int(name) / 10 for name in views.names] == pytest.approx(views.time.tolist())
+
+    def incomplete(content):
+        timed(content)
+        del content["frames"][2]["time"]
+
+    with pytest.raises(ValueError, match="has no time, other frames have; expected all or none"):
+        read_capture(dataset(incomplete))

@@ -1,0 +1,84 @@
+"""What a scene asks for beyond positions and directions: keyword-only parameters, found by name when it is traced."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from jaxtyping import Array
+
+# Each is given per sample; [..., 1] stands for one value per ray.
+#   radius        [..., S]       of the cone around the ray, at the sample, world units (arXiv:2103.13415)
+#   length        [..., S]       of the ray's interval that the sample stands for, world units
+#   time          [..., 1 or S]  of the image, as the dataset states it, in [0, 1]
+#   image_index   [..., 1 or S]  int32, of the training image
+#   progress      []             fraction of training that is done, in [0, 1]
+NEEDS = ("radius", "length", "time", "image_index", "progress")
+
+_REMEDIES = {
+    "radius": "set Rays.radius, see cameras.pixel_radius (rays in NDC have none, as cones are no cones there)",
+    "length": "give it",
+    "time": "set Rays.time; a dataset states it in each frame",
+    "image_index": "set Rays.image_index",
+    "progress": "it is a number of the model, not of rays",
+}
+_EXAMPLES = {"radius": "0.01", "length": "0.01", "time": "0.0", "image_index": "0", "progress": "1.0"}
+
+
+def needs_of(scene: Callable[..., Any]) -> tuple[str, ...]:
+    """Returns the names, of NEEDS, that a scene or the `apply` of a field takes as keyword-only parameters.
+
+    functools.partial, functools.wraps and JAX's transformations are followed. What functools.partial has bound by
+    name is no longer asked for. A function without a signature asks for nothing.
+    """
+    return tuple(_parameters(scene))
+
+
+def inputs_of(function: str, scene: Callable[..., Any], **known: Callable[[], Array] | None) -> dict[str, Array]:
+    """Computes the keyword arguments of a scene; what it does not ask for is not computed.
+
+    Args:
+        function: name of the calling function, for the message.
+        scene: any.
+        **known: by name of NEEDS, a function that computes the value; None, or absent, where there is none.
+
+    Returns:
+        The values by name. A parameter that has a default and no value is absent, so that it keeps its default.
+
+    Raises:
+        ValueError: if a parameter without a default has no value.
+    """
+    inputs = {}
+    for name, has_default in _parameters(scene).items():
+        compute = known.get(name)
+        if compute is not None:
+            inputs[name] = compute()
+        elif not has_default:
+            raise ValueError(
+                f"{function}: the scene asks for {name}, and the rays have none; {_REMEDIES[name]}, or bind it with "
+                f"functools.partial(scene, {name}={_EXAMPLES[name]})"
+            )
+    return inputs
+
+
+def _parameters(scene):
+    """Returns whether each name that a scene asks for has a default, in the order of NEEDS."""
+    bound = set()
+    while isinstance(scene, functools.partial) or _is_wrapper(scene):
+        if isinstance(scene, functools.partial):
+            bound |= scene.keywords.keys()
+            scene = scene.func
+        else:
+            scene = scene.__wrapped__
+    try:
+        parameters = inspect.signature(scene).parameters
+    except (TypeError, ValueError):  # of some builtins
+        return {}
+    found = {name: parameters[name] for name in NEEDS if name in parameters and name not in bound}
+    keyword_only = inspect.Parameter.KEYWORD_ONLY
+    return {name: each.default is not each.empty for name, each in found.items() if each.kind is keyword_only}
+
+
+def _is_wrapper(scene):
+    """Returns whether the signature of a function is that of the one it wraps, unless it states its own."""
+    return hasattr(scene, "__wrapped__") and "__signature__" not in getattr(scene, "__dict__", {})
