@@ -103,13 +103,9 @@ def default_weights() -> dict[str, Any]:
 
 def default_plugins() -> dict[str, Options]:
     """Returns the default options of all registered fields and samplers that are not built in, by name."""
-    known = {field.name for field in dataclasses.fields(RunConfig)}
+    own = {field.type for field in dataclasses.fields(RunConfig)}
     parts = {name: registry.get(name) for registry in (FIELDS, SAMPLERS) for name in registry.names()}
-    return {
-        name: part.options()
-        for name, part in parts.items()
-        if part.options and name not in known | {"mlp", "hierarchical"}
-    }
+    return {name: part.options() for name, part in parts.items() if part.options and part.options not in own}
 
 
 def read_config(config: Config) -> RunConfig:

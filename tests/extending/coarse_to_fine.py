@@ -3,7 +3,8 @@
 With few views, high octaves let a field explain each image by fog in front of its camera before the cameras agree on a
 shape (FreeNeRF, arXiv:2303.07418; the weights are those of BARF, arXiv:2104.06405). Train with it by
 
-    jaxnerf-train --plugins=coarse_to_fine --config=embedded_small --config.field=coarse_to_fine --workdir=runs/curriculum
+    jaxnerf-train --plugins=coarse_to_fine --config=embedded_small --config.field=coarse_to_fine \
+        --workdir=runs/curriculum
 
 where coarse_to_fine.py is in the current folder or on PYTHONPATH.
 """
