@@ -72,7 +72,7 @@ class Option(NamedTuple):
     range: Range | None
     choices: tuple[str, ...]
     auto: bool
-    changes: Changes
+    changes: Changes | None
     check: Callable[[Any], str | None] | None
     protocol: bool
     max_int: int
@@ -86,7 +86,7 @@ def option(
     range: Range | None = None,
     choices: tuple[str, ...] = (),
     auto: bool = False,
-    changes: Changes = Changes.MODEL,
+    changes: Changes | None = None,
     check: Callable[[Any], str | None] | None = None,
     protocol: bool = False,
     max_int: int = MAX_INT,
@@ -102,7 +102,7 @@ def option(
         range: of a number.
         choices: all values of a text; empty: any.
         auto: whether the value may be "auto", which `Options.resolve` or `Options.resolve_for_device` replaces.
-        changes: what depends on the value.
+        changes: what depends on the value; None: as the class says in `Options.changes`.
         check: value -> what is expected in place of it, or None where the value is right. For tuples.
         protocol: whether an evaluation records the value, as it determines which images are compared.
         max_int: the largest whole number.
@@ -198,7 +198,13 @@ class Device(NamedTuple):
 
 @dataclass_transform(frozen_default=True)
 class Options:
-    """The base of a part's options; subclasses are frozen dataclasses whose fields are made by `option`."""
+    """The base of a part's options; subclasses are frozen dataclasses whose fields are made by `option`.
+
+    Attributes:
+        changes: what depends on the options that do not say it themselves.
+    """
+
+    changes: typing.ClassVar[Changes] = Changes.MODEL
 
     def resolve(self, facts: Facts, device: Device) -> tuple[Self, list[str]]:
         """Replaces the "auto" values that are inferred once, when a run starts; see `infer`."""
@@ -273,12 +279,13 @@ def declarations(kind: type[Options]) -> dict[str, tuple[Option, Any]]:
 
 @functools.cache
 def _declarations(kind):
-    types_of = typing.get_type_hints(kind)
-    return {
-        field.name: (field.metadata["option"], types_of[field.name])
-        for field in dataclasses.fields(kind)
-        if "option" in field.metadata
-    }
+    types_of, found = typing.get_type_hints(kind), {}
+    for field in dataclasses.fields(kind):
+        if "option" in field.metadata:
+            declared = field.metadata["option"]
+            changes = kind.changes if declared.changes is None else declared.changes
+            found[field.name] = declared._replace(changes=changes), types_of[field.name]
+    return found
 
 
 def changing(options: Options | type[Options], changes: Changes) -> list[str]:

@@ -56,7 +56,7 @@ def make_run(folder, kind, *, radii=((20, 0.7),), size=32):
         config.data.world = "file"
     config.data.format, config.data.dir, config.data.background = "auto", str(data), "white"
     resolved = auto_config.resolve(config).config
-    workdir.claim(folder, resolved)
+    workdir.save_config(folder, resolved)
     _save(folder, resolved, radii)
     return folder
 

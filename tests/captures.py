@@ -117,7 +117,7 @@ def noise(*stacks, seed=0):
     return shots
 
 
-def sky_colour(origins, viewdirs):
+def sky_color(origins, viewdirs):
     """Returns the colour [..., 3] of the sphere of radius SKY along rays from inside it, in [0.1, 0.9]."""
     origins, viewdirs = np.asarray(origins, np.float64), np.asarray(viewdirs, np.float64)
     along = (origins * viewdirs).sum(-1, keepdims=True)
@@ -320,7 +320,7 @@ def surface_points(shots, *, count=200, seed=0, sharp=0.06):
             sees a point if the depth along the ray to it differs by less.
     """
     rng = np.random.default_rng(seed)
-    found, colours = [], []
+    found, colors = [], []
     for index in range(len(shots)):
         shot = shots[index]
         stack = jax.tree.map(lambda leaf: leaf[None], shot.camera)
@@ -331,8 +331,8 @@ def surface_points(shots, *, count=200, seed=0, sharp=0.06):
         depth, opacity, spread = _depths(rays)
         kept = (opacity > 0.99) & (spread < sharp)
         found.append((rays.origins + depth[:, None] * rays.directions)[kept])
-        colours.append(shot.pixels.reshape(height * shot.camera.width, 4)[chosen][kept, :3] // 257)
-    xyz, rgb = np.concatenate(found).astype(np.float64), np.concatenate(colours).astype(np.uint8)
+        colors.append(shot.pixels.reshape(height * shot.camera.width, 4)[chosen][kept, :3] // 257)
+    xyz, rgb = np.concatenate(found).astype(np.float64), np.concatenate(colors).astype(np.uint8)
     views = [_sight(shot.camera, xyz, sharp) for shot in shots]
     seen, at, depth = (np.stack(part) for part in zip(*views, strict=True))
     kept = seen.sum(axis=0) >= 2
@@ -371,8 +371,8 @@ def _render_once(leaves, structure, sky):
     pixels = synthetic.render_views(stack)
     if sky:
         rays = synthetic.scene_rays(stack)
-        colour = sky_colour(rays.origins, rays.viewdirs)
-        values = np.concatenate([over(pixels, colour), np.ones((len(pixels), 1))], axis=-1)
+        color = sky_color(rays.origins, rays.viewdirs)
+        values = np.concatenate([over(pixels, color), np.ones((len(pixels), 1))], axis=-1)
         pixels = np.rint(values * 65535).astype(np.uint16)
     pixels.setflags(write=False)
     return pixels

@@ -43,7 +43,7 @@ READERS = {
     "model_000010.npy": lambda path: read_weights([path]),
     "config.json": lambda path: load_config(path.parent),
     "metrics.jsonl": lambda path: read_rows(path.parent),
-    "origin.json": lambda path: shards.check_origin(path.parent, {}, file=path.name, remedy="remove it"),
+    "provenance.json": lambda path: shards.check_provenance(path.parent, {}, file=path.name, remedy="remove it"),
     GROUND_TRUTH: lambda path: read_ground_truth(path.parent),
 }
 

@@ -105,8 +105,8 @@ def measure_closed_forms() -> dict:
     for rule in RULES:
         for sampling in SAMPLINGS:
             for number in numbers:
-                doubled = _colours(rule, sampling, number, rays, jnp.float64)
-                single = _colours(rule, sampling, number, rays, jnp.float32, calls)
+                doubled = _colors(rule, sampling, number, rays, jnp.float64)
+                single = _colors(rule, sampling, number, rays, jnp.float32, calls)
                 for medium, truth, fine, coarse in zip(MEDIA, truths, doubled, single, strict=True):
                     names = {"medium": medium, "rule": rule, "sampling": sampling, "evaluations": number}
                     rows.append(names | _error(fine - truth) | {"rms32": _error(coarse - truth)["rms"]})
@@ -129,7 +129,7 @@ def random_rays(count: int) -> Rays:
     return Rays(origins=origins, directions=directions, viewdirs=viewdirs, near=near, far=near + 4)
 
 
-def _colours(rule, sampling, number, rays, dtype, calls=None):
+def _colors(rule, sampling, number, rays, dtype, calls=None):
     """Returns each medium's colours [R, 3] in a precision, and adds the calls to those that are timed."""
     with jax.enable_x64(dtype == jnp.float64):
         rays = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), rays)
@@ -198,8 +198,8 @@ def test_rays(experiment, count: int) -> tuple[Rays, np.ndarray]:
     place, width = index - np.asarray(views.offset)[view], np.asarray(views.size)[view, 1]
     pixels = np.float32(np.stack([place % width, place // width], axis=-1) + experiment.config.data.pixel_offset)
     rays = jax.jit(jax.vmap(lambda view, pixel: experiment.view_rays(views, view, pixel)))(view, pixels)
-    colours = pixel_colors(jnp.asarray(np.asarray(views.pixels)[index]), views.background)
-    return jax.tree.map(np.asarray, rays), np.asarray(colours, np.float64)
+    colors = pixel_colors(jnp.asarray(np.asarray(views.pixels)[index]), views.background)
+    return jax.tree.map(np.asarray, rays), np.asarray(colors, np.float64)
 
 
 def _field(section, **changes):
@@ -213,17 +213,17 @@ def _reference(config, params, rays, options):
         params, rays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), (params["fine"], rays))
         scene = functools.partial(_field(config.fine, compute_dtype="float64").apply, params)
 
-        def colours(number, rule="segments"):
+        def colors(number, rule="segments"):
             return np.asarray(jax.jit(functools.partial(_in_chunks, [scene], number, options | {"rule": rule}))(rays))
 
-        number, truth = FLAGS.dense, colours(FLAGS.dense)
+        number, truth = FLAGS.dense, colors(FLAGS.dense)
         while True:
-            number, before, truth = 2 * number, truth, colours(2 * number)
+            number, before, truth = 2 * number, truth, colors(2 * number)
             change = _error(truth - before)
             print(f"reference: {number // 2} to {number} segments, colour changes by {change}", flush=True)
             if change["max"] <= FLAGS.change or number >= FLAGS.densest:
                 break
-        other = _error(colours(number // 2, "gauss") - truth)
+        other = _error(colors(number // 2, "gauss") - truth)
         print(f"reference: {number} segments differ from {number // 2} Gauss points by {other}", flush=True)
     return number, truth, change["max"]
 
@@ -361,7 +361,7 @@ def plot(studies: list[dict], path: pathlib.Path) -> None:
     figure, axes = pyplot.subplots(
         len(panels), 2, figsize=(11, 3.2 * len(panels)), squeeze=False, sharey="row", layout="constrained"
     )
-    colours = dict(zip(RULES, ("tab:red", "tab:blue", "tab:green"), strict=True))
+    colors = dict(zip(RULES, ("tab:red", "tab:blue", "tab:green"), strict=True))
     styles = {"uniform": "-", "stratified": ":", "hierarchical": "--"}
     for (name, rows), (left, right) in zip(panels, axes, strict=True):
         for rule, sampling in _curves(rows):
@@ -371,7 +371,7 @@ def plot(studies: list[dict], path: pathlib.Path) -> None:
             single = [row.get("rms32", row["rms"]) for row in curve]
             for axis, across, upwards in ((left, counts, errors), (right, times, single)):
                 label = f"{rule}, {sampling}"
-                axis.loglog(across, upwards, styles[sampling], color=colours[rule], marker=".", label=label)
+                axis.loglog(across, upwards, styles[sampling], color=colors[rule], marker=".", label=label)
         closed = "rms32" in rows[0]
         left.set(title=name, ylabel="RMS error of the colour")
         left.set_xlabel("evaluations a ray" + (", in float64" if closed else ""))

@@ -94,7 +94,7 @@ def ball(
     return _homogeneous(density, inside, interval, rgb, rgb_slope)
 
 
-def two_colours(
+def two_colors(
     density: ArrayLike,
     *,
     height: ArrayLike = 0.0,
@@ -225,12 +225,12 @@ def _exact(rays, start, end, optical_depth, integral, rgb, rgb_slope):
     """Returns Exact from the optical depth of [start, end] and the integral of the transmittance there."""
     opacity, transmittance = -jnp.expm1(-optical_depth), jnp.exp(-optical_depth)
     depth = start + integral + transmittance * (rays.far - end)
-    colour = opacity[..., None] * _affine(rays.origins, rgb, rgb_slope)
+    color = opacity[..., None] * _affine(rays.origins, rgb, rgb_slope)
     if rgb_slope is not None:
         absorbed = start + integral - transmittance * end  # the integral of t over the absorbed light
         change = (_like(rgb_slope, rays.origins, 2) * rays.directions[..., None, :]).sum(axis=-1)
-        colour = colour + change * absorbed[..., None]
-    return Exact(colour, opacity, transmittance, depth)
+        color = color + change * absorbed[..., None]
+    return Exact(color, opacity, transmittance, depth)
 
 
 def _affine(x, rgb, rgb_slope):

@@ -35,13 +35,13 @@ def plot_cameras(report: Report) -> Figure:
     path = np.zeros((0, 3)) if report.path is None else report.path[:, :, 3]
     shown = np.concatenate([frusta.reshape(-1, 3), inner, path])
     points = points[:: max(1, len(points) // 6000)]
-    colours = [FLAGGED if index in flagged else CAMERA for index in range(len(poses))]
+    colors = [FLAGGED if index in flagged else CAMERA for index in range(len(poses))]
     figure = Figure(figsize=(13, 6.7), dpi=100, layout="constrained")
     right, deep, up = _axes(poses)
     for plot, vertical, title in zip(figure.subplots(1, 2), (deep, up), ("from above", "from a side"), strict=True):
         view = np.stack([right, vertical], axis=-1)
         plot.scatter(*(points @ view).T, s=2, color=POINT, linewidths=0)
-        plot.add_collection(LineCollection(frusta @ view, colors=colours, linewidths=0.8))
+        plot.add_collection(LineCollection(frusta @ view, colors=colors, linewidths=0.8))
         plot.plot(*(path @ view).T, color=PATH, linewidth=1.5)
         low, high = (shown @ view).min(axis=0), (shown @ view).max(axis=0)
         middle, reach = (low + high) / 2, 0.55 * max((high - low).max(), 1e-9)

@@ -192,8 +192,8 @@ class SparsePoints:
         point: [M] index of its point.
         pixel: [M, 2] px, (x, y) from the image's top left corner; inside the image.
         confidence: [M] in [0, 1]; None: not known, see `confident_observations`.
-        between: [V, H, W, 2] inverse depth and its confidence between the observations, at every fourth pixel of each
-            view, see `interpolated_depths`; None: not computed.
+        interpolated: [V, H, W, 2] inverse depth and its confidence between the observations, at every fourth pixel of
+            each view, see `interpolated_depths`; None: not computed.
     """
 
     positions: Float[Array, "N 3"]
@@ -201,7 +201,7 @@ class SparsePoints:
     point: Int[Array, " M"]
     pixel: Float[Array, "M 2"]
     confidence: Float[Array, " M"] | None = None
-    between: Float[Array, "V H W 2"] | None = None
+    interpolated: Float[Array, "V H W 2"] | None = None
 
 
 @pytree(static=("names", "background"))
@@ -219,7 +219,7 @@ class Views:
         names: V file names without folder and extension.
         background: the colour that alpha is composited over; None for images without alpha.
         box: [2, 3] lower and upper corner in world units; the dataset states that space outside is empty.
-        free_until: [V] in t, the depth up to which the dataset states that nothing stands in front of each camera, or
+        free_depth: [V] in t, the depth up to which the dataset states that nothing stands in front of each camera, or
             its points tell; 0 where they do not, None: not known.
         to_file: [4, 4] maps this world to that of the dataset's files; None where they are the same.
         sparse: points of the dataset's own model and their observations in these views; None without points.
@@ -239,7 +239,7 @@ class Views:
     background: tuple[float, float, float] | None = None
     box: Float[Array, "2 3"] | None = None
     to_file: Float[Array, "4 4"] | None = None
-    free_until: Float[Array, " V"] | None = None
+    free_depth: Float[Array, " V"] | None = None
     sparse: SparsePoints | None = None
     time: Float[Array, " V"] | None = None
     image_index: Int[Array, " V"] | None = None

@@ -115,17 +115,17 @@ def composite(
     """
     weights, values = at_least_float32(weights, values)
     check_shapes("composite", weights=(weights, "... S"), values=(values, "... S C"))
-    colour = _sum_over_samples(weights, values)
+    color = _sum_over_samples(weights, values)
     if background is None:
-        return colour
-    background = jnp.asarray(background, colour.dtype)
-    if background.shape not in (colour.shape, colour.shape[-1:]):
+        return color
+    background = jnp.asarray(background, color.dtype)
+    if background.shape not in (color.shape, color.shape[-1:]):
         raise ValueError(
-            f"composite: background has shape {background.shape}, expected {colour.shape[-1:]} or {colour.shape}"
+            f"composite: background has shape {background.shape}, expected {color.shape[-1:]} or {color.shape}"
         )
     behind = 1 - weights.sum(axis=-1) if transmittance is None else jnp.asarray(transmittance)
-    check_shapes("composite", transmittance=(behind, "..."), colour=(colour, "... C"))
-    return colour + behind[..., None] * jnp.broadcast_to(background, colour.shape)
+    check_shapes("composite", transmittance=(behind, "..."), color=(color, "... C"))
+    return color + behind[..., None] * jnp.broadcast_to(background, color.shape)
 
 
 def expected_depth(

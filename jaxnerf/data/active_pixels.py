@@ -195,7 +195,7 @@ def _fingerprint(views, schedule, options):
         views.size,
         views.near,
         views.far,
-        views.free_until,
+        views.free_depth,
         views.mask,
         views.box,
         views.cameras,

@@ -94,16 +94,10 @@ class DataOptions(Options):
         check=_wrong_color,
     )
     hold_out: int = option(
-        0,
-        "every n-th training view belongs to the split `held_out` instead; 0: none",
-        range=at_least(0),
-        protocol=True,
+        0, "every n-th training view belongs to the split `held_out` instead; 0: none", range=at_least(0), protocol=True
     )
     num_views: int = option(
-        0,
-        "number of training views to use, spread evenly over all of them; 0: all",
-        range=at_least(0),
-        protocol=True,
+        0, "number of training views to use, spread evenly over all of them; 0: all", range=at_least(0), protocol=True
     )
     pixel_offset: float = option(
         0.5, "rays pass through pixel centres (0.5) or pixel corners (0)", unit="px", protocol=True
@@ -294,12 +288,12 @@ def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -
     elif data.world == "around":
         capture, to_file = world.center(capture)
     nearest = [frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)]
-    free_until = dict(zip((frame.name for frame in capture.frames), nearest, strict=True))
+    free_depth = dict(zip((frame.name for frame in capture.frames), nearest, strict=True))
     capture = bounds.override_bounds(capture, near, data.far, to_file)
     box = None if capture.box is None else np.float32(capture.box)
     views = load_images.load_capture(capture, **reading)
-    free_until = np.float32([free_until[name] for name in views.names])
-    return dataclasses.replace(views, to_file=np.float32(to_file), box=box, free_until=free_until)
+    free_depth = np.float32([free_depth[name] for name in views.names])
+    return dataclasses.replace(views, to_file=np.float32(to_file), box=box, free_depth=free_depth)
 
 
 def dataset_folder(name: str) -> pathlib.Path:
@@ -368,7 +362,7 @@ def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -
         near=take(views.near),
         far=take(views.far),
         mask=None if views.mask is None else pick(views.mask),
-        free_until=None if views.free_until is None else take(views.free_until),
+        free_depth=None if views.free_depth is None else take(views.free_depth),
         names=tuple(views.names[index] for index in indices) if views.names else (),
         sparse=None if views.sparse is None else _select_observations(views.sparse, indices),
     )

@@ -14,13 +14,13 @@ from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Batch, Camera, Rays, Vector, Views, pytree
 
 BATCHINGS = ("all_images", "single_image")
-DEPTH_STRIDE = 4  # px between the places of `SparsePoints.between`
+DEPTH_STRIDE = 4  # px between the places of `SparsePoints.interpolated`
 DEPTH_FIELDS = ("depth", "depth_weight")  # of Batch; for these, some rays go through observations of sparse points
 _OBSERVED_EVERY = 16  # one ray in this many: most pixels show no sparse point
 
 
 @pytree(static=("shape",))
-class Gathered:
+class BatchPixels:
     """The pixels of one step's batch, in place of the pixels of Views that do not fit into the device's memory.
 
     Attributes:
@@ -180,7 +180,7 @@ def draw_batch(
         seed: of the run.
         step: training step.
         positions: of the rays in the step's whole batch.
-        views: on the device; their pixels may be Gathered.
+        views: on the device; their pixels may be BatchPixels.
         active_pixels: the pixels to draw from; None: all.
         batching: "all_images": each ray from any pixel of any view; "single_image": all rays of a step from one
             view, as in the paper's synthetic runs.
@@ -188,7 +188,7 @@ def draw_batch(
         ndc: whether the rays are in normalised device coordinates.
         extras: the optional fields of Batch to fill. For "depth" and "depth_weight", one ray in 16 goes through a
             random observation of `views.sparse` instead, and has the colour of the pixel around it. The depth of the
-            others is interpolated, if `views.sparse.between` is known.
+            others is interpolated, if `views.sparse.interpolated` is known.
         needs: the optional fields of Rays to fill, see `view_rays`.
 
     Returns:
@@ -208,7 +208,7 @@ def draw_batch(
         pixels = jnp.where((chosen >= 0)[:, None], at, pixels)
     rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc, needs=needs))(view, pixels)
     stored = views.pixels
-    colors = stored.rows[positions] if isinstance(stored, Gathered) else stored[index]
+    colors = stored.rows[positions] if isinstance(stored, BatchPixels) else stored[index]
     batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background))
     if not extras:
         return keys, batch
@@ -232,10 +232,10 @@ def _known_depth(views, view, chosen, place, rays, ndc):
     if ndc:
         depth = 1 + 1 / position[:, 2]  # t of `ndc_rays`: 0 at z = -1, 1 at infinity
     weight = 1.0 if sparse.confidence is None else jnp.asarray(sparse.confidence)[chosen]
-    if sparse.between is not None:
+    if sparse.interpolated is not None:
         width = views.size[view, 1]
         at = view, place // width // DEPTH_STRIDE, place % width // DEPTH_STRIDE
-        inverse, confidence = jnp.moveaxis(jnp.asarray(sparse.between)[at], -1, 0)
+        inverse, confidence = jnp.moveaxis(jnp.asarray(sparse.interpolated)[at], -1, 0)
         observed, sure = chosen >= 0, confidence > 0
         depth = jnp.where(observed, depth, jnp.where(sure, 1 / jnp.where(sure, inverse, 1), 0))
         weight = jnp.where(observed, weight, confidence)

@@ -274,7 +274,7 @@ def _render(rays, finish, count):
         direction = None
         if body.name in FINISHES[finish]:
             direction = [rays.viewdirs[ray, axis] for axis in range(3)]
-        for channel, value in enumerate(body.colour(*place, direction)):
+        for channel, value in enumerate(body.color(*place, direction)):
             rgb[:, channel] += np.bincount(ray, fraction * value, size)  # adds one after the other
     return rgb, 1 - exp(-behind[:, -1].astype(np.float32)).astype(np.float64)
 

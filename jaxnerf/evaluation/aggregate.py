@@ -20,14 +20,14 @@ from jaxnerf.evaluation.restore import TrainedRun, render_settings
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.training import metric_log
 
-ORIGIN = "origin.json"
+PROVENANCE = "provenance.json"
 _AGAIN = "remove it, and the same command scores that view again"
 _KEPT, _WORKING = ("color", "gt-color", "depth"), ("rows", "contact_sheet")
 _MEANS = ("psnr", "ssim", "psnr_float", "psnr_truncated", "psnr_aligned", "ssim_aligned")  # over the images
 FOLDERS = _KEPT + _WORKING
 
 
-def finish(
+def mark_finished(
     folder: pathlib.Path,
     index: int,
     row: Mapping[str, Any],
@@ -63,7 +63,7 @@ def view_files(folder: pathlib.Path, index: int, *, count: int) -> list[pathlib.
 
 
 def is_finished(content: Any) -> bool:
-    """Returns whether what a row's file holds is what `finish` writes: all metrics are numbers, and times finite."""
+    """Returns whether a row's file holds what `mark_finished` writes: metrics that are numbers, and finite times."""
     row = content.get("row") if isinstance(content, dict) else None
     values = [row.get(key) for key in (*_MEANS, "seconds")] + [content.get("rays")] if isinstance(row, dict) else [None]
     named = isinstance(row, dict) and isinstance(row.get("name"), str) and isinstance(content.get("first"), bool)
@@ -71,9 +71,9 @@ def is_finished(content: Any) -> bool:
     return numbers and 0 < row["seconds"] < math.inf and 0 < content["rays"] < math.inf
 
 
-def read(target: pathlib.Path, origin: Mapping[str, Any], remedy: str) -> dict[str, Any]:
-    """Reads the results.json of a finished evaluation; raises ValueError if it is damaged or has another origin."""
-    shards.check_origin(target, origin, file=ORIGIN, remedy=remedy)
+def read(target: pathlib.Path, provenance: Mapping[str, Any], remedy: str) -> dict[str, Any]:
+    """Reads the results.json of a finished evaluation; raises ValueError if it is damaged or has another provenance."""
+    shards.check_provenance(target, provenance, file=PROVENANCE, remedy=remedy)
     results = atomic_files.read_json(target / "results.json", remedy)
     if not isinstance(results, dict) or not all(type(results.get(key)) in (int, float) for key in (*_MEANS, "views")):
         raise ValueError(f"{target / 'results.json'}: lacks metrics, expected the result of an evaluation; {remedy}")
@@ -88,7 +88,7 @@ def merge(
     workdir: str | os.PathLike,
     views: Views,
     variables: tuple,
-    origin: Mapping[str, Any],
+    provenance: Mapping[str, Any],
     overwrite: bool,
 ) -> dict[str, Any] | None:
     """Writes results.json and moves the folder `partial` to `target`, which it replaces only with overwrite.
@@ -103,7 +103,7 @@ def merge(
     if not all(file.is_file() for index in range(count) for file in view_files(partial, index, count=count)):
         return None
     finished = [atomic_files.read_json(_row_file(partial, index), _AGAIN) for index in range(count)]
-    results = _results(run, workdir, views, variables, finished, origin)
+    results = _results(run, workdir, views, variables, finished, provenance)
     rows = [read_stored(_contact_sheet_file(partial, index)) for index in _on_contact_sheet(count)]
     output_images.write_contact_sheet(partial / "contact_sheet.png", rows)
     with atomic_files.partial_file(partial / "results.json") as file:
@@ -120,11 +120,11 @@ def merge(
     return results
 
 
-def _results(run, workdir, views, variables, finished, origin):
+def _results(run, workdir, views, variables, finished, provenance):
     rows = [view["row"] for view in finished]
     timed = [view["row"] for view in finished if not view["first"]] or rows
     seconds = sum(row["seconds"] for row in timed) / len(timed)
-    trained = [row for row in metric_log.read_rows(workdir) if row["step"] <= origin["step"]]
+    trained = [row for row in metric_log.read_rows(workdir) if row["step"] <= provenance["step"]]
     conventions = {**dataset.conventions(run.experiment.config.data), "chunk": run.experiment.config.eval.chunk}
     return {
         **means(rows),
@@ -132,14 +132,14 @@ def _results(run, workdir, views, variables, finished, origin):
         # The rate of one process, averaged over all processes that rendered.
         "rays_per_second": sum(view["rays"] for view in finished) / len(rows) / seconds,
         "seconds_per_frame": seconds,
-        "step": origin["step"],
+        "step": provenance["step"],
         "rays_seen": trained[-1].get("rays") if trained else None,
         "training_seconds": trained[-1]["seconds"] if trained else None,
         "compile_seconds": trained[-1].get("compile_seconds") if trained else None,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(variables[0])),
         "settings": render_settings(run),
         "exposure": run.experiment.cameras is not None and run.experiment.cameras.exposure,
-        **protocol.of_views(conventions, views, split=origin["split"]),
+        **protocol.of_views(conventions, views, split=provenance["split"]),
         "images": rows,
     }
 

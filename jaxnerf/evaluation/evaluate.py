@@ -127,31 +127,31 @@ def score_run(
 ) -> dict[str, Any] | None:
     """Scores a checkpoint as `evaluate` does, for a restored run, with views if they have been read already."""
     step = newest_step(run, workdir, step)
-    target = claim_target(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
+    target = result_folder(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
     split = split or run.experiment.config.eval.split
     views = run.experiment.load_split(split) if views is None else views
     variables = run.variables(step)
     views = refined_views(run, views, split, variables[0])
-    partial, origin = target.with_name(target.name + ".tmp"), _origin(run, variables, views, split, step)
+    partial, provenance = target.with_name(target.name + ".tmp"), _provenance(run, variables, views, split, step)
     if target.exists() and not overwrite:
-        return aggregate.read(target, origin, _REMEDY)
-    shards.claim_folder(partial, origin, overwrite=overwrite, file=aggregate.ORIGIN, remedy=_REMEDY)
+        return aggregate.read(target, provenance, _REMEDY)
+    shards.make_folder(partial, provenance, overwrite=overwrite, file=aggregate.PROVENANCE, remedy=_REMEDY)
     try:
         with atomic_files.naming(partial):
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
             _score_views(run, functools.partial(run.render_image, variables), views, partial, shard)
-            options = {"run": run, "workdir": workdir, "views": views, "variables": variables, "origin": origin}
+            options = {"run": run, "workdir": workdir, "views": views, "variables": variables, "provenance": provenance}
             return aggregate.merge(partial, target, overwrite=overwrite, **options)
     except OSError as error:
         # Another process has finished and moved the folder, perhaps just now, which a later one may have made again.
         if overwrite or error.errno not in (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST) or not target.exists():
             raise
         shutil.rmtree(partial, ignore_errors=True)
-        return aggregate.read(target, origin, _REMEDY)
+        return aggregate.read(target, provenance, _REMEDY)
 
 
-def claim_target(
+def result_folder(
     run: TrainedRun,
     workdir: str | os.PathLike,
     *,
@@ -174,7 +174,7 @@ def claim_target(
     return target
 
 
-def _origin(run, variables, views, split, step):
+def _provenance(run, variables, views, split, step):
     """Returns everything that the metrics depend on; the chunk is absent, as it changes no pixel."""
     return {
         "split": split,
@@ -217,7 +217,7 @@ def _score_views(run, render, views, folder, shard):
         row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
         output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
-        aggregate.finish(folder, index, row, truth, image, count=count, first=first)
+        aggregate.mark_finished(folder, index, row, truth, image, count=count, first=first)
         progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
         first = False
     progress.close()

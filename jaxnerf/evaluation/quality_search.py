@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxnerf.data.ray_batches import random_rays
-from jaxnerf.evaluation.evaluate import claim_target
+from jaxnerf.evaluation.evaluate import result_folder
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.training.config import Config
 
@@ -46,7 +46,7 @@ def choose(
 ) -> dict[str, Any]:
     """Returns the settings of `cheapest_settings` for `evaluate`, and prints all candidates."""
     # The search takes a while, so errors that would end the later evaluation are raised first.
-    claim_target(restore_run(workdir, config, data_dir=data_dir), workdir, split=split, step=step, overwrite=overwrite)
+    result_folder(restore_run(workdir, config, data_dir=data_dir), workdir, split=split, step=step, overwrite=overwrite)
     options = {"config": config, "data_dir": data_dir, "split": split, "step": step, "settings": settings}
     best, candidates = cheapest_settings(workdir, error_budget, **options)
     for candidate in candidates:

@@ -300,9 +300,7 @@ def vertices(side: Vector, resolution: int) -> tuple[int, int, int]:
 
 
 def interpolate(
-    table: Float[ArrayLike, "rows features"],
-    place: Sequence[Float[ArrayLike, " N"]],
-    levels: Sequence[TableLevel],
+    table: Float[ArrayLike, "rows features"], place: Sequence[Float[ArrayLike, " N"]], levels: Sequence[TableLevel]
 ) -> Float[Array, "N levels_and_features"]:
     """Interpolates features linearly between the 8 vertices around each place, for each level.
 
@@ -447,11 +445,7 @@ def total_variation(params: Mapping[str, Any], *, levels: Sequence[TableLevel]) 
     return total / max(len(dense), 1)
 
 
-HASH_DECAY = Loss(
-    None,
-    on="field",
-    help="mean square of the entries of each level of the hash grid (arXiv:2304.06706)",
-)
+HASH_DECAY = Loss(None, on="field", help="mean square of the entries of each level of the hash grid (arXiv:2304.06706)")
 TOTAL_VARIATION = Loss(
     None,
     on="field",

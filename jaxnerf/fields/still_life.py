@@ -47,7 +47,7 @@ class Body(NamedTuple):
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
     distance: Callable[..., Array]
-    colour: Callable[..., tuple[Array, Array, Array]]
+    color: Callable[..., tuple[Array, Array, Array]]
 
     def density(self, distance: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Returns the density at signed distances [...] from the outline."""
@@ -81,12 +81,12 @@ def finished_still_life(x: Positions, viewdirs: Directions, finish: str) -> Outp
     density, total_part, rgb = 0.0, 0.0, (0.0, 0.0, 0.0)
     for body in BODIES:
         own = body.density(body.distance(*place))
-        colour = body.colour(*place, direction if body.name in FINISHES[finish] else None)
+        color = body.color(*place, direction if body.name in FINISHES[finish] else None)
         # Far from all bodies the densities are 0 in float32. The tiny part keeps the colour from being 0 / 0,
         # and its square, which the gradient divides by, from being 0.
         part = own + 1e-12
         density, total_part = density + own, total_part + part
-        rgb = tuple(total + part * value for total, value in zip(rgb, colour, strict=True))
+        rgb = tuple(total + part * value for total, value in zip(rgb, color, strict=True))
     # Without the barrier XLA fuses all bodies into the loop that stacks: on a CPU twice as slow.
     rgb = jax.lax.optimization_barrier([total / total_part for total in rgb])
     return density, jnp.stack(rgb, axis=-1)
@@ -103,7 +103,7 @@ def _plinth(x, y, z):
     return _namespace(side).maximum(side, face)
 
 
-def _plinth_colour(x, y, z, direction):
+def _plinth_color(x, y, z, direction):
     z, side, face = _plinth_place(x, y, z)
     checks = _step(_wave(x / 0.68) * _wave(y / 0.68), 0.08)
     on_face = _step(face - side, 0.02)
@@ -124,12 +124,12 @@ def _pillar(x, y, z):
     return _norm(x, y, cap) - 0.24
 
 
-def _pillar_colour(x, y, z, direction):
+def _pillar_color(x, y, z, direction):
     x, y, z, cap = _pillar_place(x, y, z)
     turn = z / 0.60  # one stripe winds round once in 0.6 units
     stripes = _step((x * _wave(turn + 0.25) + y * _wave(turn)) / _norm(x, y), 0.12)
-    colour = _mix((0.02, 0.36, 0.25), (0.95, 0.86, 0.25), stripes)
-    return _shaded(colour, (x, y, cap), direction, _SHEEN)
+    color = _mix((0.02, 0.36, 0.25), (0.95, 0.86, 0.25), stripes)
+    return _shaded(color, (x, y, cap), direction, _SHEEN)
 
 
 def _ring_place(x, y, z):
@@ -144,15 +144,15 @@ def _ring(x, y, z):
     return _norm(spoke - 0.42, across) - 0.16
 
 
-def _ring_colour(x, y, z, direction):
+def _ring_color(x, y, z, direction):
     along, across, z, spoke = _ring_place(x, y, z)
     ratio, tube = along / spoke, spoke - 0.42
     double = 2 * ratio * ratio - 1  # cos 2a, and cos 6a = 4 cos^3 2a - 3 cos 2a: six bands
     bands = _step((4 * double * double - 3) * double, 0.2)
-    colour = _mix((0.32, 0.05, 0.42), (0.25, 0.78, 0.85), bands)
+    color = _mix((0.32, 0.05, 0.42), (0.25, 0.78, 0.85), bands)
     outward = tube / spoke * along
     normal = 0.8 * outward + 0.6 * across, 0.8 * across - 0.6 * outward, tube / spoke * z
-    return _shaded(colour, normal, direction, _SHEEN)
+    return _shaded(color, normal, direction, _SHEEN)
 
 
 def _brick(x, y, z):
@@ -162,7 +162,7 @@ def _brick(x, y, z):
     return sqrt(sqrt(sum(square * square for square in squares) + 1e-12)) - 0.33
 
 
-def _brick_colour(x, y, z, direction):
+def _brick_color(x, y, z, direction):
     return 0.05, 0.25, 0.80
 
 
@@ -174,7 +174,7 @@ def _lamp_core(x, y, z):
     return _norm(*_lamp_place(x, y, z)) - 0.15
 
 
-def _lamp_core_colour(x, y, z, direction):
+def _lamp_core_color(x, y, z, direction):
     return _shaded((0.45, 0.02, 0.10), _lamp_place(x, y, z), direction, _SHEEN)
 
 
@@ -182,7 +182,7 @@ def _lamp_glass(x, y, z):
     return _norm(*_lamp_place(x, y, z)) - 0.36
 
 
-def _lamp_glass_colour(x, y, z, direction):
+def _lamp_glass_color(x, y, z, direction):
     return 0.98, 0.50, 0.05
 
 
@@ -194,13 +194,13 @@ def _ball(x, y, z):
     return _norm(*_ball_place(x, y, z)) - 0.44
 
 
-def _ball_colour(x, y, z, direction):
+def _ball_color(x, y, z, direction):
     return _shaded((0.70, 0.05, 0.08), _ball_place(x, y, z), direction, _POLISH)
 
 
-def _shaded(colour, normal, direction, exponent):
+def _shaded(color, normal, direction, exponent):
     """Returns a surface's colour: matt if direction is None, else with the highlight of Blinn and Phong."""
-    base = _scale(colour, _lambert(*normal))
+    base = _scale(color, _lambert(*normal))
     if direction is None:
         return base
     # Brightest where the normal halves the angle between light and camera.
@@ -241,8 +241,8 @@ def _mix(first, second, fraction):
     return tuple(a + (b - a) * fraction for a, b in zip(first, second, strict=True))
 
 
-def _scale(colour, factor):
-    return tuple(value * factor for value in colour)
+def _scale(color, factor):
+    return tuple(value * factor for value in color)
 
 
 def _namespace(x):
@@ -265,11 +265,11 @@ def _power(x, exponent):
 
 
 BODIES = (
-    Body("plinth", 50.0, (-0.98, -0.98, -0.81), (0.98, 0.98, -0.61), _plinth, _plinth_colour),
-    Body("pillar", 50.0, (-0.64, 0.22, -0.66), (-0.16, 0.70, 0.86), _pillar, _pillar_colour),
-    Body("ring", 50.0, (-0.02, -0.06, -0.62), (0.98, 0.78, 0.54), _ring, _ring_colour),
-    Body("brick", 3.5, (0.09, -0.75, -0.62), (0.75, -0.09, 0.04), _brick, _brick_colour),
-    Body("lamp core", 50.0, (0.07, -0.25, 0.47), (0.37, 0.05, 0.77), _lamp_core, _lamp_core_colour),
-    Body("lamp glass", 2.5, (-0.14, -0.46, 0.26), (0.58, 0.26, 0.98), _lamp_glass, _lamp_glass_colour),
-    Body("ball", 50.0, (-0.82, -0.82, -0.62), (0.06, 0.06, 0.26), _ball, _ball_colour),
+    Body("plinth", 50.0, (-0.98, -0.98, -0.81), (0.98, 0.98, -0.61), _plinth, _plinth_color),
+    Body("pillar", 50.0, (-0.64, 0.22, -0.66), (-0.16, 0.70, 0.86), _pillar, _pillar_color),
+    Body("ring", 50.0, (-0.02, -0.06, -0.62), (0.98, 0.78, 0.54), _ring, _ring_color),
+    Body("brick", 3.5, (0.09, -0.75, -0.62), (0.75, -0.09, 0.04), _brick, _brick_color),
+    Body("lamp core", 50.0, (0.07, -0.25, 0.47), (0.37, 0.05, 0.77), _lamp_core, _lamp_core_color),
+    Body("lamp glass", 2.5, (-0.14, -0.46, 0.26), (0.58, 0.26, 0.98), _lamp_glass, _lamp_glass_color),
+    Body("ball", 50.0, (-0.82, -0.82, -0.62), (0.06, 0.06, 0.26), _ball, _ball_color),
 )

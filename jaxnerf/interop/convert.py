@@ -151,7 +151,7 @@ def _state(like, optimizer, step, params):
 
 def _write(folder, config, state, origin):
     try:
-        workdir.claim(folder, config)
+        workdir.save_config(folder, config)
         atomic_files.write_text(folder / "converted.json", json.dumps(origin, indent=2) + "\n")
         checkpoints = Checkpoints(folder)
         checkpoints.save(state)

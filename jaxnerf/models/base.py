@@ -32,10 +32,7 @@ class ViewOptions(Options):
         changes=Changes.IMAGES,
     )
     early_stop_eps: float = option(
-        1e-3,
-        "with a grid: the transmittance below which a ray is terminated",
-        range=BELOW_ONE,
-        changes=Changes.IMAGES,
+        1e-3, "with a grid: the transmittance below which a ray is terminated", range=BELOW_ONE, changes=Changes.IMAGES
     )
     max_samples: int = option(
         "auto", "with a grid: size of the sample buffer", range=at_least(1), auto=True, changes=Changes.SPEED

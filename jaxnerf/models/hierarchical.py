@@ -41,10 +41,7 @@ def from_context(context: SamplerContext) -> Model:
     names = ("coarse", "fine") if context.options.num_fine else ("fine",)
     fields = {name: context.make_field(name) for name in names}
     return hierarchical_model(
-        fields,
-        context.options,
-        background=context.background,
-        sample_multiplier=context.view.sample_multiplier,
+        fields, context.options, background=context.background, sample_multiplier=context.view.sample_multiplier
     )
 
 

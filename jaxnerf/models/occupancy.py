@@ -56,9 +56,7 @@ class OccupancyOptions(Options):
         True, "whether cells outside the visual hull of the alpha channels are empty from the start"
     )
     contracted: bool = option(
-        "auto",
-        "whether the box holds all of space; positions outside its inner half are then contracted",
-        auto=True,
+        "auto", "whether the box holds all of space; positions outside its inner half are then contracted", auto=True
     )
     lower: tuple[float, ...] = option("auto", "a corner of the box", unit="world units", auto=True, check=numbers(3))
     upper: tuple[float, ...] = option(
@@ -210,12 +208,7 @@ def schedule_of(options: OccupancyOptions, field: Field | None) -> GridSchedule:
 
 
 def occupancy_model(
-    field: Field,
-    schedule: GridSchedule,
-    options: OccupancyOptions,
-    view: ViewOptions,
-    *,
-    background: Background | None,
+    field: Field, schedule: GridSchedule, options: OccupancyOptions, view: ViewOptions, *, background: Background | None
 ) -> Model:
     """Makes the model of one field that is evaluated only in the occupied cells of its grid.
 

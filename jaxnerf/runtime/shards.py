@@ -54,45 +54,45 @@ def refuse_overwrite(overwrite: bool, shard: tuple[int, int], folder: pathlib.Pa
         raise ValueError(f"--overwrite with --shard would delete other shards' frames; remove {folder} first")
 
 
-def claim_folder(
+def make_folder(
     folder: pathlib.Path,
-    origin: Mapping[str, Any],
+    provenance: Mapping[str, Any],
     *,
     overwrite: bool = False,
     file: str = "path.json",
     remedy: str = "give --overwrite, or another --name",
 ) -> None:
-    """Makes a folder with a file that records the origin of its frames, or checks that of an existing one.
+    """Makes a folder with a file that records the provenance of its frames, or checks that of an existing one.
 
     Args:
         folder: made if missing.
-        origin: everything that the frames depend on, as JSON.
+        provenance: everything that the frames depend on, as JSON.
         overwrite: whether to delete the folder first.
         file: the name of the file.
         remedy: the end of the error message, which says what to do.
 
     Raises:
-        ValueError: if the folder holds frames of another origin; names what differs.
+        ValueError: if the folder holds frames of another provenance; names what differs.
     """
     if overwrite and folder.exists():
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / file).exists() and all(path.suffix == ".tmp" for path in folder.iterdir()):
-        atomic_files.write_text_once(folder / file, json.dumps(origin, indent=2) + "\n")
-    check_origin(folder, origin, file=file, remedy=remedy)
+        atomic_files.write_text_once(folder / file, json.dumps(provenance, indent=2) + "\n")
+    check_provenance(folder, provenance, file=file, remedy=remedy)
 
 
-def check_origin(folder: pathlib.Path, origin: Mapping[str, Any], *, file: str, remedy: str) -> None:
-    """Checks that the frames in a folder have the given origin; see `claim_folder`.
+def check_provenance(folder: pathlib.Path, provenance: Mapping[str, Any], *, file: str, remedy: str) -> None:
+    """Checks that the frames in a folder have the given provenance; see `make_folder`.
 
     Raises:
         ValueError: if they have another, or the file cannot be read; names what differs.
     """
     try:
         found = atomic_files.read_json(folder / file, remedy)
-        differ = [key for key in origin | found if found.get(key) != origin.get(key)]
+        differ = [key for key in provenance | found if found.get(key) != provenance.get(key)]
     except (OSError, ValueError, TypeError, AttributeError):
         raise ValueError(f"{folder / file}: cannot be read; {remedy}") from None
     if differ:
-        shown = ", ".join(f"{key} {found.get(key)!r}, not {origin.get(key)!r}" for key in differ[:2])
+        shown = ", ".join(f"{key} {found.get(key)!r}, not {provenance.get(key)!r}" for key in differ[:2])
         raise ValueError(f"{folder}: holds frames rendered with {shown}; {remedy}")

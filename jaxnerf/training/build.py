@@ -321,8 +321,8 @@ def _prepare(config, model, extras, views):
     if not set(ray_batches.DEPTH_FIELDS).isdisjoint(extras):
         sparse = confident_observations(views)
         if not config.data.ndc:
-            between = interpolated_depths(dataclasses.replace(views, sparse=sparse))
-            sparse = dataclasses.replace(sparse, between=between)
+            depths = interpolated_depths(dataclasses.replace(views, sparse=sparse))
+            sparse = dataclasses.replace(sparse, interpolated=depths)
     progress = None
     if "progress" in model.needs:
         train = config.train  # of several processes that only time ends, the learning rate has a planned end

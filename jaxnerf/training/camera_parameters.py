@@ -27,33 +27,21 @@ CAMERAS = "cameras"  # the entry of the parameters; all other entries are networ
 class CameraOptions(Options):
     """The options of parameters of the training images, which are trained with the networks."""
 
+    changes = Changes.TRAINING
+
     exposure: bool = option(
-        False,
-        "whether each image has a gain per colour channel; renderings show the scene without it",
-        changes=Changes.TRAINING,
+        False, "whether each image has a gain per colour channel; renderings show the scene without it"
     )
-    exposure_lr: float = option(
-        1e-2,
-        "initial learning rate; it decays as that of the networks",
-        range=POSITIVE,
-        changes=Changes.TRAINING,
-    )
-    refine: bool = option(
-        False,
-        "whether each pose and, common to all images, the focal length are corrected",
-        changes=Changes.TRAINING,
-    )
+    exposure_lr: float = option(1e-2, "initial learning rate; it decays as that of the networks", range=POSITIVE)
+    refine: bool = option(False, "whether each pose and, common to all images, the focal length are corrected")
     refine_lr: float = option(
         5e-4,
         "as `exposure_lr`",
         unit="radians, fractions of the cameras' spread and of the focal length",
         range=POSITIVE,
-        changes=Changes.TRAINING,
     )
-    refine_start_step: int = option(
-        300, "training step before which cameras do not move", range=at_least(0), changes=Changes.TRAINING
-    )
-    num_images: int = option("auto", "of the split `train`; do not set it", auto=True, changes=Changes.TRAINING)
+    refine_start_step: int = option(300, "training step before which cameras do not move", range=at_least(0))
+    num_images: int = option("auto", "of the split `train`; do not set it", auto=True)
 
     def resolve(self, facts: Facts, device: Device) -> tuple["CameraOptions", list[str]]:
         """Infers the number of images."""

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from jaxnerf.core.types import Views
-from jaxnerf.data.ray_batches import Gathered
+from jaxnerf.data.ray_batches import BatchPixels
 from jaxnerf.runtime import devices, memory, processes, signals
 from jaxnerf.training import build, metric_log, workdir
 from jaxnerf.training.auto_config import resolve, resolve_for_device
@@ -65,11 +65,11 @@ def train(
     processes.check_same("config", anywhere.to_json())
     with contextlib.ExitStack() as stack:
 
-        def claim():
+        def claim_workdir():
             stack.enter_context(workdir.workdir_lock(folder))
-            workdir.claim(folder, config)
+            workdir.save_config(folder, config)
 
-        processes.run_on_first(claim, pathlib.Path(folder) / "config.json")
+        processes.run_on_first(claim_workdir, pathlib.Path(folder) / "config.json")
         processes.print_once(*lines, *device_lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
         finished = run_training(experiment, views, folder, preview=preview, observe=observe)
         return finished and (at_end is None or at_end(views))
@@ -186,8 +186,8 @@ def _compile(experiment, views):
     pixels, gather = views.pixels, _stay_on_host(views.pixels)
     if gather:
         rows = np.zeros_like(pixels, shape=(options.batch_size, pixels.shape[1]))
-        gathered = Gathered(rows=rows, shape=pixels.shape)
-        data = data._replace(views=dataclasses.replace(data.views, pixels=gathered))
+        batch_pixels = BatchPixels(rows=rows, shape=pixels.shape)
+        data = data._replace(views=dataclasses.replace(data.views, pixels=batch_pixels))
     step = make_train_step(
         experiment.model, experiment.optimizer, experiment.draw, experiment.losses, experiment.cameras
     )
@@ -225,7 +225,7 @@ def _stay_on_host(pixels):
 
 
 def _gather_ahead(run, ids, pixels):
-    """Returns a step for data whose views' pixels are Gathered: it receives only the pixels that it draws.
+    """Returns a step for data whose views' pixels are BatchPixels: it receives only the pixels that it draws.
 
     Args:
         run: (state, data) -> (state, metrics), the step.
@@ -234,7 +234,7 @@ def _gather_ahead(run, ids, pixels):
     """
     step, drawn = None, None
 
-    def gathered(state, data):
+    def run_with_pixels(state, data):
         nonlocal step, drawn
         if step is None:
             step = int(state.step)
@@ -246,7 +246,7 @@ def _gather_ahead(run, ids, pixels):
         views = dataclasses.replace(data.views, pixels=dataclasses.replace(template, rows=rows))
         return run(state, data._replace(views=views))
 
-    return gathered
+    return run_with_pixels
 
 
 def _check_finite(row, options, folder):

@@ -30,42 +30,33 @@ _ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one,
 class OptimizerOptions(Options):
     """The options of the optimizer."""
 
-    lr_init: float = option(5e-4, "initial learning rate", range=POSITIVE, changes=Changes.TRAINING)
-    lr_final: float = option(
-        5e-5, "learning rate that is reached at `lr_steps`", range=POSITIVE, changes=Changes.TRAINING
-    )
+    changes = Changes.TRAINING
+
+    lr_init: float = option(5e-4, "initial learning rate", range=POSITIVE)
+    lr_final: float = option(5e-5, "learning rate that is reached at `lr_steps`", range=POSITIVE)
     lr_decay_power: float = option(
         1.0,
         "The rate is lr_init (lr_final / lr_init)^((step / lr_steps)^lr_decay_power). 1: exponential decay, as in the "
         "paper; larger: the rate stays high for most of the run and then decreases quickly.",
         range=POSITIVE,
-        changes=Changes.TRAINING,
     )
     lr_steps: int = option(
-        200_000,
-        "steps of the decay; the run may end earlier or later; auto: `max_steps`",
-        range=at_least(1),
-        auto=True,
-        changes=Changes.TRAINING,
+        200_000, "steps of the decay; the run may end earlier or later; auto: `max_steps`", range=at_least(1), auto=True
     )
-    warmup_steps: int = option(
-        0, "steps in which the learning rate rises linearly from 0", range=at_least(0), changes=Changes.TRAINING
-    )
-    beta1: float = option(0.9, "decay of Adam's first moment", range=BELOW_ONE, changes=Changes.TRAINING)
-    beta2: float = option(0.999, "decay of Adam's second moment", range=BELOW_ONE, changes=Changes.TRAINING)
-    epsilon: float = option(1e-8, "of Adam", range=POSITIVE, changes=Changes.TRAINING)
+    warmup_steps: int = option(0, "steps in which the learning rate rises linearly from 0", range=at_least(0))
+    beta1: float = option(0.9, "decay of Adam's first moment", range=BELOW_ONE)
+    beta2: float = option(0.999, "decay of Adam's second moment", range=BELOW_ONE)
+    epsilon: float = option(1e-8, "of Adam", range=POSITIVE)
     muon: float = option(
         0.0,
         "Above 0: Muon (arXiv:2502.16982) updates the matrices of the layers instead of Adam. Its updates have this "
         "root mean square times the learning rate; those of Adam have about 0.2.",
         range=at_least(0),
-        changes=Changes.TRAINING,
     )
     averaging_power: float = option(
         0.0,
         "Above 0: evaluation uses parameters averaged over about the last 1 / power of all steps (arXiv:1212.1824).",
         range=at_least(0),
-        changes=Changes.TRAINING,
     )
 
 

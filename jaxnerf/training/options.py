@@ -28,7 +28,6 @@ class TrainOptions(OptimizerOptions):
         "keep it busy, in the same number of steps.",
         range=at_least(1),
         auto=True,
-        changes=Changes.TRAINING,
     )
     cpu_batch_size: int = option(1024, "see `batch_size`", range=at_least(1), changes=Changes.NOTHING)
     microbatch_size: int = option(
@@ -42,10 +41,7 @@ class TrainOptions(OptimizerOptions):
         changes=Changes.SPEED,
     )
     batching: str = option(
-        "all_images",
-        "where a step draws its rays; `single_image`: from one view",
-        choices=BATCHINGS,
-        changes=Changes.TRAINING,
+        "all_images", "where a step draws its rays; `single_image`: from one view", choices=BATCHINGS
     )
     parallel: str = option(
         "auto",

@@ -32,7 +32,7 @@ _ADDED = {
 _REMOVED = {"occupancy.near_gradient_distance": 0.0}
 
 
-def claim(workdir: str | os.PathLike, config: RunConfig) -> None:
+def save_config(workdir: str | os.PathLike, config: RunConfig) -> None:
     """Writes a resolved config into a new workdir, or checks that it belongs to the run in an existing one.
 
     The caller holds the `workdir_lock`. Partial files of killed processes are removed.

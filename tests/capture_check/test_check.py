@@ -276,8 +276,8 @@ def test_the_plot_shows_cameras_with_findings_in_red_and_the_path_that_render_se
     wrong = findings.Finding("error", "pose", "", "", "", (2,))
     camera_plot.save(camera_plot.plot_cameras(report._replace(findings=(wrong,))), tmp_path / "plot.png", folders)
     pixels = np.int32(Image.open(tmp_path / "plot.png").convert("RGB"))
-    for colour in (camera_plot.FLAGGED, camera_plot.CAMERA, camera_plot.PATH):
-        assert (np.abs(pixels - ImageColor.getrgb(colour)).max(axis=-1) < 40).sum() > 20
+    for color in (camera_plot.FLAGGED, camera_plot.CAMERA, camera_plot.PATH):
+        assert (np.abs(pixels - ImageColor.getrgb(color)).max(axis=-1) < 40).sum() > 20
     assert camera_plot.is_plot_of(tmp_path / "plot.png", folders)
     assert not camera_plot.is_plot_of(tmp_path / "plot.png", tmp_path)
 

@@ -328,13 +328,13 @@ def test_a_rendering_without_samples_is_an_error():
 
 def test_mse_is_the_sum_over_all_renderings():
     rng = np.random.default_rng(0)
-    colours = jnp.asarray(rng.uniform(size=(3, 5, 3)), jnp.float32)
+    colors = jnp.asarray(rng.uniform(size=(3, 5, 3)), jnp.float32)
     weights = np.zeros((5, 1), np.float32)
-    outputs = [dataclasses.replace(make_rendering(weights, weights, weights), rgb=rgb) for rgb in colours[:2]]
-    batch = dataclasses.replace(make_batch(np.ones(5), 2.0), rgb=colours[2])
-    want = sum(((rgb - colours[2]) ** 2).mean(axis=-1) for rgb in colours[:2])
+    outputs = [dataclasses.replace(make_rendering(weights, weights, weights), rgb=rgb) for rgb in colors[:2]]
+    batch = dataclasses.replace(make_batch(np.ones(5), 2.0), rgb=colors[2])
+    want = sum(((rgb - colors[2]) ** 2).mean(axis=-1) for rgb in colors[:2])
     np.testing.assert_allclose(mse_loss(outputs, batch), want, rtol=1e-6)
-    np.testing.assert_allclose(mse_loss(outputs[1:], batch).mean(), ((colours[1] - colours[2]) ** 2).mean(), rtol=1e-6)
+    np.testing.assert_allclose(mse_loss(outputs[1:], batch).mean(), ((colors[1] - colors[2]) ** 2).mean(), rtol=1e-6)
 
 
 def depth_of(weights, t, delta, depth, confidence=1.0):

@@ -37,7 +37,7 @@ HAZE = analytic.atmosphere(8.0, scale_height=0.07, **COLOURED)
 SHARP = {
     "slab": analytic.slab(2.0, lower=0.4, upper=1.3, **COLOURED),
     "ball": analytic.ball(2.0, center=(0.0, 0.0, 1.0), radius=1.0, **COLOURED),
-    "two_colours": analytic.two_colours(1.0, height=1.1),
+    "two_colours": analytic.two_colors(1.0, height=1.1),
 }
 ORDERS = {"segments": 1.9, "gauss": 3.8}
 
@@ -117,7 +117,7 @@ def largest(got, expected):
 @pytest.mark.slow
 @pytest.mark.parametrize("rule", ORDERS)
 @pytest.mark.parametrize("name", SMOOTH)
-def test_order_of_colour_opacity_and_depth(name, rule):
+def test_order_of_color_opacity_and_depth(name, rule):
     found = errors(SMOOTH[name], OBLIQUE, rule, (48, 96, 192), exact(SMOOTH[name]))
     no_error = found[-1] < 1e-13  # the optical depth of an affine density has no error
     assert list(no_error) == [False, name in ("fog", "linear"), False]
@@ -165,9 +165,9 @@ def test_an_edge_costs_at_most_its_cell(name, rule):
     numbers = np.array([48, 192, 768])
     cells = numbers if rule == "segments" else numbers // 2
     found = errors(SHARP[name], OBLIQUE, rule, numbers, exact(SHARP[name]))[:, 0]
-    density, edges, colours = 2.0, 2, 1.0
+    density, edges, colors = 2.0, 2, 1.0
     length = np.linalg.norm(OBLIQUE.directions, axis=-1).max() * 4.0 / cells
-    assert (found <= density * edges * colours * length).all(), found
+    assert (found <= density * edges * colors * length).all(), found
     assert (found[1:] <= found[:-1]).all()
 
 
@@ -179,7 +179,7 @@ def test_an_edge_between_two_cells_costs_nothing(rule, order):
     assert (found[:, 1] < 1e-14).all()
     found = found[:, [0, 2]]
     assert (np.log2(found[:-1] / found[1:]) >= order).all()
-    halves = analytic.two_colours(3.0, height=1.0)
+    halves = analytic.two_colors(3.0, height=1.0)
     assert (errors(halves, rays, rule, (48,), compiled(halves.exact)(rays))[:, :2] < 1e-14).all()
 
 
@@ -292,7 +292,7 @@ def test_gauss_weights_follow_the_transmittance_at_the_points():
 
 
 @pytest.mark.parametrize("fog, wall", [(1e-3, 1e6), (1e-3, np.inf), (1e-9, 1e30)])
-def test_a_wall_keeps_its_colour_behind_fog_in_its_own_cell(fog, wall):
+def test_a_wall_keeps_its_color_behind_fog_in_its_own_cell(fog, wall):
     def scene(x, viewdirs):
         behind = x[..., 2] >= 0.5
         rgb = jnp.where(behind[..., None], jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 0.0]))

@@ -83,7 +83,7 @@ def test_float64_stays_float64(name):
         )
         samples = Samples(t=jnp.asarray(given["t"])[None], delta=jnp.asarray(given["delta"])[None])
 
-        def colour(density, rgb):
+        def color(density, rgb):
             seen = render_samples(
                 lambda x, viewdirs: (density, rgb),
                 ray,
@@ -93,7 +93,7 @@ def test_float64_stays_float64(name):
             return seen.rgb[0].sum(), seen
 
         arrays = jnp.asarray(given["density"])[None], jnp.asarray(given["rgb"])[None]
-        slope, seen = jax.jit(jax.grad(colour, has_aux=True))(*arrays)
+        slope, seen = jax.jit(jax.grad(color, has_aux=True))(*arrays)
         got = jax.tree.map(np.asarray, seen)
     want, slopes = exact.render(given), exact.gradients(given)
     for field in ("rgb", "opacity", "depth", "disparity", "weights"):

@@ -76,11 +76,9 @@ def test_gradients_are_finite_for_every_density(last):
             jaxnerf.weights_from_density(density, length),
             jaxnerf.transmittance(density, length),
         )
-        colour = jaxnerf.composite(weights, values, background=jnp.ones(3), transmittance=transmitted)
+        color = jaxnerf.composite(weights, values, background=jnp.ones(3), transmittance=transmitted)
         depth = jaxnerf.expected_depth(weights, t, transmitted, far=far)
-        return jnp.append(
-            colour, jnp.stack([weights.sum(), depth, jaxnerf.expected_disparity(weights, t), transmitted])
-        )
+        return jnp.append(color, jnp.stack([weights.sum(), depth, jaxnerf.expected_disparity(weights, t), transmitted]))
 
     def value_and_slopes(density):
         arguments = density, jnp.array([0.5, 1e-3, last]), jnp.eye(3)

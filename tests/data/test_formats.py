@@ -69,10 +69,10 @@ def errors(views, *, sky=False):
             far=jnp.float32(nearest + 1.7),
         )
         image = jax.tree.map(np.asarray, rendered(world))
-        behind = captures.sky_colour(origins, viewdirs) if sky else np.ones(3)
-        colour = image.rgb + (1 - image.opacity)[:, None] * (behind - 1)
+        behind = captures.sky_color(origins, viewdirs) if sky else np.ones(3)
+        color = image.rgb + (1 - image.opacity)[:, None] * (behind - 1)
         truth = np.asarray(pixel_colors(jnp.asarray(views.pixels[ids]), views.background))
-        found.append(np.abs(colour - truth)[kept])
+        found.append(np.abs(color - truth)[kept])
     return np.concatenate(found)
 
 
@@ -252,9 +252,9 @@ def test_a_dataset_that_changed_since_training_is_an_error(tmp_path):
         for split in ("train", "test"):
             with pytest.raises(ValueError, match=f"holds {found} images, .* expected 8 images"):
                 dataset.load_split(data, split)
-        workdir.claim(tmp_path / "run", to_config(data))
+        workdir.save_config(tmp_path / "run", to_config(data))
         with pytest.raises(ValueError, match="data.fingerprint '8 images"):
-            workdir.claim(tmp_path / "run", to_config(dataset.resolve(a_data(tmp_path))[0]))
+            workdir.save_config(tmp_path / "run", to_config(dataset.resolve(a_data(tmp_path))[0]))
 
 
 def to_config(data):

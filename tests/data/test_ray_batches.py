@@ -61,7 +61,7 @@ def pixel_ids(rays, pixel_offset=0.5):
 @pytest.mark.slow
 @pytest.mark.parametrize("batching", ray_batches.BATCHINGS)
 @pytest.mark.parametrize("pixel_offset", [0.0, 0.5])
-def test_colours_are_those_of_the_rays_pixels(batching, pixel_offset):
+def test_colors_are_those_of_the_rays_pixels(batching, pixel_offset):
     scene = views()
     _, batch = draw(3, jnp.arange(64), scene, batching=batching, pixel_offset=pixel_offset)
     view, index = pixel_ids(batch.rays, pixel_offset)
@@ -232,7 +232,7 @@ def test_the_ids_of_drawn_pixels_are_those_of_observations_too():
     scene, _ = views_with_points()
     options = {"batching": "single_image", "extras": DEPTH}
     ids = jax.jit(lambda scene: ray_batches.draw_pixels(7, 5, POSITIONS, scene, **options)[1])(scene)
-    rows = ray_batches.Gathered(rows=scene.pixels[np.asarray(ids)], shape=scene.pixels.shape)
+    rows = ray_batches.BatchPixels(rows=scene.pixels[np.asarray(ids)], shape=scene.pixels.shape)
     found = draw_with(5, POSITIONS, dataclasses.replace(scene, pixels=rows), batching="single_image")
     assert_same(found, draw_with(5, POSITIONS, scene, batching="single_image"), rtol=0, atol=0)
 

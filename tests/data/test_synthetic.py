@@ -161,7 +161,7 @@ def test_an_unwritable_cache_folder_only_warns(tmp_path, caplog, monkeypatch):
     assert len(list((tmp_path / "home" / "jaxnerf").iterdir())) == 1
 
 
-def test_only_the_balls_colour_depends_on_the_direction():
+def test_only_the_balls_color_depends_on_the_direction():
     centers = {"ball": (-0.38, -0.38, -0.18), "pillar": (-0.40, 0.46, 0.3), "glass": (0.42, -0.42, -0.29)}
     offset = 0.43 * jnp.array([0.48, -0.36, 0.80])  # towards the light, just inside the ball
     x = jnp.array([centers["ball"], centers["pillar"], centers["glass"]]) + offset[None, :] * jnp.eye(3)[:, :1]

@@ -65,7 +65,7 @@ def test_images_of_another_size_or_kind_are_damaged(tmp_path, capsys):
         assert sorted(said) == sorted(f"{file}: is damaged; its view is rendered again" for file in files[1:])
 
 
-def test_straight_alpha_recovers_a_known_colour_over_any_background():
+def test_straight_alpha_recovers_a_known_color_over_any_background():
     opacity = np.array([[0.0, 0.5, 1.0, 1e-4]])
     own = np.array([0.2, 0.4, 0.6])
     for background in (None, (1.0, 0.5, 0.0)):

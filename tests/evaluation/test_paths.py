@@ -38,7 +38,7 @@ def pose(rotation, eye):
 
 
 def ring(count, half_axes=(4.0, 4.0), height=1.0, tilt=None):
-    """Returns poses [count, 3, 4] around the origin that look at it; the world is turned by tilt."""
+    """Returns poses [count, 3, 4] around the provenance that look at it; the world is turned by tilt."""
     angle = 2 * np.pi * np.arange(count) / count
     eyes = np.stack([half_axes[0] * np.cos(angle), half_axes[1] * np.sin(angle), 0 * angle + height], axis=-1)
     flat = [look_at(np.float32(eye), np.zeros(3, np.float32), UP) for eye in eyes]
@@ -266,8 +266,8 @@ def test_rays_of_a_frame_are_those_of_its_own_camera(ndc):
         assert (np.asarray(rays.near) == 2).all() and (np.asarray(rays.far) == 6).all()
         return
     # Eq. 25 at the near plane: x' = -(f / (W / 2)) x / z with the first view's f and W.
-    direction, origin = np.asarray(plain.directions), np.asarray(plain.origins)
-    point = origin + (-1 - origin[..., 2:]) / direction[..., 2:] * direction
+    direction, provenance = np.asarray(plain.directions), np.asarray(plain.origins)
+    point = provenance + (-1 - provenance[..., 2:]) / direction[..., 2:] * direction
     np.testing.assert_allclose(rays.origins[..., 0], 100 / 32 * point[..., 0], atol=1e-5)
 
 

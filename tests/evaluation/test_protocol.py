@@ -98,7 +98,7 @@ def test_lego_at_100_pixels_is_comparable_with_no_table(scenes_dir):
 
 
 @pytest.mark.slow
-def test_truncation_keeps_8_bit_colours_and_otherwise_costs_what_the_protocol_says():
+def test_truncation_keeps_8_bit_colors_and_otherwise_costs_what_the_protocol_says():
     levels = np.resize(np.arange(256) / 255, (16, 32, 3)).astype(np.float32)
     found = image_metrics(levels, 1 - levels)
     assert found["psnr_truncated"] == found["psnr"]

@@ -73,7 +73,7 @@ def test_frames_show_the_model_and_its_depth_through_the_lens_of_the_path_file(r
     assert (np.diff(shades.ravel()[np.argsort(depth.ravel())].astype(int)) <= 0).all(), "near is bright"
 
 
-def test_rgba_over_the_background_is_the_colour(rendered):
+def test_rgba_over_the_background_is_the_color(rendered):
     color = iio.imread(rendered[0] / "color" / "0000.png") / 255
     rgba = iio.imread(rendered[0] / "rgba" / "0000.png") / 255
     alpha = rgba[..., 3:]
@@ -81,7 +81,7 @@ def test_rgba_over_the_background_is_the_colour(rendered):
     np.testing.assert_allclose(rgba[..., :3] * alpha + (1 - alpha), color, atol=1.01 / 255)
 
 
-def test_rgba_over_the_background_colour_is_the_colour(trained, path_file, tmp_path):
+def test_rgba_over_the_background_color_is_the_color(trained, path_file, tmp_path):
     run = shutil.copytree(trained, tmp_path / "run")
     content = json.loads((run / "config.json").read_text())
     content["data"] |= {"background": "none", "background_color": [0.2, 0.5, 1.0]}
@@ -131,8 +131,8 @@ def test_frames_of_other_settings_are_not_mixed(rendered, run, path_file, tmp_pa
         run, path=str(other), size=(4, 6), name="other", kind="none", settings={"chunk": 100}, overwrite=True
     )
     assert iio.imread(folder / "color" / "0001.png").shape == (6, 4, 3)
-    origin = json.loads((folder / "path.json").read_text())
-    (folder / "path.json").write_text(json.dumps(origin | {"parameters": "of a run that was trained again"}))
+    provenance = json.loads((folder / "path.json").read_text())
+    (folder / "path.json").write_text(json.dumps(provenance | {"parameters": "of a run that was trained again"}))
     with pytest.raises(ValueError, match="rendered with parameters"):
         render_path(run, path=str(other), size=(4, 6), name="other", kind="none")
     (folder / "path.json").write_text("{")

@@ -29,7 +29,7 @@ def start_run(folder):
     config = smoke_config()
     config.data.update({"dir": "scene", "format": "auto"})
     resolved = auto_config.resolve(config).config
-    workdir.claim(folder, resolved)
+    workdir.save_config(folder, resolved)
     return workdir.load_config(folder)
 
 
@@ -40,7 +40,7 @@ def test_a_run_finds_a_dataset_of_a_relative_path_from_any_current_folder(scene,
     assert len(restore_run(tmp_path / "run").experiment.load_split("train").offset) == 7
 
 
-def test_runs_of_versions_without_a_background_colour_have_black_behind_the_scene(scene, tmp_path, monkeypatch):
+def test_runs_of_versions_without_a_background_color_have_black_behind_the_scene(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(scene)
     start_run(tmp_path / "run")
     file = tmp_path / "run" / "config.json"

@@ -26,7 +26,7 @@ COLOURED = {"rgb": RGB, "rgb_slope": SLOPE}
 MEDIA = {
     "slab": lambda s: analytic.slab(s, lower=-0.6, upper=0.9, **COLOURED),
     "ball": lambda s: analytic.ball(s, center=CENTER, radius=RADIUS, **COLOURED),
-    "two_colours": lambda s: analytic.two_colours(s, height=0.25, below=RGB, above=(0.9, 0.1, 0.3)),
+    "two_colours": lambda s: analytic.two_colors(s, height=0.25, below=RGB, above=(0.9, 0.1, 0.3)),
     "atmosphere": lambda s: analytic.atmosphere(s, scale_height=1.5, **COLOURED),
     "linear": lambda s: analytic.linear(s, **COLOURED),
     "blob": lambda s: analytic.blob(s, center=CENTER, deviation=0.7, **COLOURED),
@@ -159,8 +159,8 @@ def test_homogeneous_media_are_exact_however_thick(name):
     np.testing.assert_array_equal(got.opacity, 1)
     free_path = 1 / (density * np.linalg.norm(rays.directions[0]))
     np.testing.assert_allclose(got.depth - rays.near, free_path, rtol=1e-9)
-    colour = evaluated(name)(density, rays.origins)[1]
-    np.testing.assert_allclose(got.rgb, colour, atol=1e-9)
+    color = evaluated(name)(density, rays.origins)[1]
+    np.testing.assert_allclose(got.rgb, color, atol=1e-9)
 
 
 def upward(z, near, far):

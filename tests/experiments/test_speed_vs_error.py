@@ -63,7 +63,7 @@ def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, t
     assert config.train.max_steps == "auto"
 
     def train(config, where):
-        workdir.claim(where, read_config(common.changed(config, {"train.max_steps": 7})))
+        workdir.save_config(where, read_config(common.changed(config, {"train.max_steps": 7})))
         return True
 
     names = ("psnr", "ssim", "seconds_per_frame", "views", "parameters", "rays_seen", "compile_seconds")

@@ -183,11 +183,11 @@ def test_nothing_is_written_through_a_link(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_repeated_dots_replace_all_colours(plain, tmp_path):
+def test_repeated_dots_replace_all_colors(plain, tmp_path):
     truth = synthetic_capture.write_capture(tmp_path / "dots", **SIZES, distortion=None, repetition=0.3)
     np.testing.assert_array_equal(truth.depth, plain[1].depth)
     x = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     np.testing.assert_allclose(synthetic_capture._dots(x, 0.3), synthetic_capture._dots(x + [0.3, -0.6, 0.9], 0.3))
     views = load_dataset(tmp_path / "dots", split="train")
-    colours = np.float64(views.pixels[:, :3]) / np.iinfo(views.pixels.dtype).max
-    assert colours.std(axis=0).min() > 0.1 and (colours[:, 0] > 0.2).all()
+    colors = np.float64(views.pixels[:, :3]) / np.iinfo(views.pixels.dtype).max
+    assert colors.std(axis=0).min() > 0.1 and (colors[:, 0] > 0.2).all()

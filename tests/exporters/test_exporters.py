@@ -73,7 +73,7 @@ def surfaces_of(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
-def test_a_mesh_is_a_closed_ball_of_two_colours(tmp_path, suffix):
+def test_a_mesh_is_a_closed_ball_of_two_colors(tmp_path, suffix):
     lines = []
     export_mesh(source_of(format=suffix, say=lines.append), tmp_path)
     mesh = trimesh.load(tmp_path / f"mesh.{suffix}", force="mesh")
@@ -113,7 +113,7 @@ def test_pieces_and_an_empty_box(tmp_path):
         base.check_memory(1e12, 1e9, "give a smaller --resolution")
 
 
-def test_points_have_normals_and_colours(tmp_path):
+def test_points_have_normals_and_colors(tmp_path):
     export_points(source_of(num_points=300), tmp_path)
     cloud = trimesh.load(tmp_path / "points.ply")
     assert 200 < len(cloud.vertices) <= 300
@@ -147,7 +147,7 @@ def test_splats_look_like_the_scene(images, tmp_path):
     assert -10 * np.log10(error) > 18
 
 
-def test_splats_are_scored_over_the_colour_behind_the_scene():
+def test_splats_are_scored_over_the_color_behind_the_scene():
     """The views are black, and far away Gaussians cover none of them."""
     none = splats.Gaussians(
         np.full((1, 3), 1e4), np.float64([[1, 0, 0, 0]]), np.full((1, 3), 1e-3), np.ones(1), np.zeros((1, 9, 3))

@@ -301,7 +301,7 @@ def test_outputs_and_gradients_are_finite_for_features_of_any_size(field, size, 
     assert density.max() <= np.exp(15) * 1.001 and (density >= 0).all()
 
 
-def test_colour_is_the_sigmoid_and_its_derivative_never_vanishes():
+def test_color_is_the_sigmoid_and_its_derivative_never_vanishes():
     logits = np.linspace(-200, 200, 4001, dtype=np.float32)
     values, slopes = compiled(jax.vmap(jax.value_and_grad(color_activation)))(logits)
     expected, own = compiled(jax.vmap(jax.value_and_grad(jax.nn.sigmoid)))(logits)
@@ -315,7 +315,7 @@ def test_colour_is_the_sigmoid_and_its_derivative_never_vanishes():
     assert (np.diff(beyond * jax.vmap(jax.grad(color_activation))(beyond)) < 0).all()  # the gradient of a weight
 
 
-def test_saturated_colour_learns(field):
+def test_saturated_color_learns(field):
     """A white field becomes black; through a sigmoid no gradient would return."""
     plain, params, apply, _ = field
     x, viewdirs = inside((6, 4)), directions((6, 1))

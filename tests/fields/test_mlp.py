@@ -76,7 +76,7 @@ def test_it_is_the_papers_network(paper):
     np.testing.assert_allclose(rgb, expected_rgb, atol=1e-5)
 
 
-def test_density_depends_on_position_alone_and_colour_does_not(paper):
+def test_density_depends_on_position_alone_and_color_does_not(paper):
     _, _, params, apply = paper
     x, viewdirs = inputs()
     density, rgb = apply(params, x, viewdirs)

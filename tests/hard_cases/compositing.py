@@ -31,7 +31,7 @@ def checks(name, *, render=render_samples, outputs="float32"):
     got, clean = _rendered(render, outputs, len(RAYS[name]["t"]))[name]
     ray = rounded(RAYS[name], outputs)
     want = exact.render(ray)
-    colour, want_colour = got["values"][:3], [want[c] for c in COLOURS]
+    color, want_color = got["values"][:3], [want[c] for c in COLOURS]
     seen = [got["values"][OUTPUTS.index(output)] for output in ("opacity", "depth", "disparity")]
     opacity, depth, disparity = seen
     weights, total = got["weights"], got["weights"].astype(np.float64).sum()
@@ -42,7 +42,7 @@ def checks(name, *, render=render_samples, outputs="float32"):
         Check("sum of weights above 1", float(np.maximum(total - 1, 0)), 1e-6),
         Check("opacity", relative(opacity, want["opacity"]), 2e-6),
         Check("opacity outside [0, 1]", count(not 0 <= opacity <= 1), 0),
-        Check("colour", absolute(colour, want_colour), 2e-6),
+        Check("colour", absolute(color, want_color), 2e-6),
         Check("weights + transmittance", absolute(got["whole"], 1), 1e-6),
         Check("depth", relative(depth, want["depth"]), 1e-5),
         Check("disparity", relative(disparity, want["disparity"]), 1e-5),

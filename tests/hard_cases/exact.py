@@ -96,9 +96,9 @@ def _transmittance(ray):
 def _values(ray):
     with np.errstate(divide="ignore"):
         disparity = 1 / np.asarray(ray["t"], np.longdouble)
-    colours = {name: (ray["rgb"][:, i], ray["background"][i]) for i, name in enumerate(("red", "green", "blue"))}
+    colors = {name: (ray["rgb"][:, i], ray["background"][i]) for i, name in enumerate(("red", "green", "blue"))}
     ones = np.ones_like(ray["t"])
-    return colours | {"opacity": (ones, 0), "depth": (ray["t"], ray["far"]), "disparity": (disparity, 0)}
+    return colors | {"opacity": (ones, 0), "depth": (ray["t"], ray["far"]), "disparity": (disparity, 0)}
 
 
 def _next_kept(values, kept):

@@ -17,14 +17,14 @@ def composite(density, rgb, t, length, *, background=None):
     alpha = 1.0 - jnp.exp(-density * length)
     transmittance = jnp.cumprod(1.0 - alpha[..., :-1] + 1e-10, axis=-1)
     weights = alpha * jnp.concatenate([jnp.ones_like(alpha[..., :1]), transmittance], axis=-1)
-    colour, opacity = (weights[..., None] * rgb).sum(axis=-2), weights.sum(axis=-1)
+    color, opacity = (weights[..., None] * rgb).sum(axis=-2), weights.sum(axis=-1)
     depth = (weights * t).sum(axis=-1)
     disparity = 1.0 / jnp.maximum(1e-10, depth / opacity)
     if background is not None:
-        colour = colour + (1.0 - opacity)[..., None] * background
+        color = color + (1.0 - opacity)[..., None] * background
     num_dropped = jnp.zeros(opacity.shape, jnp.int32)
     return Rendering(
-        rgb=colour,
+        rgb=color,
         opacity=opacity,
         depth=depth,
         disparity=disparity,

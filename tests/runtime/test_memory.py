@@ -121,7 +121,7 @@ def test_chunk_that_does_not_fit_is_halved_and_the_image_is_the_same(monkeypatch
     rays, tried = jax.tree.map(jnp.asarray, random_rays(0, (6, 7))), []
 
     @jax.jit
-    def colours(scale, rays):
+    def colors(scale, rays):
         values = scale * rays.viewdirs
         zero = jnp.zeros(rays.near.shape)
         names = [field.name for field in dataclasses.fields(Rendering) if field.name not in ("rgb", "weights")]
@@ -131,9 +131,9 @@ def test_chunk_that_does_not_fit_is_halved_and_the_image_is_the_same(monkeypatch
         tried.append(rays.near.size)
         if rays.near.size > 16:
             raise out_of_memory()
-        return colours(scale, rays)
+        return colors(scale, rays)
 
-    render.lower = colours.lower
+    render.lower = colors.lower
     image = memory.image_renderer(render, 40)
     expected = 2 * np.asarray(rays.viewdirs)
     np.testing.assert_allclose(image(jnp.float32(2), rays).rgb, expected, rtol=1e-6)
@@ -146,7 +146,7 @@ def test_chunk_that_does_not_fit_is_halved_and_the_image_is_the_same(monkeypatch
     assert tried[0] == 64  # all rays, in one padded shape
     monkeypatch.setattr(memory, "available", lambda: 12 * 16 + 100)
     tried.clear()
-    memory.image_renderer(colours, 40)(jnp.float32(2), rays)
+    memory.image_renderer(colors, 40)(jnp.float32(2), rays)
     assert "image with 40 rays per chunk (--chunk): needs 0.0 MB" in capsys.readouterr().err
 
 
@@ -157,7 +157,7 @@ def test_an_image_is_compiled_once(chunk, placed, culled):
     rays, compiled = jax.tree.map(jnp.asarray, random_rays(0, (6, 7))), []
 
     @jax.jit
-    def colours(scale, rays):
+    def colors(scale, rays):
         empty = render_background(rays)
         return dataclasses.replace(empty, rgb=scale * rays.viewdirs)
 
@@ -169,7 +169,7 @@ def test_an_image_is_compiled_once(chunk, placed, culled):
             compiled.append(seconds)
 
     scale = jax.device_put(jnp.float32(2), jax.devices()[0] if placed else None)
-    image = memory.image_renderer(colours, chunk, cull if culled else None)
+    image = memory.image_renderer(colors, chunk, cull if culled else None)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         for _ in range(2):

@@ -123,12 +123,12 @@ def test_only_complete_rows_and_results_are_believed(whole, tmp_path):
     wrong += [{**good, "row": {**row, "name": 3}}, {**good, "row": {**row, "seconds": 0.0}}]
     wrong += [{**good, "row": {**row, "seconds": math.inf}}, {**good, "rays": -math.inf}, {**good, "rays": math.nan}]
     assert not any(map(aggregate.is_finished, wrong))
-    origin = {"split": "test"}
+    provenance = {"split": "test"}
     for content in ("[]", "{}", json.dumps({**results, "psnr": "high"})):
-        (tmp_path / aggregate.ORIGIN).write_text(json.dumps(origin))
+        (tmp_path / aggregate.PROVENANCE).write_text(json.dumps(provenance))
         (tmp_path / "results.json").write_text(content)
         with pytest.raises(ValueError, match="results.json: lacks metrics, .*remove it"):
-            aggregate.read(tmp_path, origin, "remove it")
+            aggregate.read(tmp_path, provenance, "remove it")
 
 
 def test_two_shards_that_finish_together_both_return_the_result(fresh, monkeypatch):

@@ -83,12 +83,12 @@ def the_image_arrives_and_follows_the_mouse(page, out):
     return moved
 
 
-def modes_and_controls(page, colour, out):
+def modes_and_controls(page, color, out):
     for mode in ("depth", "opacity", "normals"):
         select(page, "Show", mode)
         page.wait_for_timeout(500)
         image = middle(page, out / f"{mode}.png")
-        check(difference(image, colour) > 3, f"{mode} differs from colour by {difference(image, colour):.1f} of 255")
+        check(difference(image, color) > 3, f"{mode} differs from color by {difference(image, color):.1f} of 255")
     select(page, "Show", "colour")
     page.mouse.move(300, 300)
     page.mouse.wheel(0, 400)  # away, so that many cameras are in view

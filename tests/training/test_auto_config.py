@@ -172,7 +172,7 @@ def test_config_of_the_paper_is_resolved_and_logs_nothing_about_a_box(views):
     assert baked.occupancy == got.occupancy and any(line.startswith("box ") for line in lines)
 
 
-def test_rays_that_hit_nothing_have_the_mean_colour_of_an_unbounded_capture(views):
+def test_rays_that_hit_nothing_have_the_mean_color_of_an_unbounded_capture(views):
     """Black behind a bright scene would be replaced by fog in front of the cameras."""
     given, rgb = auto_config(), np.random.default_rng(0).integers(0, 256, (*views.pixels.shape[:1], 3), np.uint8)
     given.data.background, given.occupancy.contracted, rgb[..., 0] = "none", True, 51
@@ -198,7 +198,7 @@ def test_rays_that_hit_nothing_have_the_mean_colour_of_an_unbounded_capture(view
     "background, contracted, sampler",
     [("none", False, "occupancy"), ("none", True, "hierarchical"), ("white", True, "occupancy")],
 )
-def test_otherwise_black_or_the_colour_behind_alpha_is_behind_the_scene(views, background, contracted, sampler):
+def test_otherwise_black_or_the_color_behind_alpha_is_behind_the_scene(views, background, contracted, sampler):
     given = auto_config(contracted=contracted)
     given.data.background, given.sampler = background, sampler
     config = resolve(given, dataclasses.replace(views, pixels=views.pixels[:, :3])).config
@@ -212,7 +212,7 @@ def test_otherwise_black_or_the_colour_behind_alpha_is_behind_the_scene(views, b
             resolve(given, views)
 
 
-def test_the_mean_colour_of_many_pixels_is_that_of_all_that_the_mask_includes(views):
+def test_the_mean_color_of_many_pixels_is_that_of_all_that_the_mask_includes(views):
     """Even columns are dark and odd ones are bright, so that every second pixel would have the wrong mean."""
     bright = np.arange(2**21) % 2
     pixels = np.uint16(np.stack([65535 * bright, 65535 * (1 - bright), np.full_like(bright, 13107)], axis=-1))
@@ -223,14 +223,14 @@ def test_the_mean_colour_of_many_pixels_is_that_of_all_that_the_mask_includes(vi
     assert mean_color(nothing) == mean_color(many)
 
 
-def test_an_unresolved_background_colour_is_an_error():
+def test_an_unresolved_background_color_is_an_error():
     data = DataOptions(background="none")
     with pytest.raises(ValueError, match="data.background_color is 'auto'; resolve the config"):
         dataset.color_behind(data)
 
 
 @pytest.mark.parametrize("color", [(0.5, 0.5), (0.5, 1.5, 0.5), (0.5, "red", 0.5)])
-def test_a_background_colour_is_red_green_and_blue(views, color):
+def test_a_background_color_is_red_green_and_blue(views, color):
     config = auto_config()
     config.data.background_color = color
     with pytest.raises(ValueError, match="data.background_color is .*expected red, green and blue"):
@@ -297,7 +297,7 @@ def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_pa
     """They stay "auto" in config.json, so the same workdir continues on another device."""
     given = resolved.config
     assert set(auto_fields(given)) == set(DEVICE_FIELDS)
-    workdir.claim(tmp_path, given)
+    workdir.save_config(tmp_path, given)
     read = workdir.load_config(tmp_path)
     assert set(auto_fields(read)) == set(DEVICE_FIELDS)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
@@ -601,8 +601,8 @@ def test_ndc_box_holds_all_rays():
 
 def test_workdir_gives_the_same_model(resolved, views, tmp_path):
     config = resolved.config
-    workdir.claim(tmp_path, config)
-    workdir.claim(tmp_path, resolve(auto_config(), views).config)  # the same command resumes
+    workdir.save_config(tmp_path, config)
+    workdir.save_config(tmp_path, resolve(auto_config(), views).config)  # the same command resumes
     read = workdir.load_config(tmp_path)
     assert as_json(read) == as_json(config)
     assert as_json(resolve(read, views).config) == as_json(config)
@@ -615,7 +615,7 @@ def test_workdir_gives_the_same_model(resolved, views, tmp_path):
     assert jax.tree.leaves(shapes[0]) == jax.tree.leaves(shapes[1])
     other = changed(config, {"occupancy.step_size": 2 * config.occupancy.step_size})
     with pytest.raises(ValueError, match="belongs to a run with another config .occupancy.step_size"):
-        workdir.claim(tmp_path, other)
+        workdir.save_config(tmp_path, other)
 
 
 @pytest.mark.scenes("lego")

@@ -85,7 +85,7 @@ def test_empty_image_wall_and_uniform_fog_are_dead(biases):
     assert follow(with_biases(network()[1], **biases), images())[1] == [1, 2, 3]
 
 
-def test_saturated_colour_is_dead_while_density_learns():
+def test_saturated_color_is_dead_while_density_learns():
     """Black fog in front of white."""
     state = with_biases(network()[1], density=1.0, rgb=-100.0)
     later, counts = follow(state, images())
@@ -95,7 +95,7 @@ def test_saturated_colour_is_dead_while_density_learns():
 
 
 @pytest.mark.slow
-def test_detection_of_saturated_colour_changes_no_bit():
+def test_detection_of_saturated_color_changes_no_bit():
     states = []
     for detect_color in (True, False):
         _, state, run = network(detect_color)

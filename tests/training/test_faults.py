@@ -20,7 +20,7 @@ from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import read_config
 from jaxnerf.training.state import create_state
-from jaxnerf.training.workdir import claim, workdir_lock
+from jaxnerf.training.workdir import save_config, workdir_lock
 from runs import ROOT, SMOKE_FLAGS, smoke_config
 from slow.faults import kill_many
 
@@ -306,7 +306,7 @@ def test_partial_files_of_a_killed_run_are_removed_and_no_others(tmp_path):
         (tmp_path / name).write_text("partial")
     for name in ("folder.tmp", "config.json.folder.tmp"):
         (tmp_path / name).mkdir()
-    claim(tmp_path, read_config(smoke_config()))
+    save_config(tmp_path, read_config(smoke_config()))
     assert {path.name for path in tmp_path.iterdir()} == {
         "config.json",
         "notes.tmp",

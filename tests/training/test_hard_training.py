@@ -49,8 +49,8 @@ def network(kind):
 
 def a_batch(rgb=None, near=2.0, far=6.0):
     """Returns a Batch of random rays and colours, or of one colour."""
-    colours = np.random.default_rng(1).uniform(size=(RAYS, 3)) if rgb is None else np.full((RAYS, 3), rgb)
-    return jax.tree.map(jnp.asarray, Batch(rays=random_rays(0, (RAYS,), near, far), rgb=np.float32(colours)))
+    colors = np.random.default_rng(1).uniform(size=(RAYS, 3)) if rgb is None else np.full((RAYS, 3), rgb)
+    return jax.tree.map(jnp.asarray, Batch(rays=random_rays(0, (RAYS,), near, far), rgb=np.float32(colors)))
 
 
 def with_params(state, change):

@@ -152,10 +152,8 @@ def test_the_fields_of_the_batch_are_those_of_the_drawn_pixels():
     index = views.offset[batch.image_index] + row * views.size[batch.image_index, 1] + column
     largest = np.iinfo(views.pixels.dtype).max
     np.testing.assert_allclose(batch.alpha, views.pixels[index, 3] / largest, atol=1e-6)
-    colours = (
-        views.pixels[index, :3] / largest * np.asarray(batch.alpha)[:, None] + 1 - np.asarray(batch.alpha)[:, None]
-    )
-    np.testing.assert_allclose(batch.rgb, colours, atol=1e-6)
+    colors = views.pixels[index, :3] / largest * np.asarray(batch.alpha)[:, None] + 1 - np.asarray(batch.alpha)[:, None]
+    np.testing.assert_allclose(batch.rgb, colors, atol=1e-6)
 
 
 def test_an_unknown_loss_names_the_registration():

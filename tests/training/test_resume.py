@@ -106,7 +106,7 @@ def test_a_config_to_resume_has_the_types_of_its_fields(trained, tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(saved))
     config = to_config_dict(workdir.load_config(tmp_path))
     assert config.train.max_reinits == 10 and config.train.max_steps == 20
-    workdir.claim(tmp_path, workdir.load_config(tmp_path))  # finished steps do not depend on this field
+    workdir.save_config(tmp_path, workdir.load_config(tmp_path))  # finished steps do not depend on this field
     config.hash_grid.resolutions = "auto"
     config.train.lr_init = 1
     with pytest.raises(TypeError):
@@ -120,10 +120,10 @@ def test_a_run_of_an_older_version_is_resumed_with_what_that_version_did(trained
     (tmp_path / "config.json").write_text(json.dumps(saved))
     config = workdir.load_config(tmp_path)
     assert config.train.lr_decay_power == 1 and config.occupancy.uniform_fraction == 1 and config.losses["depth"] == 0
-    workdir.claim(tmp_path, config)
+    workdir.save_config(tmp_path, config)
     (tmp_path / "config.json").write_text(json.dumps(saved))
     with pytest.raises(ValueError, match="to a run with another config .train.lr_decay_power 1.0 -> 2.0"):
-        workdir.claim(tmp_path, changed(config, {"train.lr_decay_power": 2.0}))
+        workdir.save_config(tmp_path, changed(config, {"train.lr_decay_power": 2.0}))
 
 
 def test_a_run_whose_training_no_longer_exists_is_not_resumed(trained, tmp_path):
@@ -134,9 +134,9 @@ def test_a_run_whose_training_no_longer_exists_is_not_resumed(trained, tmp_path)
         config = workdir.load_config(tmp_path)
         if distance:
             with pytest.raises(ValueError, match="whose occupancy.near_gradient_distance no longer exists; resume it"):
-                workdir.claim(tmp_path, config)
+                workdir.save_config(tmp_path, config)
         else:
-            workdir.claim(tmp_path, config)
+            workdir.save_config(tmp_path, config)
 
 
 @pytest.mark.slow

@@ -69,13 +69,13 @@ def test_each_page_has_its_own_camera_and_mode(browser):
     first, second = browser(), browser()
     first.open()
     second.open(position=(0.0, 0.0, 6.0), width=40)
-    colour = first.wait_for_quality()
-    assert second.wait_for_quality().shape == (48, 40, 3) and colour.shape == (48, 64, 3)
+    color = first.wait_for_quality()
+    assert second.wait_for_quality().shape == (48, 40, 3) and color.shape == (48, 64, 3)
     count = second.num_images
     second.use("Show", "depth")
     second.wait(lambda: second.num_images > count)
     grey = np.ptp(second.wait_for_quality().astype(int), axis=-1).max()
-    assert grey < 8 and np.ptp(colour.astype(int), axis=-1).max() > 50
+    assert grey < 8 and np.ptp(color.astype(int), axis=-1).max() > 50
 
 
 def test_new_parameters_replace_the_image_by_themselves(viewer, browser):

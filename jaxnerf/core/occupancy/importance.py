@@ -65,26 +65,32 @@ def importance_samples(
         zeros, none = jnp.zeros(max_samples), jnp.zeros(0, jnp.int32)
         index = jnp.zeros(max_samples, jnp.int32)
         return PlacedSamples(t=zeros, delta=zeros, ray_index=index, used=index > 0, num_dropped=none), none > 0
+    # Candidates that the grid expects to be hidden are skipped; the others share out the slots of the buffer.
     occupied, optical_depth = estimate_optical_depth(grid, rays, candidates)
     in_front = exclusive_sum(optical_depth)
     kept = occupied & ~(in_front > max_optical_depth)
     count = kept.sum(axis=-1, dtype=jnp.int32)
     number = divide_slots(count, max_samples)
+    # The probability of each candidate: a part in proportion to its estimated weight, only where the ray gets fewer
+    # samples than candidates, and the rest evenly, so that the sum is 1.
     transmittance = jnp.exp(-in_front)
     weights = jnp.where(kept, transmittance - transmittance * jnp.exp(-optical_depth), 0)
     weights = jnp.where((number < count)[:, None], (1 - uniform_fraction) * weights, 0)
     even = (1 - weights.sum(axis=-1)) / jnp.maximum(count, 1)
     probability = weights + even[:, None]
+    # As whole numbers of parts, whose sums are exact in float32 whatever the order; each candidate has at least one.
     parts = jnp.where(kept, 1 + jnp.where(probability > 0, jnp.floor(_PARTS * probability), 0), 0)
     cumulative = running_sum(parts)
     delta = jnp.where(kept, candidates.delta, 0)
     length = running_sum(delta)
 
+    # The ray of each slot: a cumulative sum of where rays end in the buffer takes the place of a search.
     first = jnp.cumsum(number, dtype=jnp.int32) - number
     slot = jnp.arange(max_samples, dtype=jnp.int32)
     ended = jnp.zeros(max_samples, jnp.int32).at[first + number].add(1, mode="drop")
     ray = jnp.minimum(jnp.cumsum(ended, dtype=jnp.int32), count.size - 1)
     used = slot < number.sum()
+    # The parts of a ray are divided evenly among its slots; a random shift moves all inner bounds together.
     row, total = slot - first[ray], cumulative[ray, -1]
     spacing = total / jnp.maximum(number[ray], 1)
     shift = uniform(key, (*count.shape, 1))[ray, 0] - 0.5
@@ -98,6 +104,7 @@ def importance_samples(
         size = parts[ray, index]
         return index, jnp.clip((at - (cumulative[ray, index] - size)) / jnp.maximum(size, 1), 0, 1)
 
+    # A sample lies in the middle of its parts, and stands for the length between their bounds.
     index, fraction = locate(lower)
     before = length[ray, index] - (1 - fraction) * delta[ray, index]
     after = jnp.where(last, length[ray, -1], jnp.roll(before, -1))

@@ -405,9 +405,9 @@ def _composite(function, scene, rays, placed, *, rule, longest, median_depth=Fal
     length = jnp.where(placed.used, rendering.lengths_at_speeds(placed.delta, speed, unknown), 0)
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
     weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=longest)
-    colours = [rgb[:, axis] * weights for axis in range(3)]
+    colors = [rgb[:, axis] * weights for axis in range(3)]
     moments = volume_rendering.multiply_or_zero(weights, t), volume_rendering.divide_or_zero(weights, t)
-    parts = [optical_depth, *colours, *moments]
+    parts = [optical_depth, *colors, *moments]
     sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
     packed = PackedSamples(weights=weights, t=t, delta=placed.delta, ray_index=ray, used=placed.used, rule=rule)
     median = None

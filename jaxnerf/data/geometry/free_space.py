@@ -29,9 +29,9 @@ def surface_range(
         pixels: px, (x, y), any pixel_offset.
 
     Returns:
-        near and far; `free_until`, or 0 without, and infinity for pixels outside all triangles.
+        near and far; `free_depth`, or 0 without, and infinity for pixels outside all triangles.
     """
-    least = 0.0 if views.free_until is None else float(views.free_until[view])
+    least = 0.0 if views.free_depth is None else float(views.free_depth[view])
     near, far = np.full(len(pixels), least, np.float32), np.full(len(pixels), np.inf, np.float32)
     found = _triangulated(views, view)
     if found is None:

@@ -36,7 +36,7 @@ def seen_cells(
     """Returns the cells that at least min_views views see, and those that are free.
 
     A view sees a cell if it sees one of its corners between near and far. A cell is free if it is in front of
-    `Views.free_until` for two of the views that see it, or for the only one, or if it touches a sphere around a camera
+    `Views.free_depth` for two of the views that see it, or for the only one, or if it touches a sphere around a camera
     of the radius `clear_radii`. What few cameras show close to a camera's place has little parallax, so a field would
     put fog there that hides the scene from cameras beside that place.
 
@@ -61,10 +61,10 @@ def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
     """Returns the radius [V], in world units, of a sphere around each camera in which there is no matter.
 
     A photographer stands there, and where nothing in the image is close, nothing beside the image is much closer, in
-    general. The radius is 0.75 times the distance to the nearest matter: `Views.free_until`, or the distance to the
+    general. The radius is 0.75 times the distance to the nearest matter: `Views.free_depth`, or the distance to the
     16th nearest sparse point, seen from there or not, if that is less. It is 0 where neither is known.
     """
-    known = np.zeros(len(views.offset)) if views.free_until is None else np.asarray(views.free_until)
+    known = np.zeros(len(views.offset)) if views.free_depth is None else np.asarray(views.free_depth)
     nearest = np.where(known > 0, known, np.inf)
     if views.sparse is not None and len(views.sparse.positions) >= _FEW_POINTS:
         centers = np.asarray(views.cameras.to_world)[:, :, 3]
@@ -116,8 +116,8 @@ def _view_counter(views, schedule, planes):
     It returns how many views see each cell, how many of these see it free, and whether it touches a clear sphere.
     """
     shape, (lower, upper) = schedule.shape, np.float32([schedule.lower, schedule.upper]).reshape(2, 1, 1, 1, 3)
-    free_until = np.zeros(len(views.offset), np.float32) if views.free_until is None else views.free_until
-    known = views.cameras.to_world, clear_radii(views), views.near, views.far, free_until
+    free_depth = np.zeros(len(views.offset), np.float32) if views.free_depth is None else views.free_depth
+    known = views.cameras.to_world, clear_radii(views), views.near, views.far, free_depth
     stack = *(jnp.asarray(each, jnp.float32) for each in known), *_shown_slopes(views)
 
     @jax.jit
@@ -133,12 +133,12 @@ def _view_counter(views, schedule, planes):
             return counts[0] + seen, counts[1] + (seen & ~behind), counts[2] | clear
 
         none = jnp.zeros((planes, *shape[1:]), jnp.int32)
-        return jax.lax.fori_loop(0, len(free_until), add, (none, none, none > 0))
+        return jax.lax.fori_loop(0, len(free_depth), add, (none, none, none > 0))
 
     return functools.partial(count, stack)
 
 
-def _sees(to_world, clear_radius, near, far, free_until, least, scale, shown, x):
+def _sees(to_world, clear_radius, near, far, free_depth, least, scale, shown, x):
     """Returns which of the positions x [3, ...] a view sees, sees behind its free space, and has around its camera."""
     offset = [x[axis] - to_world[axis, 3] for axis in range(3)]
     right, up, back = (sum(to_world[i, axis] * offset[i] for i in range(3)) for axis in range(3))
@@ -150,7 +150,7 @@ def _sees(to_world, clear_radius, near, far, free_until, least, scale, shown, x)
     column, row = (jnp.where(inside, value, 0).astype(jnp.int32) for value in (column, row))
     seen = ahead & inside & shown[row, column]
     close = sum(value**2 for value in offset) < clear_radius**2
-    return seen, seen & (depth >= free_until), close
+    return seen, seen & (depth >= free_depth), close
 
 
 def _shown_slopes(views):

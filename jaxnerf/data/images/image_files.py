@@ -195,9 +195,9 @@ def average_tiles(
         mean = np.stack([_sum_tiles(plane, factor) for plane in planes], axis=-1) / (largest * factor**2)
         return np.rint(mean * 65535).astype(np.uint16)
     alpha = planes[3].astype(np.uint16 if pixels.dtype == np.uint8 else np.uint32)  # holds largest^2
-    colour = np.stack([_sum_tiles(plane * alpha, factor) for plane in planes[:3]], axis=-1)
+    color = np.stack([_sum_tiles(plane * alpha, factor) for plane in planes[:3]], axis=-1)
     cover = _sum_tiles(alpha, factor) / (largest * factor**2)
-    return to_straight(colour / (float(largest) ** 2 * factor**2), cover, background=background)
+    return to_straight(color / (float(largest) ** 2 * factor**2), cover, background=background)
 
 
 def _sum_tiles(plane, factor):
@@ -234,6 +234,6 @@ def to_straight(
     rounded = np.rint(np.clip(alpha, 0, 1) * 65535) / 65535
     behind = 0.0 if background is None else np.asarray(background, np.float64) * (rounded - alpha)[..., None]
     covered = rounded[..., None]
-    colour = (premultiplied + behind) / np.where(covered > 0, covered, 1.0)
-    colour = np.where(covered > 0, np.clip(colour, 0, 1), 0.0)
-    return np.rint(np.concatenate([colour, covered], axis=-1) * 65535).astype(np.uint16)
+    color = (premultiplied + behind) / np.where(covered > 0, covered, 1.0)
+    color = np.where(covered > 0, np.clip(color, 0, 1), 0.0)
+    return np.rint(np.concatenate([color, covered], axis=-1) * 65535).astype(np.uint16)

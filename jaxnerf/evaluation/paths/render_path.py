@@ -70,7 +70,7 @@ def render_path(
         The paths written: the folder and the videos.
 
     Raises:
-        ValueError: if there is no such run, checkpoint or path, or frames of that name have another origin.
+        ValueError: if there is no such run, checkpoint or path, or frames of that name have another provenance.
     """
     suffix = video_suffix(kind)
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
@@ -84,7 +84,7 @@ def render_path(
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
     atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(overwrite, shard, target)
-    shards.claim_folder(target, _origin(run, step, variables, views, path, closed), overwrite=overwrite)
+    shards.make_folder(target, _provenance(run, step, variables, views, path, closed), overwrite=overwrite)
     missing = _write_frames(target, run, variables, views, path, rgba=rgba, shard=shard)
     written = [target]
     if missing:
@@ -149,13 +149,13 @@ def _select_kind(kind, views):
     return kind
 
 
-def _origin(run, step, variables, views, path, closed):
+def _provenance(run, step, variables, views, path, closed):
     """Returns everything that the frames depend on, for path.json."""
-    origin = {"path": path.source, "frames": len(path.poses), "width": path.width, "height": path.height}
+    provenance = {"path": path.source, "frames": len(path.poses), "width": path.width, "height": path.height}
     if path.source == "interpolate":
-        origin["closed"] = closed
+        provenance["closed"] = closed
     return {
-        **origin,
+        **provenance,
         "step": step,
         **render_settings(run),
         "config": fingerprint(run.identity),

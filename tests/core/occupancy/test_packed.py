@@ -303,7 +303,7 @@ def without(samples, kept):
 
 
 @pytest.mark.parametrize("error", [0.002, 0.02, 0.2])
-def test_colours_of_the_visible_samples_are_within_the_error(rays, samples, error):
+def test_colors_of_the_visible_samples_are_within_the_error(rays, samples, error):
     grid = checked_grid()
     kept = visible(scene, grid, rays, samples, error=error)
     occupied = np.asarray(is_occupied(grid, rays, samples.t) & (samples.delta > 0))
@@ -315,32 +315,32 @@ def test_colours_of_the_visible_samples_are_within_the_error(rays, samples, erro
 
 
 @compiled
-def visible_in_ball(density, colour, rays, samples):
+def visible_in_ball(density, color, rays, samples):
     """Returns a ball's visible samples before white for an error of 0.002, and colours of all and of these."""
 
     def ball(x, viewdirs):
         inside = (x**2).sum(axis=-1) < 1
-        return jnp.where(inside, density, 0.0), jnp.broadcast_to(colour, x.shape)
+        return jnp.where(inside, density, 0.0), jnp.broadcast_to(color, x.shape)
 
     options = {"error": 0.002, "max_samples": 100, "background": jnp.ones(3)}
     kept = packed_module.visible_samples(ball, full_grid(), rays, samples, **options)
     fewer = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
-    colours = [jaxnerf.render_samples(ball, rays, chosen, background=jnp.ones(3)).rgb for chosen in (samples, fewer)]
-    return kept, *colours
+    colors = [jaxnerf.render_samples(ball, rays, chosen, background=jnp.ones(3)).rgb for chosen in (samples, fewer)]
+    return kept, *colors
 
 
-def test_white_fog_before_white_is_not_needed_and_a_body_of_one_colour_is(rays, samples):
+def test_white_fog_before_white_is_not_needed_and_a_body_of_one_color_is(rays, samples):
     """Also where the body is divided among many samples, each of which could be dropped on its own."""
     for density in (0.05, 0.5):
         kept, _, _ = visible_in_ball(density, jnp.ones(3), rays, samples)
         assert not kept.any()
-    for density, colour in itertools.product((0.3, 3.0, 30.0, 1e6), ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
-        kept, whole, fewer = visible_in_ball(density, jnp.float32(colour), rays, samples)
+    for density, color in itertools.product((0.3, 3.0, 30.0, 1e6), ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
+        kept, whole, fewer = visible_in_ball(density, jnp.float32(color), rays, samples)
         assert kept.any()
         np.testing.assert_allclose(fewer, whole, atol=0.0021)
 
 
-def test_opaque_samples_are_needed_whatever_their_colour(rays, samples):
+def test_opaque_samples_are_needed_whatever_their_color(rays, samples):
     wall = lambda x, viewdirs: (jnp.full(x.shape[:-1], 1e6), jnp.ones_like(x))  # noqa: E731
     kept = visible(wall, full_grid(), rays, samples, background=np.ones(3))
     np.testing.assert_array_equal(kept.sum(axis=-1), 1)

@@ -83,8 +83,8 @@ def test_nan_in_a_ray_shows_and_stays_in_its_ray(broken, contracted):
         renderings = [render(ball, grid, rays).rgb for render in (training, image, packed)]
         return [*renderings, clear.rgb, given.rgb[:6], given.rgb[-1:]], rays_may_hit(grid, rays, cell=CELL)
 
-    colours, may_hit = render(grid, broken)
-    for rgb in colours:
+    colors, may_hit = render(grid, broken)
+    for rgb in colors:
         np.testing.assert_array_equal(np.isnan(rgb).any(axis=-1), np.arange(9)[-len(rgb) :] < 8 if len(rgb) != 6 else 1)
         assert len(rgb) == 6 or (np.asarray(rgb)[-1] > 0.1).all()
     assert may_hit.all()

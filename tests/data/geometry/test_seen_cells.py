@@ -125,7 +125,7 @@ def test_a_lens_that_shows_nothing_is_an_error():
 @pytest.mark.parametrize("contracted", [False, True])
 def test_the_space_in_front_of_the_stated_depth_is_free(contracted):
     schedule = a_schedule(contracted=contracted)
-    views = some_views((0.0, 0.0), free_until=np.float32([1.9, 1.9]))
+    views = some_views((0.0, 0.0), free_depth=np.float32([1.9, 1.9]))
     _, free = seen_cells(views, schedule, min_views=1)
     depth = -centers(schedule)[..., 2]  # the same in the inner half of a contracted box
     inside = in_view(centers(schedule), 0.0, -0.15)
@@ -135,7 +135,7 @@ def test_the_space_in_front_of_the_stated_depth_is_free(contracted):
 
 def test_two_views_that_see_a_cell_must_agree_that_it_is_free():
     schedule = a_schedule()
-    x, views = centers(schedule), some_views((0.0, 0.5), free_until=np.float32([3.0, 0.0]))
+    x, views = centers(schedule), some_views((0.0, 0.5), free_depth=np.float32([3.0, 0.0]))
     _, free = seen_cells(views, schedule, min_views=1)
     near = (np.linalg.norm(x, axis=-1) > 2.6) & (-x[..., 2] < 2.8)  # and not within 2.25 of the first camera
     both, alone = (in_view(x, 0.0, -0.15) & seen & near for seen in (in_view(x, 0.5, -0.15), ~in_view(x, 0.5, 0.3)))
@@ -147,7 +147,7 @@ def test_two_views_that_see_a_cell_must_agree_that_it_is_free():
 def test_the_space_around_a_camera_is_free(contracted):
     """Also beside it and behind it, where only other cameras see."""
     schedule = a_schedule(contracted=contracted)
-    views = some_views((-0.5, 0.5), free_until=np.float32([0.8, 1.6]))
+    views = some_views((-0.5, 0.5), free_depth=np.float32([0.8, 1.6]))
     _, free = seen_cells(views, schedule, min_views=1)
     x = centers(schedule)
     distance = np.stack([np.linalg.norm(x - [eye, 0, 0], axis=-1) for eye in (-0.5, 0.5)])
@@ -159,7 +159,7 @@ def test_the_space_around_a_camera_is_free(contracted):
 
 def test_the_nearest_points_bound_the_space_around_a_camera():
     """Points that a camera does not see count, too, unless there are so few that they may be wrong."""
-    views = with_wall(some_views(free_until=np.float32([1.0, 8.0])))
+    views = with_wall(some_views(free_depth=np.float32([1.0, 8.0])))
     to_wall = np.sort(np.linalg.norm(views.sparse.positions - views.cameras.to_world[1, :, 3], axis=-1))[15]
     np.testing.assert_allclose(clear_radii(views), 0.75 * np.array([1.0, to_wall]), rtol=1e-6)
     behind = np.float32([0.25, 0, 0.5]) + 1e-3 * np.arange(16, dtype=np.float32)[:, None]
@@ -169,15 +169,15 @@ def test_the_nearest_points_bound_the_space_around_a_camera():
         assert clear_radii(more)[1] == pytest.approx(0.75 * nearest, rel=0.05)
     few = dataclasses.replace(views.sparse, positions=views.sparse.positions[:15])
     np.testing.assert_allclose(clear_radii(dataclasses.replace(views, sparse=few)), [0.75, 6.0])
-    unknown = some_views(free_until=np.float32([0.0, 0.0]))
-    for free_until in (None, unknown.free_until):
-        alone = clear_radii(dataclasses.replace(views, free_until=free_until))
+    unknown = some_views(free_depth=np.float32([0.0, 0.0]))
+    for free_depth in (None, unknown.free_depth):
+        alone = clear_radii(dataclasses.replace(views, free_depth=free_depth))
         np.testing.assert_allclose(alone[1], 0.75 * to_wall, rtol=1e-6)
-        np.testing.assert_array_equal(clear_radii(dataclasses.replace(unknown, free_until=free_until)), [0, 0])
+        np.testing.assert_array_equal(clear_radii(dataclasses.replace(unknown, free_depth=free_depth)), [0, 0])
 
 
 def test_surface_range_holds_the_wall_and_ignores_a_wrong_point():
-    views = with_wall(some_views(free_until=np.float32([0.3, 0.4])))
+    views = with_wall(some_views(free_depth=np.float32([0.3, 0.4])))
     pixels = np.float32([[24, 24], [24, 12], [14, 30], [0.5, 0.5]])
     for view in (0, 1):
         near, far = surface_range(views, view, pixels)
@@ -203,7 +203,7 @@ def test_cells_between_cameras_and_surfaces_are_likely_to_be_empty():
 
 
 def test_training_starts_from_what_is_known():
-    views, schedule = with_wall(some_views(free_until=np.float32([1.0, 1.0]))), a_schedule()
+    views, schedule = with_wall(some_views(free_depth=np.float32([1.0, 1.0]))), a_schedule()
     cells, _, indices = active_region(views, schedule, use_alpha=False, min_views=1)
     grid = schedule.create(*cells)
     assert cells.empty.any() and not (cells.empty & ~cells.valid).any()

@@ -81,7 +81,7 @@ def test_shrinking_commutes_with_compositing(dtype, background):
     assert np.abs(found - expected).max() < 1e-5
 
 
-def test_invisible_colour_does_not_bleed_over_an_edge():
+def test_invisible_color_does_not_bleed_over_an_edge():
     pixels = np.zeros((2, 2, 4), np.uint8)
     pixels[:, 0] = 200, 100, 0, 255  # the other column is transparent black
     shrunk = average_tiles(pixels, 2)[0, 0] / 65535
@@ -107,7 +107,7 @@ def test_sixteen_bits_survive(tmp_path, channels):
     np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), pixels)
 
 
-def test_grey_and_palette_become_colour(tmp_path):
+def test_grey_and_palette_become_color(tmp_path):
     grey = Image.fromarray(_pixels(0, (5, 7)))
     grey.save(tmp_path / "grey.png")
     np.testing.assert_array_equal(read_image(tmp_path / "grey.png"), np.asarray(grey)[..., None].repeat(3, -1))

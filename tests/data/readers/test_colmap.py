@@ -60,8 +60,8 @@ def binary(cameras, images, points):
     for key, motion, camera, name, seen in images:
         second += struct.pack("<I7dI", key, *motion, camera) + name.encode() + b"\0"
         second += struct.pack("<Q", len(seen)) + b"".join(struct.pack("<ddq", *row) for row in seen)
-    for key, place, colour, error, track in points:
-        third += struct.pack("<Q3d3BdQ", key, *place, *colour, error, len(track) // 2)
+    for key, place, color, error, track in points:
+        third += struct.pack("<Q3d3BdQ", key, *place, *color, error, len(track) // 2)
         third += struct.pack(f"<{len(track)}I", *track)
     return {"cameras.bin": first, "images.bin": second, "points3D.bin": third}
 
@@ -78,8 +78,8 @@ def text(cameras, images, points):
         first += line(key, name, width, height, *params)
     for key, motion, camera, name, seen in images:
         second += line(key, *motion, camera, name) + line(*(value for row in seen for value in row))
-    for key, place, colour, error, track in points:
-        third += line(key, *place, *colour, error, *track)
+    for key, place, color, error, track in points:
+        third += line(key, *place, *color, error, *track)
     return {"cameras.txt": first.encode(), "images.txt": second.encode(), "points3D.txt": third.encode()}
 
 
