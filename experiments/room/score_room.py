@@ -44,7 +44,7 @@ HEADS = (
     *("depth error, units", "in cells", "weight in free space", "more than 4 cells in front of the surface"),
 )
 PLACES = {"val": "near the path", "test": "far novel"}
-_WITNESSES = 2  # training views that see a surface
+_MIN_SEEN = 2  # training views that see a surface
 _FREE = {"free_weight": 1, "free_weight_4_cells": 4}  # cells from the surface at which free space ends
 _NUM_SAMPLES = 512  # positions on the part of a ray in free space
 
@@ -129,7 +129,7 @@ def _score_view(run, variables, optical_depths, views, index, truth, num_rays):
         raise ValueError(f"{name} has {width} x {height} px, expected those of the ground truth; train with factor 1")
     rays = run.experiment.view_rays(views, index, pixel_grid(height, width))
     image = run.render_image(variables, rays)
-    seen = truth.num_seen[known] >= _WITNESSES
+    seen = truth.num_seen[known] >= _MIN_SEEN
     target = reference(views, index)
     metrics = image_metrics(image.rgb, target)
     unit = unit_of(views)  # of the run's world, in the capture's

@@ -1,8 +1,8 @@
 """Captures of the embedded room as a phone makes them, written as a dataset with its ground truth beside it.
 
-A camera is carried around the table and looks roughly at it. Further views, which no training view is close to, show
-what free space and depth are worth. Everything that a real capture leaves unknown is in ground_truth.npz: poses,
-exposures, the depth of every pixel, and how many training views see its surface.
+A camera is carried around the table and looks roughly at it. Further views, which no training view is close to, measure
+the reconstruction of free space and depth. ground_truth.npz holds what is unknown for a real capture: poses, exposures,
+the depth of every pixel, and how many training views see its surface.
 """
 
 import json
@@ -18,6 +18,7 @@ from PIL import Image
 
 from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.types import Camera
+from jaxnerf.exporters.points import write_ply
 from jaxnerf.runtime.atomic_files import open_regular, partial_file, write_text
 from test_scenes import room
 
@@ -30,7 +31,7 @@ _FAR_ARC = 135.0  # the same, of the far views
 _APART = 0.5  # world units from a far view to the nearest training view
 _CLEARANCE = 0.15  # world units of free space around every camera
 _NEAREST = 0.3  # world units from a far view to what it shows
-_WITNESSES = 2  # training views that see a surface which a far view may show
+_MIN_SEEN = 2  # training views that must see a surface for a far view to show it
 _SEEN_FRACTION = 0.9  # of a far view's pixels
 _SAME_DEPTH = 0.03  # relative difference of depths that are of one surface
 _POINT_NOISE = 0.002  # standard deviation of a sparse point's position, over its depth
@@ -144,7 +145,7 @@ def write_capture(
         rgb = np.stack([_dots(x, repetition) for x in surfaces]).reshape(rgb.shape)
     num_seen = np.zeros(depth.shape, np.uint16)
     for index in range(num_views, len(poses)):
-        seen = _sightings(_surface(lens, poses[index], depth[index]), lens, *train)
+        seen = _seen_by(_surface(lens, poses[index], depth[index]), lens, *train)
         num_seen[index] = seen.sum(axis=0).reshape(height, width)
     gains = np.ones((len(poses), 3))
     gains[:num_views] = _gains(num_views, exposure, white_balance, seed)
@@ -181,7 +182,7 @@ def _check(folder, counts, width, height, image_format):
 
 
 class _Lens(NamedTuple):
-    """The intrinsics that all views share.
+    """The intrinsics of all views.
 
     Attributes:
         width, height: px.
@@ -240,7 +241,7 @@ def _dots(x, period):
     return np.array([0.85, 0.8, 0.7]) + shade * (np.array([0.25, 0.2, 0.35]) - [0.85, 0.8, 0.7])
 
 
-def _sightings(x, lens, poses, depths):
+def _seen_by(x, lens, poses, depths):
     """Returns [V, N], whether views with given depth maps see points [N, 3]."""
     seen = np.zeros((len(poses), len(x)), bool)
     k1, k2, p1, p2 = lens.distortion
@@ -302,8 +303,8 @@ def _far_poses(count, lens, poses, depths, seed):
             depth = room.trace(np.broadcast_to(pose[:, 3], directions.shape), directions).t
             if depth.min() < _NEAREST:
                 continue
-            seen = _sightings(_surface(coarse, pose, depth), lens, poses, depths).sum(axis=0)
-            if (seen >= _WITNESSES).mean() >= _SEEN_FRACTION:
+            seen = _seen_by(_surface(coarse, pose, depth), lens, poses, depths).sum(axis=0)
+            if (seen >= _MIN_SEEN).mean() >= _SEEN_FRACTION:
                 chosen.append(pose)
                 break
         else:
@@ -381,7 +382,7 @@ def _sparse_points(count, lens, rgb, poses, depths, seed):
         found.append(_surface(lens, pose, depth)[index] + noise)
         colors.append(np.uint8(np.rint(255 * image.reshape(-1, 3)[index])))
     xyz, colors = np.concatenate(found), np.concatenate(colors)
-    seen = _sightings(xyz, lens, poses, depths)
+    seen = _seen_by(xyz, lens, poses, depths)
     kept = np.flatnonzero(seen.sum(axis=0) >= 3)
     kept = np.sort(rng.permutation(kept)[:count])
     return xyz[kept], colors[kept], seen[:, kept]
@@ -398,7 +399,9 @@ def _write(folder, truth, rgb, colors, image_format):
     with partial_file(folder / GROUND_TRUTH, suffix=".tmp.npz") as partial:
         np.savez_compressed(partial, **truth._asdict())
     if len(truth.points):
-        _write_points(folder / "sparse_pc.ply", truth.points, colors)
+        properties = dict(zip("xyz", truth.points.T, strict=True))
+        with partial_file(folder / "sparse_pc.ply") as partial:
+            write_ply(partial, properties | dict(zip(("red", "green", "blue"), colors.T, strict=True)))
     write_text(folder / "transforms.json", json.dumps(_transforms(truth, image_format), indent=1) + "\n")
 
 
@@ -421,15 +424,3 @@ def _transforms(truth, image_format):
         for path, pose in zip(paths, poses, strict=True)
     ]
     return content
-
-
-def _write_points(path, xyz, colors):
-    columns = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.zeros(len(xyz), columns)
-    for index, (name, _) in enumerate(columns):
-        rows[name] = xyz[:, index] if index < 3 else colors[:, index - 3]
-    kinds = {"<f4": "float", "u1": "uchar"}
-    properties = "".join(f"property {kinds[kind]} {name}\n" for name, kind in columns)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(xyz)}\n{properties}end_header\n"
-    with partial_file(path) as partial:
-        partial.write_bytes(header.encode() + rows.tobytes())
