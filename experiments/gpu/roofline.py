@@ -47,7 +47,7 @@ class Counts:
         flops: of matrix products, by the type of their operands.
         product_bytes: operands and results of these products.
         gathers, scatters: operations.
-        batch_pixels, scattered: their rows.
+        gathered, scattered: their rows.
         row_bytes: what gathers and scatters move, at least a sector a row; an addition reads and writes.
         other_bytes: results of all other operations; those that are fused stay in registers.
         operations: other operations.
@@ -97,7 +97,7 @@ def count(jaxpr) -> Counts:
         elif name == "gather":
             indices = equation.invars[1].aval
             rows = indices.size // max(indices.shape[-1] if indices.shape else 1, 1)
-            total.gathers, total.batch_pixels = total.gathers + 1, total.gathered + rows
+            total.gathers, total.gathered = total.gathers + 1, total.gathered + rows
             total.row_bytes += max(sizes[0], profiles.SECTOR * rows) + sizes[0]
         elif name.startswith("scatter"):
             indices, updates = equation.invars[1].aval, equation.invars[2].aval

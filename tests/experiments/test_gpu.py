@@ -22,7 +22,7 @@ def test_counts_of_products_rows_and_loops():
     arguments = jnp.ones((100, 4)), jnp.zeros(8, int), jnp.ones((4, 5))
     counts = roofline.count(jax.make_jaxpr(function)(*arguments).jaxpr)
     assert counts.flops == {"float32": 2 * 8 * 4 * 5 * (3 + 1)}
-    assert (counts.batch_pixels, counts.scattered, counts.conditionals) == (3 * 8, 8, 1)
+    assert (counts.gathered, counts.scattered, counts.conditionals) == (3 * 8, 8, 1)
     # A row has 16 bytes, and a sector 32. What is gathered is written once, and an addition reads and writes.
     assert counts.row_bytes == 3 * (8 * 32 + 8 * 16) + 2 * 8 * 32
 

@@ -165,7 +165,7 @@ def test_an_image_is_compiled_once(chunk, placed, culled):
         return scale * rays.viewdirs[..., 0] > 0, render_background(rays)
 
     def listen(event, seconds, fun_name="", **_):
-        if event.endswith("backend_compile_duration") and fun_name == "jit(colours)":
+        if event.endswith("backend_compile_duration") and fun_name == "jit(colors)":
             compiled.append(seconds)
 
     scale = jax.device_put(jnp.float32(2), jax.devices()[0] if placed else None)

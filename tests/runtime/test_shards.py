@@ -80,17 +80,17 @@ def test_shards_in_any_order_give_the_result_of_one_call(fresh, whole, rendered)
 
 def test_an_interrupted_call_loses_only_the_view_that_it_rendered(fresh, whole, rendered, monkeypatch):
     score, folder = fresh
-    finish = aggregate.finish
+    finish = aggregate.mark_finished
 
     def stopped(folder, index, *rest, **options):
         if index == 2:
             raise KeyboardInterrupt
         finish(folder, index, *rest, **options)
 
-    monkeypatch.setattr(aggregate, "finish", stopped)
+    monkeypatch.setattr(aggregate, "mark_finished", stopped)
     with pytest.raises(KeyboardInterrupt):
         score()
-    monkeypatch.setattr(aggregate, "finish", finish)
+    monkeypatch.setattr(aggregate, "mark_finished", finish)
     (folder / "20.tmp" / "rows" / "005.json.0a1b.tmp").write_text("{")  # as a kill leaves it
     assert len(rendered) == 3 and not (folder / "20").exists()
     assert without_times(score()) == without_times(whole[0])
