@@ -135,7 +135,7 @@ def judge_focal(capture: Capture, evidence: Evidence) -> tuple[list[Finding], Ev
 def judge_views(capture: Capture, evidence: Evidence) -> list[Finding]:
     """Returns Findings about images that do not belong to their cameras: swapped, or with a wrong pose.
 
-    An image is accused only if another pose explains several times as many guided matches, see `view_evidence`.
+    An image is flagged only if another pose explains several times as many guided matches, see `view_evidence`.
     """
     views = range(len(capture.frames))
     fit, matches = np.array([_fits(evidence, view, view) for view in views]).T
@@ -145,13 +145,13 @@ def judge_views(capture: Capture, evidence: Evidence) -> list[Finding]:
         return _judge_all(capture, evidence)
     odd = [view for view in views if fraction[view] < _UNUSUAL * usual and len(evidence.keypoints[view].points)]
     found = {view: find_alternative(evidence, view, without=odd) for view in odd}
-    accused = {view: other for view, other in found.items() if other and _is_certain(capture, evidence, view, other)}
-    findings, left = [], set(accused)
-    for first, second in itertools.combinations(accused, 2):
-        if {first, second} <= left and _are_swapped(evidence.poses, first, second, accused):
-            findings.append(_swap(capture, first, second, accused))
+    flagged = {view: other for view, other in found.items() if other and _is_certain(capture, evidence, view, other)}
+    findings, left = [], set(flagged)
+    for first, second in itertools.combinations(flagged, 2):
+        if {first, second} <= left and _are_swapped(evidence.poses, first, second, flagged):
+            findings.append(_swap(capture, first, second, flagged))
             left -= {first, second}
-    findings += [_wrong_pose(capture, evidence, view, accused[view]) for view in sorted(left)]
+    findings += [_wrong_pose(capture, evidence, view, flagged[view]) for view in sorted(left)]
     return findings + [_unknown(capture, view) for view in odd if matches[view] < _MIN_CIRCLES]
 
 
@@ -235,7 +235,7 @@ def _fitting(tracks, poses, scale):
 
 
 def _is_certain(capture, evidence, view, other):
-    """Returns whether an Alternative is enough to accuse an image."""
+    """Returns whether an Alternative is enough to flag an image."""
     limit = _OWN_FRACTION
     if len(_track_errors(capture, evidence, view)) >= _MIN_OBSERVATIONS:
         limit = _OWN_FRACTION_IN_MODEL if np.median(_track_errors(capture, evidence, view)) < INLIER else limit
@@ -256,12 +256,12 @@ def _track_errors(capture, evidence, view):
     return np.where(np.asarray(depth) > 0, np.nan_to_num(off, nan=np.inf) * scale, np.inf)
 
 
-def _are_swapped(poses, first, second, accused):
+def _are_swapped(poses, first, second, flagged):
     """Returns whether each of two images was taken from about the place of the other's camera."""
     eyes = poses[:, :, 3]
     apart = np.linalg.norm(eyes[first] - eyes[second])
     off = [
-        np.linalg.norm(accused[image].pose[:, 3] - eyes[camera]) for image, camera in ((first, second), (second, first))
+        np.linalg.norm(flagged[image].pose[:, 3] - eyes[camera]) for image, camera in ((first, second), (second, first))
     ]
     return max(off) < 0.3 * apart
 
@@ -279,9 +279,9 @@ def _confidence(other):
     return 0.5 + 0.5 * math.erf((other.other.matches - other.own.matches) / spread / math.sqrt(2))
 
 
-def _swap(capture, first, second, accused):
+def _swap(capture, first, second, flagged):
     one, two = capture.frames[first].image, capture.frames[second].image
-    found = f"{one} and {two} each show the view of the other's camera: of the first, {_numbers(accused[first])}"
+    found = f"{one} and {two} each show the view of the other's camera: of the first, {_numbers(flagged[first])}"
     expected, change = "each image at its own camera", "rename the two files to each other"
     return Finding("error", "swap", found, expected, change, (first, second))
 

@@ -70,8 +70,8 @@ def judge_folds(capture: Capture, evidence: Evidence, doubtful: Collection[int])
 
 def _belongs(evidence, group):
     """Returns whether the first image of a group fits the camera of one of the next two, and others fit, too."""
-    own = any(_agree(evidence, group[0], other) for other in group[1:3])
-    return own and sum(_agree(evidence, *pair) for pair in itertools.pairwise(group)) >= _MIN_AGREEING
+    first_agrees = any(_agree(evidence, group[0], other) for other in group[1:3])
+    return first_agrees and sum(_agree(evidence, *pair) for pair in itertools.pairwise(group)) >= _MIN_AGREEING
 
 
 def _agree(evidence, first, second):

@@ -83,8 +83,8 @@ def inspect(
         views = cameras.judge_views(capture, evidence)
         findings += focal + views
         if not wrong:
-            accused = {index for finding in views for index in finding.frames if finding.severity == "error"}
-            findings += folds.judge_folds(capture, evidence, accused)
+            flagged = {index for finding in views for index in finding.frames if finding.severity == "error"}
+            findings += folds.judge_folds(capture, evidence, flagged)
     findings += wrong
     points, point_tracks = cameras.points_of(evidence)
     bounds, stated = depths.ranges(capture, near, far)

@@ -3,7 +3,7 @@
 Matches that ignore the cameras are often wrong where a texture repeats itself, and may even agree with each other.
 Guided matches are therefore counted instead: among the corners near the epipolar line that a pose defines, the
 nearest descriptor must be unambiguous. As many are found by chance where the descriptors of an image are exchanged
-among its corners; that number is subtracted. An image is accused only if another pose, estimated from points that
+among its corners; that number is subtracted. An image is flagged only if another pose, estimated from points that
 other cameras agree on, explains several times as many of them as its own does.
 """
 
@@ -58,11 +58,11 @@ def find_alternative(evidence: Evidence, view: int, *, without: Sequence[int] = 
     Args:
         evidence: see `cameras.gather`.
         view: of the image.
-        without: views that are doubtful, too, and testify neither for nor against it.
+        without: views that are doubtful, too, and do not count.
     """
     doubtful = {view, *without}
-    witnesses = _similar(evidence.keypoints, view, doubtful)
-    points, places, sources = _known_points(evidence, view, witnesses, doubtful)
+    similar = _similar(evidence.keypoints, view, doubtful)
+    points, places, sources = _known_points(evidence, view, similar, doubtful)
     if len(points) < _MIN_POINTS:
         return None
     found = _estimate_pose(points, places, INLIER / evidence.scale[view])
@@ -71,21 +71,21 @@ def find_alternative(evidence: Evidence, view: int, *, without: Sequence[int] = 
     pose, inliers = found
     if len(np.unique(sources[inliers])) < 2 or len(inliers) < _MIN_POINTS:
         return None
-    own = support(evidence, view, evidence.poses[view], _nearest(evidence.poses, evidence.poses[view], doubtful))
+    stated = support(evidence, view, evidence.poses[view], _nearest(evidence.poses, evidence.poses[view], doubtful))
     other = support(evidence, view, pose, _nearest(evidence.poses, pose, doubtful))
-    return Alternative(pose, own, other, len(inliers))
+    return Alternative(pose, stated, other, len(inliers))
 
 
 def support(
     evidence: Evidence, view: int, pose: Float[np.ndarray, "3 4"], others: Int[np.ndarray, " K"] | Sequence[int]
 ) -> Support:
     """Counts the guided matches of an image, as if taken from a pose, with other cameras."""
-    rng, own = np.random.default_rng(0), evidence.keypoints[view]
+    rng, keypoints = np.random.default_rng(0), evidence.keypoints[view]
     counts = []
     for other in others:
         there, scale = evidence.keypoints[other], (evidence.scale[view], evidence.scale[other])
-        near = _near_lines(own.points, there.points, pose, evidence.poses[other], scale)
-        similarity = own.descriptors @ there.descriptors.T
+        near = _near_lines(keypoints.points, there.points, pose, evidence.poses[other], scale)
+        similarity = keypoints.descriptors @ there.descriptors.T
         chance = [_count(similarity[rng.permutation(len(similarity))], near) for _ in range(_SHUFFLES)]
         counts.append(_count(similarity, near) - np.mean(chance))
     counts = np.array(counts or [0.0])
@@ -128,31 +128,31 @@ def _similar(keypoints, view, doubtful):
     return [int(other) for other in order if counts[other] >= 8]
 
 
-def _known_points(evidence, view, witnesses, doubtful):
+def _known_points(evidence, view, similar, doubtful):
     """Returns points in space [N, 3], where an image shows them [N, 2], and the view through which each is known."""
     points, places, sources = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, int)]
-    own = evidence.keypoints[view]
-    for witness in witnesses:
-        others = [other for other in evidence.near[witness] if other not in doubtful]
+    keypoints = evidence.keypoints[view]
+    for other_view in similar:
+        others = [other for other in evidence.near[other_view] if other not in doubtful]
         if len(others) < 2:
             continue
-        tracks = follow(evidence.keypoints, np.array([others]), first=[witness])
+        tracks = follow(evidence.keypoints, np.array([others]), first=[other_view])
         there, _ = triangulate(tracks, evidence.poses)
         rays = there[:, None] - evidence.poses[tracks.views][..., 3]
         rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
         apart = np.where(tracks.shown, (rays * rays[:, :1]).sum(-1), 1).min(axis=1) < _PARALLAX
         good = apart & (errors(tracks, evidence.poses, evidence.scale) < INLIER)
         known = {tuple(place): point for place, point in zip(tracks.points[good, 0], there[good], strict=True)}
-        pairs = match(own, evidence.keypoints[witness])
+        pairs = match(keypoints, evidence.keypoints[other_view])
         found = [
-            (known[place], own.points[index])
+            (known[place], keypoints.points[index])
             for index, other in enumerate(pairs)
-            if other >= 0 and (place := tuple(evidence.keypoints[witness].points[other])) in known
+            if other >= 0 and (place := tuple(evidence.keypoints[other_view].points[other])) in known
         ]
         if found:
             points.append(np.array([point for point, _ in found]))
             places.append(np.array([place for _, place in found]))
-            sources.append(np.full(len(found), witness))
+            sources.append(np.full(len(found), other_view))
     return tuple(np.concatenate(part) for part in (points, places, sources))
 
 

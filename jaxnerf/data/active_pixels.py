@@ -215,16 +215,16 @@ def _slice(views, index):
 
 def _unmasked(views, index):
     """Returns which pixels [H, W] of a view belong to batches."""
-    own, size = _slice(views, index)
-    return np.ones(size, bool) if views.mask is None else np.asarray(views.mask[own]).reshape(size)
+    pixels, size = _slice(views, index)
+    return np.ones(size, bool) if views.mask is None else np.asarray(views.mask[pixels]).reshape(size)
 
 
 def _has_alpha(views, index):
     """Returns which pixels [H, W] of a view have alpha > 0; none if the views have no alpha."""
-    own, size = _slice(views, index)
+    pixels, size = _slice(views, index)
     if views.pixels.shape[-1] != 4:
         return np.zeros(size, bool)
-    return np.asarray(views.pixels[own, 3] > 0).reshape(size)
+    return np.asarray(views.pixels[pixels, 3] > 0).reshape(size)
 
 
 def _any_of(pixels, side):

@@ -371,7 +371,7 @@ def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -
 def _select_observations(sparse: SparsePoints, indices: np.ndarray) -> SparsePoints:
     """Returns all points with their observations in the views of the given indices, in their order."""
     first, ends = (np.searchsorted(sparse.view, indices, side=side) for side in ("left", "right"))
-    kept = np.concatenate([np.arange(*own) for own in zip(first, ends, strict=True)]).astype(int)
+    kept = np.concatenate([np.arange(*bounds) for bounds in zip(first, ends, strict=True)]).astype(int)
     return dataclasses.replace(
         sparse,
         view=np.repeat(np.arange(len(indices), dtype=np.int32), ends - first),

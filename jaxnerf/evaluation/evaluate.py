@@ -164,8 +164,8 @@ def result_folder(
 
     For a shard it may exist: all shards are then finished, and this one has nothing to do.
     """
-    step, own = newest_step(run, workdir, step), run.experiment.config.eval.split
-    name = str(step) if split in (None, own) else f"{step}-{split}"
+    step, default_split = newest_step(run, workdir, step), run.experiment.config.eval.split
+    name = str(step) if split in (None, default_split) else f"{step}-{split}"
     target = pathlib.Path(workdir) / "eval" / name
     atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(overwrite, shard, target)
@@ -200,7 +200,7 @@ def summary(results: dict[str, Any]) -> str:
 def _score_views(run, render, views, folder, shard):
     """Renders and scores those views of a shard that are not finished."""
     count = len(views.names)
-    frames = shards.own(range(count), shard)
+    frames = shards.indices_of(range(count), shard)
     files = [aggregate.view_files(folder, index, count=count) for index in frames]
     sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
     readable = output_images.readable(files, sizes, is_valid=aggregate.is_finished)

@@ -90,13 +90,13 @@ def _in_strips(image, truth, mask, rows):
     """Computes the metrics of `_whole` from strips of so many rows."""
     errors, similarities = [], []
     for start in range(0, image.shape[0], rows):
-        own, wide = (
+        inner, wide = (
             [None if values is None else values[start:end] for values in (image, truth, mask)]
             for end in (start + rows, start + rows + _SSIM_MARGIN)
         )
-        count = own[0].size if mask is None else int(own[2].sum())
+        count = inner[0].size if mask is None else int(inner[2].sum())
         if count:
-            errors.append((count, _mean_square_errors(*own)))
+            errors.append((count, _mean_square_errors(*inner)))
         if len(wide[0]) > _SSIM_MARGIN:
             similarities.append((len(wide[0]) - _SSIM_MARGIN, _similarity(*wide)))
     means = {

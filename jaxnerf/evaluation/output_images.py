@@ -89,8 +89,8 @@ def straight_alpha(rgb: ArrayLike, opacity: ArrayLike, background: Sequence[floa
         background: [3], or None for black.
     """
     alpha = to_8_bits(opacity)[..., None] / 255  # rounded first, so that the colour compensates for the rounding
-    own = np.asarray(rgb) - (1 - alpha) * np.asarray((0.0, 0.0, 0.0) if background is None else background)
-    straight = np.where(alpha > 0, own / np.maximum(alpha, 1 / 255), 0)
+    emitted = np.asarray(rgb) - (1 - alpha) * np.asarray((0.0, 0.0, 0.0) if background is None else background)
+    straight = np.where(alpha > 0, emitted / np.maximum(alpha, 1 / 255), 0)
     return to_8_bits(np.concatenate([straight, alpha], axis=-1))
 
 

@@ -94,8 +94,8 @@ def cheapest_settings(
         ValueError: if none is within the budget; says how close the best comes.
     """
     if sample_multipliers is None:
-        own = restore_run(workdir, config, data_dir=data_dir, settings=settings).experiment.config.eval
-        sample_multipliers = [own.sample_multiplier * fraction for fraction in _FRACTIONS]
+        options = restore_run(workdir, config, data_dir=data_dir, settings=settings).experiment.config.eval
+        sample_multipliers = [options.sample_multiplier * fraction for fraction in _FRACTIONS]
     exact = restore_run(workdir, config, data_dir=data_dir, settings={**(settings or {}), **_EXACT})
     experiment = exact.experiment
     views = experiment.load_split(split or experiment.config.eval.split)

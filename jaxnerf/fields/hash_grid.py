@@ -379,8 +379,8 @@ def _stored(values):
     On a CPU, XLA would otherwise compute them again in the loops of each level and vertex, which it then does not
     vectorize. It never computes a reduction twice, hence a sum with zeros; an optimization_barrier does not help.
     """
-    own = jnp.eye(len(values), dtype=bool)[..., None]
-    return list(jnp.where(own, jnp.stack(values)[None], 0).sum(axis=1))
+    diagonal = jnp.eye(len(values), dtype=bool)[..., None]
+    return list(jnp.where(diagonal, jnp.stack(values)[None], 0).sum(axis=1))
 
 
 @jax.custom_jvp

@@ -80,12 +80,12 @@ def finished_still_life(x: Positions, viewdirs: Directions, finish: str) -> Outp
     direction = viewdirs[..., 0], viewdirs[..., 1], viewdirs[..., 2]
     density, total_part, rgb = 0.0, 0.0, (0.0, 0.0, 0.0)
     for body in BODIES:
-        own = body.density(body.distance(*place))
+        density_of_body = body.density(body.distance(*place))
         color = body.color(*place, direction if body.name in FINISHES[finish] else None)
         # Far from all bodies the densities are 0 in float32. The tiny part keeps the colour from being 0 / 0,
         # and its square, which the gradient divides by, from being 0.
-        part = own + 1e-12
-        density, total_part = density + own, total_part + part
+        part = density_of_body + 1e-12
+        density, total_part = density + density_of_body, total_part + part
         rgb = tuple(total + part * value for total, value in zip(rgb, color, strict=True))
     # Without the barrier XLA fuses all bodies into the loop that stacks: on a CPU twice as slow.
     rgb = jax.lax.optimization_barrier([total / total_part for total in rgb])

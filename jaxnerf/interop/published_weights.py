@@ -184,11 +184,11 @@ def _reordered(layers, order):
     """Returns JaxNeRF's layers with encoded inputs in our order and, in the trunk, before the activations."""
     result, width = {}, 0
     for name, (kernel, bias) in layers.items():
-        own, encoded = kernel[:width], kernel[width:]
+        hidden, encoded = kernel[:width], kernel[width:]
         if name.startswith("trunk_"):
-            kernel = np.concatenate([encoded[order(len(encoded))], own])
+            kernel = np.concatenate([encoded[order(len(encoded))], hidden])
         elif name == "view":
-            kernel = np.concatenate([own, encoded[order(len(encoded))]])
+            kernel = np.concatenate([hidden, encoded[order(len(encoded))]])
         result[name] = kernel, bias
         width = width if name == "density" else len(bias)
     return result

@@ -64,8 +64,8 @@ def compile_step(
         axes = {"in_axes": (None, None, 0), "out_axes": None}
         step = functools.partial(train_step, axis_name="batch")
         jitted = jax.pmap(step, "batch", devices=devices, donate_argnums=0, **axes)
-        own = [index for index, device in enumerate(devices) if device.process_index == jax.process_index()]
-        positions = positions[own]
+        local = [index for index, device in enumerate(devices) if device.process_index == jax.process_index()]
+        positions = positions[local]
     else:
         jitted = _sharded(train_step, mesh)
         positions = place(positions, NamedSharding(mesh, P("batch")))

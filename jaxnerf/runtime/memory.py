@@ -54,11 +54,11 @@ def _host_available(system="/"):
     try:
         lines = (system / "proc/meminfo").read_text().splitlines()
         found += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-        own = (system / "proc/self/cgroup").read_text().strip().rpartition("::")[2].strip("/")
+        group_path = (system / "proc/self/cgroup").read_text().strip().rpartition("::")[2].strip("/")
     except OSError:  # not Linux
         return found
     folder = system / "sys/fs/cgroup"
-    for group in {folder, folder / own, *(folder / own).parents} - set(folder.parents):
+    for group in {folder, folder / group_path, *(folder / group_path).parents} - set(folder.parents):
         try:
             limit, used = ((group / f"memory.{name}").read_text().strip() for name in ("max", "current"))
             stats = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())

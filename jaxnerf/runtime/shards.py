@@ -43,7 +43,7 @@ def parse(text: str | None) -> tuple[int, int]:
     return index, count
 
 
-def own(indices: Iterable[int], shard: tuple[int, int]) -> list[int]:
+def indices_of(indices: Iterable[int], shard: tuple[int, int]) -> list[int]:
     """Returns the indices of a shard's frames: every count-th, so that all shards take about the same time."""
     return [index for index in indices if index % shard[1] == shard[0]]
 

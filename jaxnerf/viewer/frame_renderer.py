@@ -98,10 +98,10 @@ class FrameRenderer:
             views: of the split "train", for NDC and, where space is contracted, for near and far.
             chunk: rays rendered at once; None: as many as suit the device.
         """
-        own = run.experiment.config.eval
+        options = run.experiment.config.eval
         fast = {
-            "sample_multiplier": own.sample_multiplier * _FAST_SAMPLES,
-            "early_stop_eps": max(own.early_stop_eps, _FAST_STOP),
+            "sample_multiplier": options.sample_multiplier * _FAST_SAMPLES,
+            "early_stop_eps": max(options.early_stop_eps, _FAST_STOP),
         }
         models = {False: run.model_with({}), True: run.model_with(fast)}
         self._baked, self._cull = models[False].grid_schedule is None, models[False].cull

@@ -79,7 +79,7 @@ def test_swapped_images_are_named():
 
 
 @pytest.mark.parametrize("kinds", [None, 1, 3, 12])
-def test_no_image_with_a_right_pose_is_accused(kinds):
+def test_no_image_with_a_right_pose_is_flagged(kinds):
     found = evidence(kinds)
     assert not cameras.judge_views(capture(), found)
     for view in (0, 4):

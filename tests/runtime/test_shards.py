@@ -215,8 +215,8 @@ def test_shards_of_a_path_make_its_video_when_all_frames_exist(run, rendered, tm
 
 def test_the_flag_names_a_shard_by_index_and_count(monkeypatch):
     assert shards.parse(None) == shards.parse("0/1") == (0, 1) and shards.parse("3/16") == (3, 16)
-    assert sorted(sum((shards.own(range(7), (k, 3)) for k in range(3)), [])) == list(range(7))
-    assert shards.own(range(2), (2, 3)) == []
+    assert sorted(sum((shards.indices_of(range(7), (k, 3)) for k in range(3)), [])) == list(range(7))
+    assert shards.indices_of(range(2), (2, 3)) == []
     for wrong in ("16/16", "1", "-1/2", "1/0", "0/0", "a/b", "1/2/3", "", " 1/2"):
         with pytest.raises(ValueError, match="--shard is .*, expected K/N with K from 0 below N"):
             shards.parse(wrong)

@@ -379,20 +379,20 @@ def _evaluate(function, scene, rays, t, ray_index, used, delta):
     first = ray_index[0]
     t = jnp.where(used, t, jnp.where(used[0], t[0], rays.near[first]))
     index = jnp.where(used, ray_index, first)
-    own = jax.tree.map(lambda leaf: leaf[index], rays)
-    x = own.origins + t[:, None] * own.directions
+    sample_rays = jax.tree.map(lambda leaf: leaf[index], rays)
+    x = sample_rays.origins + t[:, None] * sample_rays.directions
     x = jnp.where(used[:, None], x, jax.lax.stop_gradient(x))[None]
-    inputs = _packed_inputs(function, scene, own, t, used, delta) if needs_of(scene) else {}
-    density, rgb = scene(x, own.viewdirs[None], **inputs)
+    inputs = _packed_inputs(function, scene, sample_rays, t, used, delta) if needs_of(scene) else {}
+    density, rgb = scene(x, sample_rays.viewdirs[None], **inputs)
     rendering.check_scene_output(function, density, rgb, x)
     return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
 
 
-def _packed_inputs(function, scene, own, t, used, delta: Callable[[], Array]):
+def _packed_inputs(function, scene, sample_rays, t, used, delta: Callable[[], Array]):
     """Returns what the scene asks for at samples [K] of Rays [K], each value [1, K]; see _evaluate."""
     lengths = delta()
     lengths = jnp.where(used, lengths, jnp.where(used[0], lengths[0], 0))
-    inputs = rendering.sample_inputs(function, scene, own, t[:, None], lengths[:, None])
+    inputs = rendering.sample_inputs(function, scene, sample_rays, t[:, None], lengths[:, None])
     values = {name: value.reshape(1, -1) for name, value in inputs.items()}
     return {name: jnp.where(used[None], value, jax.lax.stop_gradient(value)) for name, value in values.items()}
 
@@ -477,8 +477,8 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
         n = num_done[:, None] + row
         used = n < count.at[ray, None].get(mode="fill", fill_value=0)
         ray = jnp.minimum(ray, ray_count - 1)
-        own, some = _nth_samples(rays, samples, words, up_to, ray, n, used)
-        return _sum_run(function, scene, own, some, used, samples.rule, transmittance if median_depth else None)
+        slot_rays, some = _nth_samples(rays, samples, words, up_to, ray, n, used)
+        return _sum_run(function, scene, slot_rays, some, used, samples.rule, transmittance if median_depth else None)
 
     no_ray = jnp.full(slot_count, ray_count)
     none_done = jnp.zeros_like(no_ray)
@@ -545,12 +545,12 @@ def _nth_samples(rays, samples, words, up_to, ray, n, used):
     Unused samples are at the near end of the ray, as in render_samples.
     """
     word = jnp.minimum((up_to[ray, None] <= n[..., None]).sum(axis=-1), words.shape[-1] - 1)
-    own = jax.tree.map(lambda leaf: leaf[ray], rays)
+    slot_rays = jax.tree.map(lambda leaf: leaf[ray], rays)
     ray = ray[:, None]
     flags, end = words[ray, word], up_to[ray, word]
     source = 32 * word + _nth_bit(flags, n - end + _count_bits(flags))
-    t = jnp.where(used, samples.t[ray, source], own.near[:, None])
-    return own, (t, jnp.where(used, samples.delta[ray, source], 0))
+    t = jnp.where(used, samples.t[ray, source], slot_rays.near[:, None])
+    return slot_rays, (t, jnp.where(used, samples.delta[ray, source], 0))
 
 
 def _sum_run(function, scene, rays, samples, used, rule, transmittance):

@@ -77,9 +77,9 @@ def read_capture(folder: Path) -> Capture:
         if split != "train" and not (Path(folder) / f"transforms_{split}.json").is_file():
             continue
         source, content = _read_transforms(folder, split)
-        own = [frame._replace(name=f"{split}/{frame.name}") for frame in _frames(content, source)[0]]
-        splits[split] = tuple(range(len(frames), len(frames) + len(own)))
-        frames += own
+        listed = [frame._replace(name=f"{split}/{frame.name}") for frame in _frames(content, source)[0]]
+        splits[split] = tuple(range(len(frames), len(frames) + len(listed)))
+        frames += listed
     return Capture("blender", Path(folder), tuple(frames), splits)
 
 

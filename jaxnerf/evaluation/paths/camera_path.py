@@ -169,9 +169,9 @@ def _from_file(file, views):
         fps=found.fps,
     )
     same = resize(same, found.width, found.height)
-    own = np.isfinite(found.focal)
-    middle = np.where(own, [same.width / 2, same.height / 2], same.center)
-    focal, center = np.where(own, found.focal, same.focal), found.center
+    is_stated = np.isfinite(found.focal)
+    middle = np.where(is_stated, [same.width / 2, same.height / 2], same.center)
+    focal, center = np.where(is_stated, found.focal, same.focal), found.center
     return same._replace(focal=focal, center=np.where(np.isfinite(center), center, middle))
 
 

@@ -112,7 +112,7 @@ def _write_frames(target, run, variables, views, path, *, rgba, shard):
     def missing():
         return [index for index, group in enumerate(files) if not all(file.is_file() for file in group)]
 
-    frames = shards.own(range(len(files)), shard)
+    frames = shards.indices_of(range(len(files)), shard)
     readable = output_images.readable([files[index] for index in frames], [(path.height, path.width)] * len(frames))
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     if todo:
