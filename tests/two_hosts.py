@@ -30,7 +30,7 @@ def toy_experiment():
     def render(keys, params, grid, rays, step):
         seen = plain.render(keys, params, grid, rays, step)
         full = (rays.origins[:, 0] > 1.0).astype(jnp.int32)
-        return tuple(toy_rendering(one.rgb, full) for one in seen)
+        return {name: toy_rendering(one.rgb, full) for name, one in seen.items()}
 
     def density(params, x, viewdirs):
         return jax.nn.relu(x @ params["w"])[..., 0], x
