@@ -17,9 +17,12 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from skimage import measure
 
 from jaxnerf.core.cameras import project
+from jaxnerf.data.geometry.poses import up_of
+from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.exporters.base import ExportSource, check_memory
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 from jaxnerf.runtime import atomic_files, memory
@@ -52,9 +55,46 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     mesh.remove_unreferenced_vertices()
     path = folder / f"mesh.{settings.format}"
     with atomic_files.naming(path):
-        mesh.export(path)
+        if settings.format == "glb":
+            poses = poses_in_file(np.asarray(source.views.cameras.to_world), source.views.to_file)
+            write_glb(mesh, path, up=up_of(poses))
+        else:
+            mesh.export(path)
     sides = " x ".join(f"{side:.4g}" for side in mesh.extents)
     source.say(f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {sides} in the dataset's units")
+
+
+def write_glb(mesh: trimesh.Trimesh, path: pathlib.Path, *, up: Float[np.ndarray, "3"]) -> None:
+    """Writes a mesh with vertex colours as glTF 2.0 defines it.
+
+    Colours become linear, in float32, as 8 bits of linear light would show bands in dark places. The material is not
+    lit, since the colours hold the light of the scene. A node turns the mesh, whose vertices stay in the units and axes
+    of the dataset's files, so that up is y.
+
+    Args:
+        mesh: with sRGB colours of 8 bits.
+        path: of the file.
+        up: unit vector in the axes of the mesh.
+    """
+    colors = np.asarray(mesh.visual.vertex_colors) / 255
+    rgb = np.where(colors[:, :3] <= 0.04045, colors[:, :3] / 12.92, ((colors[:, :3] + 0.055) / 1.055) ** 2.4)
+    bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    bare.vertex_attributes["_COLOR_0"] = np.float32(np.concatenate([rgb, colors[:, 3:]], axis=1))
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0].as_matrix()
+
+    def complete(tree):
+        # trimesh writes colours in 8 bits only, and other attributes under names that begin with _.
+        for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
+            primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
+            primitive["material"] = 0
+        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # for programs without the extension
+        tree["materials"] = [{"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}]
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+
+    scene = trimesh.Scene()
+    scene.add_geometry(bare, transform=turn)
+    scene.export(path, file_type="glb", include_normals=True, tree_postprocessor=complete)
 
 
 def keep_large_pieces(faces: np.ndarray, fraction: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from jaxnerf.core.types import Camera
 from jaxnerf.exporters import base, splats, surfaces
 from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.exporters.depth import export_depth
-from jaxnerf.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field
+from jaxnerf.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field, write_glb
 from jaxnerf.exporters.points import export_points, thinned
 from jaxnerf.exporters.splats import export_splats, score
 
@@ -72,7 +72,7 @@ def surfaces_of(tmp_path):
     return depth.render_depth_images(None, None)
 
 
-@pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
 def test_a_mesh_is_a_closed_ball_of_two_colors(tmp_path, suffix):
     lines = []
     export_mesh(source_of(format=suffix, say=lines.append), tmp_path)
@@ -84,6 +84,37 @@ def test_a_mesh_is_a_closed_ball_of_two_colors(tmp_path, suffix):
     away = np.abs(mesh.vertices[:, 1] - CENTER[1]) > 0.1
     assert (colors[red & away, 0] > 200).all() and (colors[~red & away, 1] > 200).all()
     assert "triangles" in lines[0]
+
+
+def test_a_glb_has_linear_colors_and_normals_and_stands_on_its_feet(tmp_path):
+    """Dark grey, 60 of 255 in sRGB, is 0.045 in linear light; the dataset's z is up."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=2.0)
+    ball.apply_translation(CENTER)
+    mesh = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=np.tile([60, 60, 60, 255], (len(ball.vertices), 1)))
+    write_glb(mesh, tmp_path / "mesh.glb", up=np.array([0.0, 0.0, 1.0]))
+    content = (tmp_path / "mesh.glb").read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    tree, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    (primitive,) = tree["meshes"][0]["primitives"]
+
+    def read(name):
+        accessor = tree["accessors"][primitive["attributes"][name]]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        assert accessor["componentType"] == 5126  # float32
+        start, count = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), int(accessor["type"][-1])
+        return np.frombuffer(binary, "<f4", accessor["count"] * count, start).reshape(-1, count)
+
+    np.testing.assert_allclose(read("COLOR_0")[:, :3], ((60 / 255 + 0.055) / 1.055) ** 2.4, rtol=1e-5)
+    vertices, normals = read("POSITION"), read("NORMAL")
+    np.testing.assert_allclose(vertices, mesh.vertices, rtol=1e-6)  # in the units and axes of the files
+    np.testing.assert_allclose(normals, (vertices - CENTER) / 2, atol=0.02)
+    material = tree["materials"][primitive["material"]]
+    assert "KHR_materials_unlit" in material["extensions"] and "KHR_materials_unlit" in tree["extensionsUsed"]
+    assert material["pbrMetallicRoughness"] == {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    turned = trimesh.load(tmp_path / "mesh.glb", force="mesh").vertices
+    np.testing.assert_allclose(turned, vertices[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)  # y is up
+    export_mesh(source_of(format="glb"), tmp_path)
+    assert trimesh.load(tmp_path / "mesh.glb", force="mesh").is_watertight
 
 
 def test_a_mesh_is_decimated_on_request(tmp_path):
