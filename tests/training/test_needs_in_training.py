@@ -40,7 +40,8 @@ jaxnerf.register_field("needy", lambda options, box: FIELD)
 
 def config_of(sampler, folder):
     config = smoke_config(max_steps=STEPS, lr_steps=STEPS, save_every=3, log_every=3)
-    config.update_from_flattened_dict(PACKED if sampler == "occupancy" else {"sampling.num_fine": 0, "sampling.num_coarse": 64})
+    dense = {"sampling.num_fine": 0, "sampling.num_coarse": 64}
+    config.update_from_flattened_dict(PACKED if sampler == "occupancy" else dense)
     config.field, config.eval.at_end = "needy", False
     config.data.format, config.data.dir, config.data.background = "auto", str(folder), "white"
     config.data.world, config.data.hold_out = "file", 3
