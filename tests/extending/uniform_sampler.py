@@ -12,6 +12,7 @@ import functools
 
 import jaxnerf
 from jaxnerf.core.types import without_samples
+from jaxnerf.fields.base import field_scene, needs_of_fields
 from jaxnerf.models.base import Model
 
 
@@ -25,7 +26,7 @@ def make_uniform_model(context):
         return {"fine": field.init(key)}
 
     def scene(params, grid):
-        return functools.partial(field.apply, params["fine"])
+        return field_scene(field, params)
 
     def render(keys, params, grid, rays, step):
         """Renders a training batch: a tuple, whose last Rendering is the one that metrics report."""
@@ -43,6 +44,7 @@ def make_uniform_model(context):
         samples_per_ray=num_samples,
         input_layers={"fine": field.input_layers},
         color_layers={"fine": field.color_layers},
+        needs=needs_of_fields(field),  # rays then have what the field asks for, such as the time
     )
 
 

@@ -138,7 +138,7 @@ def test_progress_is_that_of_the_steps_or_of_the_time():
     np.testing.assert_allclose([data.at(step) for step in (0, 2, 5, 10, 12)], [0.35, 0.35, 0.5, 1, 1], rtol=1e-6)
 
 
-def test_a_model_that_asks_for_nothing_has_neither_progress_nor_fields():
+def test_a_model_that_needs_nothing_has_neither_progress_nor_fields():
     config = auto_config.resolve_for_device(smoke_config())[0]
     experiment = build.build(config)
     views = experiment.load_split("train")

@@ -55,7 +55,7 @@ def test_nothing_is_copied_without_a_browser(monkeypatch, tmp_path):
     viewer = live.LiveViewer(tmp_path, port=0)
     started = threading.Event()
     monkeypatch.setattr(viewer, "_run", started.set)
-    monkeypatch.setattr(live, "averaged_params", lambda state: pytest.fail("copied"))
+    monkeypatch.setattr(live, "image_params", lambda state: pytest.fail("copied"))
     for _ in range(3):
         viewer.observe(None, None)
     assert started.wait(10)
