@@ -114,7 +114,7 @@ def in_color(value, x):
 
 @pytest.mark.parametrize("name", FOUR)
 @pytest.mark.parametrize("renderer", RENDERERS)
-def test_a_scene_may_ask_for_one_thing(name, renderer, rays, samples):
+def test_a_scene_may_need_one_thing(name, renderer, rays, samples):
     """Its colour is the value, so a ray shows the weighted mean of the values along it."""
     alone = dataclasses.replace(rays, **{other: None for other in ("radius", "time", "image_index") if other != name})
     got = compiled(functools.partial(RENDERERS[renderer], ONE[name]))(alone, samples)
@@ -281,7 +281,7 @@ def programs(scene, rays, samples):
     return [*texts, str(jax.make_jaxpr(update)(key, full_grid()))]
 
 
-def test_a_scene_that_asks_for_nothing_has_the_same_program(rays, samples):
+def test_a_scene_that_needs_nothing_has_the_same_program(rays, samples):
     """Rays may have the fields or not, and parameters of other names do not count."""
     bare = dataclasses.replace(rays, radius=None, time=None, image_index=None)
 
@@ -296,7 +296,7 @@ def test_a_scene_that_asks_for_nothing_has_the_same_program(rays, samples):
     assert [text.count(" = ") for text in programs(plain, rays, samples)][0] == operations[0]
 
 
-def test_only_what_is_asked_for_is_computed(rays, samples):
+def test_only_what_is_needed_is_computed(rays, samples):
     def at_time(x, viewdirs, *, time):
         return plain(x, viewdirs)
 
@@ -332,7 +332,7 @@ def test_no_rays_and_no_gradient(rays, samples):
     assert jax.grad(total)(0.5) == 0
 
 
-def test_visible_samples_pass_what_a_scene_asks_for(rays, samples):
+def test_visible_samples_pass_what_a_scene_needs(rays, samples):
     def wall(x, viewdirs, *, time, length):
         """Opaque at an even time, empty at an odd one."""
         return 1e4 * (time < 0.5) * (length > 0) + 0 * x[..., 0], 0.5 + 0 * x
@@ -435,7 +435,7 @@ def test_a_cell_is_occupied_if_matter_is_there_at_any_time():
     assert (np.asarray(grid.density_max)[:2] == 10).all() and not np.asarray(grid.density_max)[2:].any()
 
 
-def test_what_a_scene_asks_for_does_not_move_the_points_in_the_cells():
+def test_needs_do_not_move_the_points_in_the_cells():
     def scene(x, viewdirs, *, time=None, length=None):
         return jnp.abs(x).sum(axis=-1), x
 

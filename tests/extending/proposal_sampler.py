@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import jaxnerf
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
+from jaxnerf.fields.base import field_scene, needs_of_fields
 from jaxnerf.models.base import Model
 from jaxnerf.options import Options, at_least, between, option
 
@@ -45,7 +46,7 @@ def make_proposal_model(context):
         return {name: field.init(jax.random.fold_in(key, index)) for index, (name, field) in enumerate(fields.items())}
 
     def scene(params, grid):
-        return functools.partial(fine.apply, params["fine"])
+        return field_scene(fine, params)
 
     def render(keys, params, grid, rays, step):
         """Renders both networks; segments have their samples in the middle, so that the loss finds their ends."""
@@ -66,6 +67,7 @@ def make_proposal_model(context):
         scene=scene,
         samples_per_ray=options.num_samples,
         fields=fields,
+        needs=needs_of_fields(fine),
         image_networks=("fine",),  # the proposal network has no colour that could be compared with images
     )
 

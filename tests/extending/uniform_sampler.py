@@ -13,6 +13,7 @@ import functools
 
 import jaxnerf
 from jaxnerf.core.types import without_samples
+from jaxnerf.fields.base import field_scene, needs_of_fields
 from jaxnerf.models.base import Model
 from jaxnerf.options import Options, at_least, option
 
@@ -34,7 +35,7 @@ def make_uniform_model(context):
         return {"fine": field.init(key)}
 
     def scene(params, grid):
-        return functools.partial(field.apply, params["fine"])
+        return field_scene(field, params)
 
     def render(keys, params, grid, rays, step):
         """Renders a training batch: a dict with the Rendering of each network."""
@@ -51,6 +52,7 @@ def make_uniform_model(context):
         scene=scene,
         samples_per_ray=num_samples,
         fields={"fine": field},
+        needs=needs_of_fields(field),  # rays then have what the field asks for, such as the time
     )
 
 

@@ -40,9 +40,8 @@ jaxnerf.register_field("needy", lambda options, box: FIELD)
 
 def config_of(sampler, folder):
     config = smoke_config(max_steps=STEPS, lr_steps=STEPS, save_every=3, log_every=3)
-    config.update_from_flattened_dict(
-        PACKED if sampler == "occupancy" else {"sampling.num_fine": 0, "sampling.num_coarse": 64}
-    )
+    dense = {"sampling.num_fine": 0, "sampling.num_coarse": 64}
+    config.update_from_flattened_dict(PACKED if sampler == "occupancy" else dense)
     config.field, config.eval.at_end = "needy", False
     config.data.format, config.data.dir, config.data.background = "auto", str(folder), "white"
     config.data.world, config.data.hold_out = "file", 3
@@ -139,7 +138,7 @@ def test_progress_is_that_of_the_steps_or_of_the_time():
     np.testing.assert_allclose([data.at(step) for step in (0, 2, 5, 10, 12)], [0.35, 0.35, 0.5, 1, 1], rtol=1e-6)
 
 
-def test_a_model_that_asks_for_nothing_has_neither_progress_nor_fields():
+def test_a_model_that_needs_nothing_has_neither_progress_nor_fields():
     config = auto_config.resolve_for_device(smoke_config())[0]
     experiment = build.build(config)
     views = experiment.load_split("train")

@@ -1,0 +1,110 @@
+"""The examples of fields that ask for more: they train, and what they ask for improves their images."""
+
+import dataclasses
+import functools
+
+import cone_field
+import moving_bodies
+import numpy as np
+import pytest
+
+import jaxnerf
+from jaxnerf.data.ray_batches import pixel_colors
+from jaxnerf.data.synthetic import load_synthetic
+from runs import smoke_config
+
+NETWORK = {"depth": 4, "width": 64}
+
+
+def config_of(field, steps, **fields):
+    """Returns a config with one network of 4 layers of 64 features."""
+    config = smoke_config(max_steps=steps, lr_steps=steps, save_every=steps, log_every=100)
+    config.update_from_flattened_dict({"field": field, "sampling.num_fine": 0, "train.batch_size": 256, **fields})
+    options = {"skip_layer": 2, "num_freqs": 8, "num_view_freqs": 2}
+    config.cone, config.moving = NETWORK | options, dict(NETWORK)
+    activation = {"view_width": 32, "density_activation": "softplus", "density_bias": -1.0}
+    config.fine.update(NETWORK | options | activation)
+    return config
+
+
+def score(run, views):
+    """Returns the mean PSNR of the last checkpoint over views."""
+    variables, values = run.variables(run.steps()[-1]), []
+    for index, (height, width) in enumerate(views.size):
+        rays = run.experiment.view_rays(views, index, jaxnerf.pixel_grid(int(height), int(width)))
+        first = views.offset[index]
+        truth = pixel_colors(views.pixels[first : first + height * width], views.background)
+        values.append(float(jaxnerf.psnr(run.render_image(variables, rays).rgb, truth.reshape(height, width, 3))))
+    return np.mean(values)
+
+
+def train_at_scales(field, workdir, *, steps, size, num_samples, factors):
+    """Trains on the embedded scene at three resolutions; returns the run's PSNR at some fractions of the largest."""
+    config = config_of(field, steps, **{"data.size": size, "sampling.num_coarse": num_samples, "train.lr_init": 5e-3})
+    assert jaxnerf.train_and_evaluate(config, workdir, views=cone_field.multi_scale(load_synthetic(size=size)))
+    run, test = jaxnerf.restore_run(workdir), load_synthetic(split="test", size=size)
+    return [score(run, cone_field.shrunk(test, factor)) for factor in factors]
+
+
+def test_a_cone_field_learns(tmp_path):
+    (quarter,) = train_at_scales("cone", tmp_path / "run", steps=200, size=32, num_samples=24, factors=(4,))
+    assert quarter > 20.5
+
+
+@pytest.mark.slow
+def test_a_cone_field_is_better_at_lower_resolution_than_the_papers_network(tmp_path):
+    """Both see three resolutions. The exact scene has 23.8 dB at a quarter with one ray through each pixel."""
+    scores = {}
+    for field in ("cone", "mlp"):
+        scores[field] = train_at_scales(field, tmp_path / field, steps=1200, size=64, num_samples=48, factors=(1, 2, 4))
+    assert scores["cone"][2] > 25 and scores["cone"][2] > scores["mlp"][2] + 0.2
+
+
+def test_the_encoding_is_the_mean_over_the_frustum():
+    """Against the mean of sin and cos over random points of a cylinder around the sample."""
+    rng = np.random.default_rng(0)
+    x, away = np.float32([0.3, -0.2, 0.5]), np.float32([2, -1, 2]) / 3
+    radius, length, count = 0.2, 0.5, 400_000
+    side = np.cross(away, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    turn, out = rng.uniform(0, 2 * np.pi, count), radius * np.sqrt(rng.uniform(0, 1, count))
+    across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(away, side)
+    points = x + rng.uniform(-0.5, 0.5, (count, 1)) * length * away + out[:, None] * across
+    angles = 2.0 ** np.arange(3)[:, None] * points[:, None]
+    want = np.concatenate([np.sin(angles), np.cos(angles)], axis=-1).mean(axis=0).reshape(-1)
+    got = cone_field.integrated_encoding(x[None], away[None], np.float32([radius]), np.float32([length]), 3)
+    np.testing.assert_allclose(got[0], want, atol=0.01)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("moving")
+    moving_bodies.write_dataset(folder)
+    return folder
+
+
+def test_a_moving_scene_is_learned_from_images_with_times(dataset, tmp_path):
+    """Unseen views at unseen times; with the time frozen the same network shows the bodies at the wrong places."""
+    fields = {"data.format": "blender", "data.dir": str(dataset), "data.near": 2.8, "data.far": 5.2}
+    fields |= {"sampling.num_coarse": 32, "train.lr_init": 8e-3}
+    assert jaxnerf.train_and_evaluate(config_of("moving", 400, **fields), tmp_path / "run")
+    run = jaxnerf.restore_run(tmp_path / "run")
+    test = run.experiment.load_split("test")
+    assert len(np.unique(test.time)) == len(test.size) == 6
+    value = score(run, test)
+    frozen = score(run, dataclasses.replace(test, time=np.zeros(6, np.float32)))
+    assert value > 21.5 and value > frozen + 4
+
+
+def test_the_dataset_shows_the_bodies_where_they_are(dataset):
+    """A frame equals the closed form at its camera and its time."""
+    views = jaxnerf.load_dataset(dataset, split="test", near=2.0, far=6.0)
+    camera = jaxnerf.Camera(
+        **{name: getattr(views.cameras, name)[3] for name in ("to_world", "focal", "center")}, height=32, width=32
+    )
+    rays = jaxnerf.rays_from_pixels(camera, jaxnerf.pixel_grid(32, 32), near=2.0, far=6.0)
+    scene = functools.partial(moving_bodies.bodies, time=np.full((1, 1, 1), views.time[3]))
+    image = jaxnerf.render_rays(None, scene, rays, num_samples=128, background=(1.0, 1.0, 1.0))
+    first = views.offset[3]
+    truth = pixel_colors(views.pixels[first : first + 1024], views.background).reshape(32, 32, 3)
+    assert jaxnerf.psnr(image.rgb, truth) > 45
