@@ -1,26 +1,19 @@
 """Reader of the format of nerfstudio and instant-ngp: one transforms.json beside images."""
 
-import math
 import os
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES
 from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.intrinsics import number_in, read_camera, wrong_value
 from jaxnerf.data.readers.ply import read_points
 from jaxnerf.data.readers.validation import check_inside, is_number, read_json, read_times, required, short_repr
 from jaxnerf.registry import Reader
-
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
-_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-_UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")  # instant-ngp's other lenses
-_ANGLES = ("camera_angle_x", "camera_angle_y")
-_OTHERS = ("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
 def read_capture(folder: str | os.PathLike) -> Capture:
@@ -92,7 +85,7 @@ def _entries(content, source):
     """Returns all entries, sorted by name, and notes."""
     frames = required(content, "frames", source)
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise _wrong(source, "frames", frames, "a list of one object {...} per image; export it again")
+        raise wrong_value(source, "frames", frames, "a list of one object {...} per image; export it again")
     places = [f"{source}, frame {index}" for index in range(len(frames))]
     stated = [required(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
     paths = [
@@ -184,7 +177,7 @@ def _splits(content, source, entries, kept):
         key = f"{split}_filenames"
         names = content.get(key, [])
         if not isinstance(names, list):
-            raise _wrong(source, key, names, "a list of file_paths; correct or remove it")
+            raise wrong_value(source, key, names, "a list of file_paths; correct or remove it")
         chosen = set()
         for name in names:
             path = _path(source.parent, name, key=key, source=source)
@@ -202,7 +195,7 @@ def _splits(content, source, entries, kept):
 def _camera(content, source, entry):
     matrix = required(entry.content, "transform_matrix", entry.where)
     pose = check_pose(matrix, source=entry.where)
-    return _read_camera([(source, content), (entry.where, entry.content)], to_world=pose, image=entry.image)
+    return read_camera([(source, content), (entry.where, entry.content)], to_world=pose, image=entry.image)
 
 
 def _points(content, source):
@@ -225,12 +218,12 @@ def _box(content, source):
     if "aabb" in content or "normal_mts_args" in content:  # these define scale and offset differently
         return None, [f"{source}: aabb_scale is not used, as the file has aabb or normal_mts_args"]
     fields = {key: (content[key], source) for key in ("aabb_scale", "scale") if key in content}
-    side = _number(fields, "aabb_scale", "a number from 1e-6 to 1e6", 1e-6, 1e6)
-    scale = _number(fields, "scale", "a number from 1e-6 to 1e6", 1e-6, 1e6) if "scale" in content else 0.33
+    side = number_in(fields, "aabb_scale", "a number from 1e-6 to 1e6", 1e-6, 1e6)
+    scale = number_in(fields, "scale", "a number from 1e-6 to 1e6", 1e-6, 1e6) if "scale" in content else 0.33
     offset = content.get("offset", 0.5)
     offset = offset if isinstance(offset, list) else [offset] * 3
     if len(offset) != 3 or not all(is_number(value) for value in offset):
-        raise _wrong(source, "offset", content["offset"], "three numbers; correct or remove it")
+        raise wrong_value(source, "offset", content["offset"], "three numbers; correct or remove it")
     # A cube around 0.5 is invariant under the cyclic permutation of the axes, which is therefore not undone.
     center, half = (0.5 - np.array(offset, np.float64)) / scale, 0.5 * side / scale
     return (center - half, center + half), []
@@ -241,121 +234,9 @@ def _check_applied(content, source):
         rows = content["applied_transform"]
         lists = isinstance(rows, list) and len(rows) in (3, 4) and all(isinstance(row, list) for row in rows)
         if not lists or not all(len(row) == 4 and all(map(is_number, row)) for row in rows):
-            raise _wrong(source, "applied_transform", rows, "3 or 4 rows of 4 numbers; correct or remove it")
+            raise wrong_value(source, "applied_transform", rows, "3 or 4 rows of 4 numbers; correct or remove it")
     if "applied_scale" in content:
-        _number({"applied_scale": (content["applied_scale"], source)}, "applied_scale", "more than 0", 1e-30)
-
-
-def _read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: Path) -> Camera:
-    """Returns the float64 camera of one image.
-
-    The center defaults to the middle of the image, the focal length in y to that in x. A perspective lens
-    whose coefficients are all 0 is a pinhole. The size is the stated one. If it is not stated and center or
-    focal depend on it, it is the image's after EXIF rotation; otherwise it is None.
-
-    Args:
-        levels: [(where, entries)]: the file's, then the frame's. Later levels override earlier ones field by
-            field; a later level's angle overrides an earlier one's focal length. where: for messages.
-        to_world: [3, 4].
-        image: opened only if its size is needed.
-
-    Raises:
-        ValueError: names where, what was found, what is expected and what to do.
-    """
-    fields, where = _fields(levels), levels[-1][0]
-    size = [_size(fields, key) for key in "wh"]
-    if None in size and (size != [None, None] or not {"cx", "cy", "fl_x"} <= fields.keys()):
-        found = image_size(image)
-        size = [have if stated is None else stated for stated, have in zip(size, found, strict=True)]
-    lens, distortion = _lens(fields, where)
-    center = [
-        _number(fields, key, "a number of px") if key in fields else length / 2
-        for key, length in zip(("cx", "cy"), size, strict=True)
-    ]
-    return Camera(
-        to_world=to_world,
-        focal=_focal(fields, size, where),
-        center=np.array(center, np.float64),
-        distortion=distortion,
-        lens=lens,
-        height=size[1],
-        width=size[0],
-    )
-
-
-def _number(fields, key, expected, low=-math.inf, high=math.inf):
-    """Returns the float in fields, {key: (value, where)}; ValueError unless it is a number in [low, high]."""
-    value, where = fields[key]
-    if not is_number(value) or not low <= value <= high:
-        raise _wrong(where, key, value, f"{expected}; correct it or export the file again")
-    return float(value)
-
-
-def _wrong(where, key, value, expected):
-    return ValueError(f"{where}: {key} is {short_repr(value)}, expected {expected}")
-
-
-def _fields(levels):
-    """Returns {key: (value, where it is stated)} of all fields of a camera."""
-    fields, keys = {}, (*_OTHERS, *_ANGLES, *_COEFFICIENTS, *_UNSUPPORTED)
-    for where, level in levels:
-        if "fl_x" not in level and any(key in level for key in _ANGLES):
-            fields = {key: field for key, field in fields.items() if key not in ("fl_x", "fl_y")}
-        fields |= {key: (level[key], where) for key in keys if key in level}
-        if "distortion_params" in level:
-            values = level["distortion_params"]
-            if not isinstance(values, list) or len(values) != 6:
-                raise _wrong(where, "distortion_params", values, "the numbers k1 k2 k3 k4 p1 p2; export the file again")
-            fields |= {key: (value, where) for key, value in zip(_COEFFICIENTS, values, strict=True)}
-    return fields
-
-
-def _focal(fields, size, where):
-    lengths = []
-    for axis, pixels in zip("xy", size, strict=True):
-        if f"fl_{axis}" in fields:
-            lengths.append(_number(fields, f"fl_{axis}", "px between 0.001 and 1e9", 1e-3, 1e9))
-        elif f"camera_angle_{axis}" in fields and "fl_x" not in fields:
-            angle = _number(fields, f"camera_angle_{axis}", "radians between 0 and pi", 1e-6, math.pi - 1e-6)
-            lengths.append(0.5 * pixels / math.tan(0.5 * angle))
-    if not lengths:
-        raise ValueError(
-            f"{where}: has no fl_x or camera_angle_x, nor has the file; expected one; export the file again"
-        )
-    return np.array([lengths[0], lengths[-1]], np.float64)
-
-
-def _lens(fields, where):
-    """Returns the lens and its coefficients; the latter are None for a pinhole."""
-    model, place = fields.get("camera_model", (None, where))
-    fisheye, flag = fields.get("is_fisheye", (model == "OPENCV_FISHEYE", where))
-    other = [key for key in _UNSUPPORTED if key in fields]
-    if other or model not in (None, *_PERSPECTIVE, "OPENCV_FISHEYE"):
-        found = f"has {other[0]}" if other else f"camera_model is {short_repr(model)}"
-        expected = f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE"
-        raise ValueError(f"{place}: {found}, expected {expected}; convert the images to one of these")
-    if not isinstance(fisheye, bool) or (model is not None and fisheye != (model == "OPENCV_FISHEYE")):
-        expected = "true or false" if model is None else f"the value that camera_model {model} implies"
-        raise _wrong(flag, "is_fisheye", fisheye, f"{expected}; correct or remove it")
-    values = {key: _number(fields, key, "a number") if key in fields else 0.0 for key in _COEFFICIENTS}
-    for key in ("p1", "p2") if fisheye else ("k4",):
-        if values[key]:
-            kind = "fisheye lens has k1 k2 k3 k4" if fisheye else "perspective lens has k1 k2 k3 p1 p2"
-            raise _wrong(fields[key][1], key, values[key], f"0, as a {kind}; calibrate without it")
-    if fisheye:
-        return "fisheye", np.array([values[key] for key in ("k1", "k2", "k3", "k4")])
-    keys = ("k1", "k2", "p1", "p2", "k3") if values["k3"] else ("k1", "k2", "p1", "p2")
-    distortion = np.array([values[key] for key in keys])
-    return ("opencv", distortion) if distortion.any() else ("pinhole", None)
-
-
-def _size(fields, key):
-    if key not in fields:
-        return None
-    pixels = _number(fields, key, "whole pixels from 1 to 1000000", 1, 1e6)
-    if pixels != int(pixels):
-        raise _wrong(fields[key][1], key, pixels, "whole pixels; correct or remove it")
-    return int(pixels)
+        number_in({"applied_scale": (content["applied_scale"], source)}, "applied_scale", "more than 0", 1e-30)
 
 
 READER = Reader(read_capture, detect=lambda folder: (folder / "transforms.json").is_file())
