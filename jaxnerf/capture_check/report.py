@@ -120,6 +120,7 @@ def _image_facts(capture, available, images):
     counts = ", ".join(f"{len(chosen)} {name}" for name, chosen in splits.items())
     return [
         ("format", f"{capture.format} ({capture.source}){also}"),
+        *(("read", choice) for choice in capture.choices),
         ("views", f"{len(capture.frames)}: {counts}{checked}"),
         ("images", f"{_counted(sizes)} px; {_counted(channels)}; {masks or 'no'} masks"),
     ]

@@ -180,6 +180,7 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
     # Reading the cameras takes a while, so they are only read to infer something from them.
     if any(map(is_auto, (data.factor, data.world, data.background, data.fingerprint))):
         capture = base.read_capture(folder, data.format)
+        lines += [f"read          {choice}" for choice in capture.choices]
         lines += [f"note          {note}" for note in capture.notes]
         masks = [frame.mask for frame in capture.frames if frame.mask is not None]
         if masks:

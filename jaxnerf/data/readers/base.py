@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
 from jaxnerf.data.readers.colmap_model import check_complete
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
@@ -55,6 +55,7 @@ class Capture(NamedTuple):
         points: [N, 3] float64, points on surfaces, world units; None: not known.
         box: (lower [3], upper [3]), outside which the format states that there is no matter; None: not known.
         notes: one line for each part of the dataset that was skipped or found at another place, with the reason.
+        choices: one line for each choice of the reader that the files leave open, with the reason.
     """
 
     format: str
@@ -64,6 +65,7 @@ class Capture(NamedTuple):
     points: Float[np.ndarray, "N 3"] | None = None
     box: tuple[np.ndarray, np.ndarray] | None = None
     notes: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()
 
 
 def fingerprint(capture: Capture) -> str:
@@ -136,7 +138,8 @@ def _find_masks(folder, images):
     for place in (folder / name for name in _MASK_FOLDERS):
         if not place.is_dir():
             continue
-        paths = sorted(path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        paths = (path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        paths = sorted(path for path in paths if not is_hidden(path.name))
         files = {path.relative_to(place).with_suffix("").as_posix(): path for path in paths}
         masks = [files.get(name) or files.get(name + suffix) for name, suffix in images]
         if None not in masks:

@@ -15,6 +15,19 @@ _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 _UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")  # instant-ngp's other lenses
 _ANGLES = ("camera_angle_x", "camera_angle_y")
 _OTHERS = ("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy")
+# Fields that say more of a camera than the angle and the size in files of Blender's renders.
+STATED = ("fl_x", "fl_y", "cx", "cy", "camera_model", "is_fisheye", *_COEFFICIENTS, "distortion_params", *_UNSUPPORTED)
+_UNUSED = {  # facts of other programs: why they are not used
+    **dict.fromkeys(("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew"), "no lens of jaxnerf has that term"),
+    "rolling_shutter": "all pixels of an image have one pose",
+    **dict.fromkeys(("transform_matrix_start", "transform_matrix_end"), "transform_matrix is the pose"),
+    **dict.fromkeys(("K", "intrinsics", "intrinsic_matrix"), "fl_x, fl_y, cx and cy are read"),
+    **dict.fromkeys(("near", "far"), "set data.near and data.far"),
+    **dict.fromkeys(("shift_x", "shift_y"), "cx and cy are read"),
+}
+_TERMS = {"SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
+_ZERO = (None, 0, [], [0, 0, 0], [0, 0, 0, 0])
+_ROUNDING = 0.01  # of a focal length that is stated twice
 
 
 def read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: Path) -> Camera:
@@ -52,6 +65,47 @@ def read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: 
         height=size[1],
         width=size[0],
     )
+
+
+def ignored_facts(levels: list[tuple[Any, dict]], camera: Camera, image: Path) -> dict[str, str]:
+    """Returns {field: what it says and why it is not used} of the camera facts that `read_camera` does not use.
+
+    Args:
+        levels, image: see `read_camera`.
+        camera: what it returned.
+    """
+    fields, found = _fields(levels), {}
+    for where, level in levels:
+        for key, why in _UNUSED.items():
+            if key in level and level[key] not in _ZERO:
+                found[key] = f"{where}: {key} is not used, as {why}"
+        given = dict(zip(_COEFFICIENTS, level.get("distortion_params", ()), strict=False))
+        for key, value in given.items():
+            if level.get(key, value) != value:
+                found[key] = f"{where}: {key} is {short_repr(level[key])}, distortion_params has {value}, which is used"
+    model, where = fields.get("camera_model", (None, None))
+    extra = [key for key in _COEFFICIENTS if model in _TERMS and key in fields and key not in _TERMS[model]]
+    if extra := [key for key in extra if fields[key][0]]:
+        found["camera_model"] = f"{where}: camera_model {model} has no {extra[0]}, which is used as stated"
+    return found | _other_angles(fields, camera, image)
+
+
+def _other_angles(fields, camera, image):
+    """Returns the part of `ignored_facts` about angles of view that contradict the focal lengths beside them."""
+    found = {}
+    for axis, key in enumerate(_ANGLES):
+        if key not in fields or "fl_x" not in fields or fields[key][1] != fields["fl_x"][1]:
+            continue
+        pixels = (camera.width, camera.height)[axis] or image_size(image)[axis]
+        focal, used = 0.5 * pixels / math.tan(0.5 * _angle(fields, key)), camera.focal[axis]
+        if abs(focal / used - 1) > _ROUNDING:
+            angle = f"{fields[key][1]}: {key} {fields[key][0]:.5g} is a focal length of {focal:.5g} of {pixels} px"
+            found[key] = f"{angle}, {used:.5g} px is stated, too, and used"
+    return found
+
+
+def _angle(fields, key):
+    return number_in(fields, key, "radians between 0 and pi", 1e-6, math.pi - 1e-6)
 
 
 def number_in(
@@ -92,8 +146,7 @@ def _focal(fields, size, where):
         if f"fl_{axis}" in fields:
             lengths.append(number_in(fields, f"fl_{axis}", "px between 0.001 and 1e9", 1e-3, 1e9))
         elif f"camera_angle_{axis}" in fields and "fl_x" not in fields:
-            angle = number_in(fields, f"camera_angle_{axis}", "radians between 0 and pi", 1e-6, math.pi - 1e-6)
-            lengths.append(0.5 * pixels / math.tan(0.5 * angle))
+            lengths.append(0.5 * pixels / math.tan(0.5 * _angle(fields, f"camera_angle_{axis}")))
     if not lengths:
         raise ValueError(
             f"{where}: has no fl_x or camera_angle_x, nor has the file; expected one; export the file again"
