@@ -101,8 +101,8 @@ def detect_formats(folder: str | os.PathLike) -> list[str]:
         check_complete(folder)
         raise ValueError(
             f"{folder}: holds no dataset, expected transforms_train.json (Blender), transforms.json, a COLMAP "
-            "model in sparse/0, or poses_bounds.npy (LLFF); correct the folder, or import the module that "
-            "registers another format with --plugins=MODULE"
+            "model in sparse/0 or dense/0/sparse, or poses_bounds.npy (LLFF); correct the folder, or import the "
+            "module that registers another format with --plugins=MODULE"
         )
     return found
 

@@ -9,6 +9,8 @@ from typing import Any
 from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
 from jaxnerf.data.readers.validation import check_inside, short_repr
 
+_TRIED = 5  # paths that are compared with the files
+
 
 class ImageFinder:
     """Finds files below a folder. Each folder is listed at most once, and only if a name does not fit exactly.
@@ -69,7 +71,13 @@ class ImageFinder:
         Names that differ from the path in upper and lower case, or in composed and decomposed Unicode, are
         followed if one alone fits.
         """
-        candidates = (path, *(path + suffix for suffix in IMAGE_SUFFIXES))
+        return self._first(path, (path, *(path + suffix for suffix in IMAGE_SUFFIXES)))
+
+    def find_exact(self, path: str) -> Path | None:
+        """Returns what `find` does for a path that has its extension."""
+        return self._first(path, (path,))
+
+    def _first(self, path, candidates):
         for candidate in candidates:
             if os.path.isfile(self.folder / candidate):  # Path.is_file raises if the name is too long
                 return self.folder / candidate
@@ -136,10 +144,12 @@ class ImageFinder:
         return self._listings[place]
 
 
-def nearly(finder: ImageFinder, path: str) -> str:
-    """Returns "" or the end of a message that names the file that nearly fits a path without a file."""
-    found = finder.similar(path)
-    return f"; {finder.folder / found} nearly fits {path!r}: rename it, or correct the path" if found else ""
+def nearly(finder: ImageFinder, *paths: str) -> str:
+    """Returns "" or the end of a message that names the file that nearly fits one of some paths without a file."""
+    for path in paths[:_TRIED]:
+        if found := finder.similar(path):
+            return f"; {finder.folder / found} nearly fits {short_repr(path)}: rename it, or correct the path"
+    return ""
 
 
 def _parts_of_absolute(name):

@@ -194,7 +194,7 @@ def _missing(entries, source, finder):
     missing = [entry for entry in entries if entry.image is None]
     if not missing:
         return []
-    names, hint = [entry.name for entry in missing], nearly(finder, missing[0].path)
+    names, hint = [entry.name for entry in missing], nearly(finder, *(entry.path for entry in missing))
     count = f"{len(names)} of {len(entries)} frames have no file"
     listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     if 2 * len(names) > len(entries):
