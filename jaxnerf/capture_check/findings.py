@@ -15,7 +15,7 @@ class Finding(NamedTuple):
     Attributes:
         severity: "error" where training would be useless, or "warning".
         kind: "axes", "focal", "swap", "pose", "fold", "overlap", "points", "size", "file", "mask", "duplicate",
-            "blur", "bounds" or "skipped".
+            "blur", "bounds", "leak" or "skipped".
         found: what the check found, with the name of the file.
         expected: what it expects there.
         change: the file, field or flag to change, and how.
