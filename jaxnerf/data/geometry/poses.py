@@ -48,7 +48,8 @@ def _checked_rotation(rotation, source, tolerance=1e-3):
         lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(rotation, axis=0))
     if not off < _ROUNDED:  # also True if the product overflowed to NaN
         found = f"no rotation in its first three columns (lengths {lengths}, off by {off:.2g})"
-        raise _wrong(source, found, "unit columns at right angles; divide out its scale or shear")
+        change = "divide out its scale or shear, or export more digits"
+        raise _wrong(source, found, f"unit columns at right angles; {change}")
     if np.linalg.det(rotation) < 0:
         raise _wrong(source, "determinant -1, so it mirrors", "a rotation, determinant 1; negate one axis")
     if off <= tolerance:

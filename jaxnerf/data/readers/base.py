@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from jaxnerf.core.types import Camera
 from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
 from jaxnerf.data.readers.colmap_model import check_complete
+from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
@@ -140,8 +141,8 @@ def _find_masks(folder, images):
             continue
         paths = (path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
         paths = sorted(path for path in paths if not is_hidden(path.name))
-        files = {path.relative_to(place).with_suffix("").as_posix(): path for path in paths}
-        masks = [files.get(name) or files.get(name + suffix) for name, suffix in images]
+        files = {fold(path.relative_to(place).with_suffix("").as_posix()): path for path in paths}
+        masks = [files.get(fold(name)) or files.get(fold(name + suffix)) for name, suffix in images]
         if None not in masks:
             return masks, notes
         first, count = images[masks.index(None)][0], sum(mask is not None for mask in masks)

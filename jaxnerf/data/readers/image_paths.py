@@ -117,7 +117,7 @@ class ImageFinder:
         place = self.folder
         for part in path.split("/"):
             if not os.path.exists(place / part):
-                names = self._names(place).get(_fold(part), [])
+                names = self._names(place).get(fold(part), [])
                 if len(names) != 1:
                     return None
                 part = names[0]
@@ -127,20 +127,20 @@ class ImageFinder:
     def _of_stem(self, path):
         """Returns an image with the path's name and any image's extension, or None."""
         place = self._folded(os.path.dirname(path)) if "/" in path else self.folder
-        stem = _fold(os.path.basename(path))
+        stem = fold(os.path.basename(path))
         for suffix in IMAGE_SUFFIXES if place else ():
             if names := self._names(place).get(stem + suffix):
                 return place / names[0]
         return None
 
     def _names(self, place):
-        """Returns {folded name: names} of the entries of a folder that are not hidden."""
+        """Returns {folded name: names} of the printable entries of a folder that are not hidden."""
         if place not in self._listings:
             names = sorted(os.listdir(place)) if os.path.isdir(place) else []
             listing = self._listings[place] = {}
             for name in names:
-                if not is_hidden(name):
-                    listing.setdefault(_fold(name), []).append(name)
+                if name.isprintable() and not is_hidden(name):  # messages contain it
+                    listing.setdefault(fold(name), []).append(name)
         return self._listings[place]
 
 
@@ -158,5 +158,6 @@ def _parts_of_absolute(name):
     return [part for part in re.split(r"[/\\]", match[2]) if part not in ("", ".")] if match else []
 
 
-def _fold(name):
+def fold(name: str) -> str:
+    """Returns a name in the form in which names are compared: without case, in composed Unicode."""
     return unicodedata.normalize("NFC", name).casefold()

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxnerf.data.readers.base import Capture, Frame
-from jaxnerf.data.readers.image_paths import ImageFinder, nearly
+from jaxnerf.data.readers.image_paths import ImageFinder, fold, nearly
 from jaxnerf.data.readers.intrinsics import number_in, wrong_value
 from jaxnerf.data.readers.json_frames import read_cameras, read_poses, read_splits, split_ranges
 from jaxnerf.data.readers.ply import read_points
@@ -35,9 +35,9 @@ def read_capture(folder: str | os.PathLike) -> Capture:
         folder: holds transforms.json. Relative paths in that file that lead out of the folder are errors.
 
     Returns:
-        Capture. Its splits are the files', or the file's lists of names that are not empty. A camera's height and
-        width are those that the file states; if center or focal depend on the size and it is not stated, they are
-        the upright image's. Points and box are those of the first file.
+        Capture. Its splits are the files' if there are several, or the file's lists of names that are not empty.
+        A camera's height and width are those that the file states; if center or focal depend on the size and it is
+        not stated, they are the upright image's. Points and box are those of the first file.
 
     Raises:
         ValueError: names file and frame, what was found, what is expected and what to do.
@@ -71,15 +71,17 @@ def _read_splits(folder, stated):
     if (folder / "transforms.json").is_file():
         notes.append(f"{folder / 'transforms.json'}: not used beside {first.source.name}; rename that to read it")
     choice = f"{stated}: world, near and far follow from the cameras; --format=blender takes near 2 and far 6"
+    alone = f"{first.source.name}: every 8th view is a test view, as there is no file of another split"
+    held_out = [alone] if len(paths) == 1 else []
     return Capture(
         format="transforms",
         source=first.source,
         frames=sum(frames.values(), ()),
-        splits=split_ranges(paths, frames),
+        splits=split_ranges(paths, frames) if len(paths) > 1 else None,
         points=first.points,
         box=first.box,
         notes=(*sum((file.notes for file in files.values()), ()), *finder.notes(first.source), *notes),
-        choices=(choice, *_world(first)),
+        choices=(choice, *held_out, *_world(first)),
     )
 
 
@@ -172,7 +174,7 @@ def _entries(content, source, finder):
 def _without_suffix(path, image):
     """Returns a file_path without extension; it may have none, and dots in its name."""
     name = os.path.basename(path)
-    has_none = image is not None and image.name != name and image.stem.casefold() == name.casefold()
+    has_none = image is not None and image.name != name and fold(image.stem) == fold(name)
     return path if has_none else os.path.splitext(path)[0]
 
 

@@ -138,6 +138,13 @@ def test_split_files_win_over_one_file_beside_them_with_a_note(tmp_path, shots):
     assert capture.notes[0].endswith("transforms.json: not used beside transforms_train.json; rename that to read it")
 
 
+def test_of_a_training_file_alone_every_8th_view_is_held_out(tmp_path, shots):
+    _, splits = write(tmp_path, shots, parts={"train": range(8)})
+    capture = base.read_capture(splits)
+    assert capture.splits is None and "every 8th view is a test view" in capture.choices[1]
+    assert jaxnerf.load_dataset(splits, split="test").names == ("000",)
+
+
 def test_names_that_repeat_in_other_files_begin_with_the_split(tmp_path, shots):
     _, splits = write(tmp_path, shots, parts={"train": range(6), "test": range(4, 8)})
     names = [frame.name for frame in base.read_capture(splits).frames]
