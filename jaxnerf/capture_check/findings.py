@@ -15,7 +15,7 @@ class Finding(NamedTuple):
     Attributes:
         severity: "error" where training would be useless, or "warning".
         kind: "axes", "focal", "swap", "pose", "fold", "overlap", "points", "size", "file", "mask", "duplicate",
-            "blur", "bounds" or "skipped".
+            "blur", "bounds", "leak" or "skipped".
         found: what the check found, with the name of the file.
         expected: what it expects there.
         change: the file, field or flag to change, and how.
@@ -54,7 +54,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 _MIRROR_ROW = "also negate row 1 of every transform_matrix (the world is mirrored)"
 _POSE_FILES = {
     "blender": _PoseFile("every transform_matrix of transforms_*.json", np.eye(3), "columns", _MIRROR_ROW),
-    "transforms": _PoseFile("every transform_matrix of transforms.json", np.eye(3), "columns", _MIRROR_ROW),
+    "transforms": _PoseFile("every transform_matrix of the JSON files", np.eye(3), "columns", _MIRROR_ROW),
     "llff": _PoseFile(
         "the 3 x 5 matrix in every row of poses_bounds.npy",
         np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxnerf.capture_check import cameras, depths, folds, tracks
 from jaxnerf.capture_check import images as images_module
 from jaxnerf.capture_check.findings import Finding, percent
+from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.path_poses import coverage
 from jaxnerf.data.geometry.poses import gaze_center, up_of
@@ -92,6 +93,7 @@ def inspect(
     if stated or not wrong:  # bounds computed from wrong poses mean nothing
         findings += depths.judge_bounds(depth, bounds[point_tracks.views[:, 0]], stated)
     findings += depths.judge_box(capture, points)
+    findings += _judge_splits(whole)
     findings += [
         Finding("warning", "skipped", note, "nothing skipped", "the files named, if this is not intended")
         for note in whole.notes
@@ -101,6 +103,15 @@ def inspect(
     facts += [("near, far", _range(bounds, stated, depth)), ("path", line)]
     order = sorted(findings, key=lambda finding: finding.severity != "error")
     return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path)
+
+
+def _judge_splits(capture):
+    """Returns a Finding for each split whose views are training views, too."""
+    shared = dataset.views_shared_with_training(dataset.DataOptions(format=capture.format), capture)
+    expected = "views that training does not see"
+    change = "the lists of views of the splits, or remove the copies"
+    notes = dict.fromkeys(found["note"] for found in shared.values())
+    return [Finding("warning", "leak", note, expected, change) for note in notes]
 
 
 def subset(capture: Capture) -> Capture:
@@ -120,6 +131,7 @@ def _image_facts(capture, available, images):
     counts = ", ".join(f"{len(chosen)} {name}" for name, chosen in splits.items())
     return [
         ("format", f"{capture.format} ({capture.source}){also}"),
+        *(("read", choice) for choice in capture.choices),
         ("views", f"{len(capture.frames)}: {counts}{checked}"),
         ("images", f"{_counted(sizes)} px; {_counted(channels)}; {masks or 'no'} masks"),
     ]

@@ -16,7 +16,8 @@ from jaxnerf.data.facts import LookAt, mean_color
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
 from jaxnerf.data.readers import base, blender
-from jaxnerf.data.readers.base import fingerprint
+from jaxnerf.data.readers.base import Capture, fingerprint
+from jaxnerf.data.shared_views import line_of, shared_views
 from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, is_auto, option, replaced, values_of
 
@@ -153,7 +154,16 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
     Raises:
         ValueError: if the folder does not exist or holds no dataset.
     """
-    lines = []
+    data, lines, capture = _resolve(data)
+    if capture is not None or data.format == "blender":
+        notes = [found["note"] for found in views_shared_with_training(data, capture).values()]
+        lines += [f"note          {note}" for note in dict.fromkeys(notes)]
+    return data, lines
+
+
+def _resolve(data):
+    """Returns what `resolve` does, without what concerns test views, and the Capture if it had to be read."""
+    lines, capture = [], None
 
     def infer(name, value, line=None):
         nonlocal data
@@ -165,7 +175,7 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
     if data.format == "synthetic":
         for name, value in _SYNTHETIC.items():
             infer(name, value)
-        return data, lines
+        return data, lines, None
     folder = dataset_folder(data.dir)
     if pathlib.Path(data.dir).is_dir():  # a name below $JAXNERF_SCENES stays a name
         data = replaced(data, dir=str(folder.absolute()))
@@ -180,6 +190,7 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
     # Reading the cameras takes a while, so they are only read to infer something from them.
     if any(map(is_auto, (data.factor, data.world, data.background, data.fingerprint))):
         capture = base.read_capture(folder, data.format)
+        lines += [f"read          {choice}" for choice in capture.choices]
         lines += [f"note          {note}" for note in capture.notes]
         masks = [frame.mask for frame in capture.frames if frame.mask is not None]
         if masks:
@@ -197,7 +208,35 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
             infer("background", color, f"background    {color}")
         infer("fingerprint", fingerprint(capture))
     infer("ndc", data.world == "forward", f"NDC           {'on' if data.world == 'forward' else 'off'}")
-    return data, lines
+    return data, lines, capture
+
+
+def views_shared_with_training(data: DataOptions, capture: Capture | None = None) -> dict[str, dict[str, Any]]:
+    """Returns {split: {"count", "names", "note"}} of the splits "test" and "val" with views that are trained on.
+
+    Args:
+        data: the options, resolved.
+        capture: of the dataset; None: it is read. If it cannot be read, nothing is known and {} is returned.
+    """
+    try:
+        if capture is None:
+            capture = base.read_capture(dataset_folder(data.dir), data.format)
+        train, select = load_images.split_indices(capture, "train"), _selection(data, "train")
+        train = train if select is None else train[select(len(train))]
+        found = {split: _shared_with(capture, split, train) for split in load_images.scored_splits(capture)}
+    except (ValueError, OSError):  # reported by whoever reads the images
+        return {}
+    if len(found) == 1:  # the one that is defined stands for the other
+        found |= dict.fromkeys(("test", "val"), *found.values())
+    return {split: shared for split, shared in found.items() if shared}
+
+
+def _shared_with(capture, split, train):
+    shared = shared_views(capture, split, train)
+    if not shared:
+        return None
+    note = line_of(shared, split, len(load_images.split_indices(capture, split)))
+    return {"count": len(shared), "names": [view.name for view in shared], "note": note}
 
 
 def resolve_for_scene(data: DataOptions, views: Views, *, fills_space: bool) -> tuple[DataOptions, Views, list[str]]:
@@ -261,7 +300,7 @@ def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -
     if data.format == "synthetic":
         views = synthetic.load_synthetic(split=source, size=data.size, finish=data.finish)
         return views if select is None else select_views(views, select(len(views.offset)))
-    data, _ = resolve(data)
+    data, *_ = _resolve(data)
     _check_world(data)
     near = 0.0 if is_auto(data.near) else data.near  # it is resolved later, against the views
     folder = dataset_folder(data.dir)
@@ -332,8 +371,10 @@ def color_behind(data: DataOptions) -> tuple[float, ...] | None:
 
 
 def conventions(data: DataOptions) -> dict[str, Any]:
-    """Returns the options of a dataset that an evaluation protocol records."""
-    return {name: getattr(data, name) for name, (declared, _) in declarations(DataOptions).items() if declared.protocol}
+    """Returns the options of a dataset that an evaluation protocol records, and its test views that are trained on."""
+    found = {name: getattr(data, name) for name, (each, _) in declarations(DataOptions).items() if each.protocol}
+    shared = {} if data.format == "synthetic" else views_shared_with_training(data)
+    return found | ({"shared_with_training": shared} if shared else {})
 
 
 def held_out(count: int, every: int) -> Int[np.ndarray, " N"]:

@@ -194,7 +194,9 @@ def summary(results: dict[str, Any]) -> str:
     metrics = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
     if results.get("exposure"):
         metrics += f" ({results['psnr_aligned']:.2f} dB, {results['ssim_aligned']:.4f} after colour alignment)"
-    return f"{step}{metrics} over {results['views']} views{speed}"
+    shared = results.get("conventions", {}).get("shared_with_training")
+    note = f"; note: {shared['note']}" if shared else ""
+    return f"{step}{metrics} over {results['views']} views{speed}{note}"
 
 
 def _score_views(run, render, views, folder, shard):

@@ -63,6 +63,9 @@ def of_views(conventions: Mapping[str, Any], views: Views, *, split: str) -> dic
     rule = _TEST_SPLITS.get(conventions["format"], _OTHER_TEST_SPLIT) if split == "test" else f"all of {split!r}"
     if split == "held_out":
         rule = f"one in {conventions['hold_out']} of the training views"
+    conventions = dict(conventions)
+    if shared := conventions.pop("shared_with_training", {}).get(split):
+        conventions["shared_with_training"] = shared
     step = _number_step(views.names)
     selection = rule + (f"; the numbers in the names go up by {step}" if step else "")
     return of_images({**conventions, "split": split, "selection": selection}, views.size)
@@ -92,6 +95,8 @@ def comparable_with(conventions: Mapping[str, Any]) -> list[dict[str, Any]]:
             for name in ("hold_out", "num_views")
             if conventions.get(name)
         ]
+        if shared := conventions.get("shared_with_training"):
+            differences.append(f"{shared['count']} of the views were trained on, there none")
         why = ["if the scene is the same", _WHY[metric]]
         offset = conventions.get("pixel_offset")
         if pixel_offset not in (None, offset):

@@ -1,6 +1,7 @@
 """Tests jaxnerf-check: the defects it finds in datasets, and the changes it proposes."""
 
 import dataclasses
+import json
 import pathlib
 import subprocess
 import sys
@@ -366,3 +367,35 @@ def test_cameras_at_one_position_are_found_and_their_axes_are_not_judged(tmp_pat
     report = inspect(tmp_path)
     assert [finding.kind for finding in report.findings if finding.severity == "error"] == ["pose"]
     assert "all 6 cameras are at the same position" in report.text()
+
+
+def test_test_views_among_the_training_views_and_unused_facts_are_reported(folders, tmp_path):
+    def plant(folder):
+        path = folder / "transforms.json"
+        content = json.loads(path.read_text())
+        names = [frame["file_path"] for frame in content["frames"]]
+        content |= {"train_filenames": names, "test_filenames": names[::4], "camera_angle_x": 1.5}
+        path.write_text(json.dumps(content))
+
+    report = planted(folders, tmp_path, "transforms", plant)
+    assert not report.num_errors
+    (leak,) = (finding for finding in report.findings if finding.kind == "leak")
+    assert leak.line().startswith(
+        "WARNING 3 of 3 views of the split 'test' are training views, too (000 is the same file)"
+    )
+    (unused,) = (finding for finding in report.findings if finding.kind == "skipped")
+    assert "camera_angle_x 1.5 is a focal length of 85.874 of 160 px, 192 px is stated, too, and used" in unused.found
+
+
+def test_split_files_with_full_intrinsics_are_checked_as_one_file_is(folders, tmp_path):
+    def plant(folder):
+        content = json.loads((folder / "transforms.json").read_text())
+        for split, frames in (("train", content["frames"][2:]), ("test", content["frames"][:2])):
+            (folder / f"transforms_{split}.json").write_text(json.dumps({**content, "frames": frames}))
+        (folder / "transforms.json").unlink()
+
+    report = planted(folders, tmp_path, "transforms", plant)
+    assert not report.num_errors, report.text()
+    facts = dict(report.facts)
+    assert facts["format"].startswith("transforms (") and "12: 10 train, 2 test" in facts["views"]
+    assert "transforms_train.json states fl_x" in facts["read"] and "from the cameras" in facts["near, far"]

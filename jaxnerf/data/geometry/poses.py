@@ -6,6 +6,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+_ROUNDED = 2e-3  # a matrix of three decimals is off by at most 2 sqrt(3) 0.0005; one scaled by 1.001 by 0.002
+
 
 def check_pose(matrix: Any, *, source: Any, shape: tuple[int, int] = (4, 4)) -> Float[np.ndarray, "3 4"]:
     """Returns a camera's rotation and position, float64, after checking that they are a rigid motion.
@@ -18,7 +20,8 @@ def check_pose(matrix: Any, *, source: Any, shape: tuple[int, int] = (4, 4)) -> 
 
     Raises:
         ValueError: if it is not a matrix of finite numbers of that shape, if its rotation scales, shears or
-            mirrors by more than 1e-3, or if its fourth row is not 0 0 0 1.
+            mirrors by more than three decimals explain, or if its fourth row is not 0 0 0 1. Where it is off by
+            more than 1e-3, but not by more than that, the nearest rotation is returned.
     """
     try:
         pose = np.asarray(matrix)
@@ -35,20 +38,24 @@ def check_pose(matrix: Any, *, source: Any, shape: tuple[int, int] = (4, 4)) -> 
         raise _wrong(source, f"{pose[tuple(bad)]} at {bad}", "finite numbers; export it again or remove it")
     if shape == (4, 4) and np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-3:
         raise _wrong(source, f"last row {pose[3].tolist()}", "0 0 0 1; transpose it if it is column-major")
-    _check_rotation(pose[:3, :3], source)
-    return pose[:3]
+    return np.column_stack([_checked_rotation(pose[:3, :3], source), pose[:3, 3]])
 
 
-def _check_rotation(rotation, source, tolerance=1e-3):
-    # Files have about seven digits, so rounding errors are near 1e-7, far below the tolerance.
+def _checked_rotation(rotation, source, tolerance=1e-3):
+    # Most files have about seven digits, so rounding errors are near 1e-7, far below the tolerance.
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(rotation.T @ rotation - np.eye(3)).max()
         lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(rotation, axis=0))
-    if not off <= tolerance:  # also True if the product overflowed to NaN
+    if not off < _ROUNDED:  # also True if the product overflowed to NaN
         found = f"no rotation in its first three columns (lengths {lengths}, off by {off:.2g})"
-        raise _wrong(source, found, "unit columns at right angles; divide out its scale or shear")
+        change = "divide out its scale or shear, or export more digits"
+        raise _wrong(source, found, f"unit columns at right angles; {change}")
     if np.linalg.det(rotation) < 0:
         raise _wrong(source, "determinant -1, so it mirrors", "a rotation, determinant 1; negate one axis")
+    if off <= tolerance:
+        return rotation
+    left, _, right = np.linalg.svd(rotation)
+    return left @ right
 
 
 def _wrong(source, found, expected):

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size, is_hidden
 from jaxnerf.data.readers.base import Capture, Frame
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Returns the image files of a folder, sorted by name."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    """Returns the image files of a folder that are not hidden, sorted by name."""
+    paths = (path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(path for path in paths if not is_hidden(path.name) and path.is_file())
 
 
 def downscaled_folders(folder: Path) -> dict[int, Path]:

@@ -30,6 +30,11 @@ _UPRIGHT = {  # value of the tag -> function that makes the image upright
 }
 
 
+def is_hidden(name: str) -> bool:
+    """Returns whether a file's name is that of a hidden file, such as the ._ files that macOS writes beside images."""
+    return name.startswith(".")
+
+
 def read_image(
     path: str | os.PathLike, *, camera_size: tuple | None = None, follow_exif: bool = True
 ) -> UInt[np.ndarray, "H W C"]:

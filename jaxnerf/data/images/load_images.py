@@ -44,6 +44,11 @@ def split_indices(capture: Capture, split: str, *, hold: int = 8) -> Int[np.ndar
     return chosen
 
 
+def scored_splits(capture: Capture) -> list[str]:
+    """Returns those of the splits "test" and "val" that a dataset defines and that have frames, at least "test"."""
+    return [split for split in ("test", "val") if capture.splits and capture.splits.get(split)] or ["test"]
+
+
 def load_capture(
     capture: Capture,
     *,

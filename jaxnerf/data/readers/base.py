@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
 from jaxnerf.data.readers.colmap_model import check_complete
+from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
@@ -55,6 +56,7 @@ class Capture(NamedTuple):
         points: [N, 3] float64, points on surfaces, world units; None: not known.
         box: (lower [3], upper [3]), outside which the format states that there is no matter; None: not known.
         notes: one line for each part of the dataset that was skipped or found at another place, with the reason.
+        choices: one line for each choice of the reader that the files leave open, with the reason.
     """
 
     format: str
@@ -64,6 +66,7 @@ class Capture(NamedTuple):
     points: Float[np.ndarray, "N 3"] | None = None
     box: tuple[np.ndarray, np.ndarray] | None = None
     notes: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()
 
 
 def fingerprint(capture: Capture) -> str:
@@ -99,8 +102,8 @@ def detect_formats(folder: str | os.PathLike) -> list[str]:
         check_complete(folder)
         raise ValueError(
             f"{folder}: holds no dataset, expected transforms_train.json (Blender), transforms.json, a COLMAP "
-            "model in sparse/0, or poses_bounds.npy (LLFF); correct the folder, or import the module that "
-            "registers another format with --plugins=MODULE"
+            "model in sparse/0 or dense/0/sparse, or poses_bounds.npy (LLFF); correct the folder, or import the "
+            "module that registers another format with --plugins=MODULE"
         )
     return found
 
@@ -136,9 +139,10 @@ def _find_masks(folder, images):
     for place in (folder / name for name in _MASK_FOLDERS):
         if not place.is_dir():
             continue
-        paths = sorted(path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
-        files = {path.relative_to(place).with_suffix("").as_posix(): path for path in paths}
-        masks = [files.get(name) or files.get(name + suffix) for name, suffix in images]
+        paths = (path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        paths = sorted(path for path in paths if not is_hidden(path.name))
+        files = {fold(path.relative_to(place).with_suffix("").as_posix()): path for path in paths}
+        masks = [files.get(fold(name)) or files.get(fold(name + suffix)) for name, suffix in images]
         if None not in masks:
             return masks, notes
         first, count = images[masks.index(None)][0], sum(mask is not None for mask in masks)

@@ -1,21 +1,24 @@
-"""Reader of the format of the NeRF paper's Blender renders: transforms_<split>.json beside PNG files."""
+"""Reader of the format of the NeRF paper's Blender renders: transforms_<split>.json beside PNG files.
+
+Files that state more of their cameras than these are detected as the format "transforms". If this reader is selected
+for them, it reads their cameras all the same, in a world where near is 2 and far 6.
+"""
 
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
-
-from jaxnerf.core.types import Camera, Views
-from jaxnerf.data.geometry.poses import check_pose
+from jaxnerf.core.types import Views
 from jaxnerf.data.images.image_files import image_form
 from jaxnerf.data.images.load_images import load_frames
 from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.image_paths import ImageFinder, nearly
+from jaxnerf.data.readers.json_frames import read_cameras, read_poses, read_splits, split_ranges
+from jaxnerf.data.readers.split_files import full_cameras, split_files
 from jaxnerf.data.readers.validation import (
     check_background,
     check_factor,
-    check_inside,
     check_range,
     is_number,
     read_json,
@@ -54,9 +57,9 @@ def load_blender(
     factor, background = check_factor(factor), check_background(background)
     check_range(near, far)
     source, content = _read_transforms(folder, split)
-    frames, forms = _frames(content, source, select)
+    frames, forms, _ = _frames(content, source, select)
     for frame, form in zip(frames, forms, strict=True):
-        _check_image(frame.image, form, factor, background, _declared_size(content, source))
+        _check_image(frame, form, factor, background)
         if form[0][:2] != forms[0][0][:2] or form[1] != forms[0][1]:
             size, expected = (f"{width} x {height} {dtype}" for (height, width, _), dtype in (form, forms[0]))
             raise ValueError(
@@ -69,18 +72,21 @@ def load_blender(
 def read_capture(folder: Path) -> Capture:
     """Returns the Capture of all splits in a folder; frames are named by split and file, such as train/r_0.
 
+    A split other than "train" that cannot be read, as its images were never rendered, for example, is noted.
+
     Raises:
         ValueError: as `load_blender`.
     """
-    frames, splits = [], {}
-    for split in ("train", "val", "test"):
-        if split != "train" and not (Path(folder) / f"transforms_{split}.json").is_file():
-            continue
-        source, content = _read_transforms(folder, split)
-        listed = [frame._replace(name=f"{split}/{frame.name}") for frame in _frames(content, source)[0]]
-        splits[split] = tuple(range(len(frames), len(frames) + len(listed)))
-        frames += listed
-    return Capture("blender", Path(folder), tuple(frames), splits)
+    _read_transforms(folder, "train")  # whose error names the files that there are
+    paths = split_files(folder)
+    read, notes = read_splits(paths, lambda path: _frames(read_json(path), path))
+    frames = {
+        split: [frame._replace(name=f"{split}/{frame.name}") for frame in listed]
+        for split, (listed, _, _) in read.items()
+    }
+    notes = [*(note for *_, own in read.values() for note in own), *notes]
+    listed = tuple(frame for part in frames.values() for frame in part)
+    return Capture("blender", Path(folder), listed, split_ranges(paths, frames), notes=tuple(notes))
 
 
 def _read_transforms(folder, split):
@@ -96,61 +102,66 @@ def _read_transforms(folder, split):
     return source, read_json(source)
 
 
-def _angle(content, source):
+def _check_angle(content, source):
+    """Raises a ValueError if a file has a wrong angle, or neither an angle nor a focal length anywhere."""
+    if "camera_angle_x" not in content:
+        frames = content.get("frames") if isinstance(content.get("frames"), list) else []
+        stated = set(content).union(*(frame for frame in frames if isinstance(frame, dict)))
+        if any(key in stated for key in ("fl_x", "camera_angle_x", "camera_angle_y")):
+            return
     angle = required(content, "camera_angle_x", source)
     if not is_number(angle) or not 1e-6 < angle < math.pi - 1e-6:  # outside, the focal length is no float32
         hint = "convert it from degrees" if is_number(angle) and angle > 0 else "export it again"
         raise ValueError(f"{source}: camera_angle_x is {angle!r}, expected radians between 0 and pi; {hint}")
-    return angle
 
 
 def _frames(content, source, select=None):
-    """Returns the Frames that a file lists, or those that are selected, and the `image_form` of each."""
-    angle, listed = _angle(content, source), required(content, "frames", source)
+    """Returns the Frames that a file lists, or those that are selected, the `image_form` of each, and notes."""
+    _check_angle(content, source)
+    listed = required(content, "frames", source)
     if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
         found = "an empty list" if listed == [] else f"{str(listed)[:40]!r}"
         raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
-    frames, forms = [], []
     times = read_times([(f"{source}, frame {index}", frame) for index, frame in enumerate(listed)])
-    for index in range(len(listed)) if select is None else select(len(listed)):
-        where = f"{source}, frame {index}"
-        path = _image_path(source, listed[index], where)
-        pose = check_pose(required(listed[index], "transform_matrix", where), source=where)
-        forms.append(image_form(path))
-        height, width, _ = forms[-1][0]
-        focal, center = np.full(2, 0.5 * width / math.tan(0.5 * angle)), np.array([width, height]) / 2
-        camera = Camera(to_world=pose, focal=focal, center=center, height=height, width=width)
-        frames.append(Frame(path.stem, path, camera, time=times[index]))
-    return frames, forms
+    chosen = [int(index) for index in (range(len(listed)) if select is None else select(len(listed)))]
+    entries, finder = [(f"{source}, frame {index}", listed[index]) for index in chosen], ImageFinder(source.parent)
+    images = [_image_path(finder, frame, where) for where, frame in entries]
+    poses, notes = read_poses(source, entries)
+    forms = [image_form(path) for path in images]
+    sized = [
+        (where, _with_size(frame, content, form[0]), image)
+        for (where, frame), image, form in zip(entries, images, forms, strict=True)
+    ]
+    cameras, camera_notes = read_cameras([(source, content)], sized, poses)
+    frames = [
+        Frame(image.stem, image, camera, time=times[index])
+        for index, image, camera in zip(chosen, images, cameras, strict=True)
+    ]
+    return frames, forms, [*finder.notes(source), *notes, *camera_notes]
 
 
-def _declared_size(content, source):
-    """Returns the (height, width) that the file states; each is None if it is not stated."""
-    declared = tuple(content.get(key) for key in ("h", "w"))
-    for key, value in zip("hw", declared, strict=True):
-        if value is not None and not (is_number(value) and value >= 1 and value == int(value)):
-            raise ValueError(f"{source}: {key} is {value!r}, expected whole pixels; correct or remove it")
-    return declared
+def _with_size(frame, content, form):
+    """Returns the frame's entries with the size of its image where neither it nor the file states one."""
+    return {key: side for key, side in (("h", form[0]), ("w", form[1])) if key not in content} | frame
 
 
-def _image_path(source, frame, where):
-    inside = check_inside(required(frame, "file_path", where), key="file_path", source=where)
-    path = source.parent / inside
-    tried = [path, path.with_name(path.name + ".png")]
-    found = [candidate for candidate in tried if candidate.is_file()]
-    if not found:
-        raise ValueError(f"{where}: {tried[1]} does not exist, expected its image; copy it or remove the frame")
-    return found[0]
+def _image_path(finder, frame, where):
+    path = finder.inside(required(frame, "file_path", where), key="file_path", source=where)
+    if found := finder.find(path):
+        return found
+    todo = nearly(finder, path) or "; copy it or remove the frame"
+    raise ValueError(f"{where}: {finder.folder / path}.png does not exist, expected its image{todo}")
 
 
-def _check_image(path, form, factor, background, declared):
+def _check_image(frame, form, factor, background):
     """Raises a ValueError if an image has no alpha behind which to composite, or not the stated or a divisible size."""
     (height, width, channels), _ = form
+    path, declared = frame.image, (frame.camera.height, frame.camera.width)
     if background is not None and channels != 4:
         raise ValueError(
             f"{path}: has no alpha, expected RGBA; set data.background to 'none' (background=None) for RGB"
         )
-    if any(side not in (None, have) for side, have in zip(declared, (height, width), strict=True)):
+    if declared != (height, width):
         expected = f"w = {declared[1]}, h = {declared[0]} as its JSON file states"
         raise ValueError(f"{path}: is {width} x {height}, expected {expected}; correct one of them")
     if height % factor or width % factor:
@@ -160,4 +171,8 @@ def _check_image(path, form, factor, background, declared):
         raise ValueError(f"{path}: {found}, expected a divisor; choose one of {works}")
 
 
-READER = Reader(read_capture, detect=lambda folder: (folder / "transforms_train.json").is_file())
+def _detect(folder):
+    return bool(split_files(folder)) and not full_cameras(folder)
+
+
+READER = Reader(read_capture, detect=_detect)

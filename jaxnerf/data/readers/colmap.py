@@ -10,6 +10,7 @@ from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.colmap_model import (
     AGAIN,
+    MODEL_FOLDERS,
     UNDISTORT,
     check_complete,
     count_images,
@@ -17,6 +18,7 @@ from jaxnerf.data.readers.colmap_model import (
     model_suffix,
     read_model,
 )
+from jaxnerf.data.readers.image_paths import ImageFinder, nearly
 from jaxnerf.data.readers.validation import check_inside, is_number
 from jaxnerf.registry import Reader
 
@@ -51,12 +53,13 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     """Returns the Capture of the COLMAP model in a folder, in the model's world.
 
     Registered images whose file is missing are skipped, and so are observations of points that points3D lacks:
-    users delete points, and the remaining ones stay correct. Both are noted. If there are no points, `points`
-    and the frames' `seen` are None.
+    users delete points, and the remaining ones stay correct. Both are noted. If there are no points, or no
+    points3D, `points` and the frames' `seen` are None.
 
     Args:
         folder: has cameras, images and points3D, as .bin or else .txt, in sparse/0, sparse, colmap/sparse/0,
-            colmap/sparse or itself, and the image files in images/ or itself.
+            colmap/sparse, dense/0/sparse, dense/sparse or itself, and the image files in images/ (of a model in
+            dense/, in images/ beside it) or itself. A name may begin with images/, and differ in case.
 
     Raises:
         ValueError: names the file, what was found, what is expected and what to do; also if more than half of
@@ -67,11 +70,11 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     if model is None:
         check_complete(folder)
         raise ValueError(
-            f"{folder}: has no cameras and images, .bin or .txt, in sparse/0, sparse, colmap/sparse/0 or "
-            "itself, expected a COLMAP model; correct the folder"
+            f"{folder}: has no cameras and images, .bin or .txt, in sparse/0, sparse, colmap/sparse/0, dense/0/sparse "
+            "or itself, expected a COLMAP model; correct the folder"
         )
     cameras, images, ids, points = read_model(model)
-    present, notes = _find_images(images, folder, model_file(model, "images"))
+    present, notes = _find_images(images, _image_folder(folder, model), model_file(model, "images"))
     frames = [_frame(path, name, image, cameras[image.camera], ids) for path, name, image in present]
     notes += _check_seen(frames, present, model) + _other_models(folder, model)
     if not len(ids):
@@ -82,42 +85,54 @@ def read_capture(folder: str | os.PathLike) -> Capture:
 
 def models_in(folder: Path) -> list[Path]:
     """Returns the folders of all COLMAP models of a dataset, in the order of their numbers."""
-    for base in (folder / "sparse", folder / "colmap" / "sparse"):
+    dense = [base for base in sorted(folder.glob(MODEL_FOLDERS[-1])) if model_suffix(base)]
+    for base in (folder / place for place in MODEL_FOLDERS[:-1]):
         numbered = [path for path in base.glob("*") if path.name.isdecimal() and model_suffix(path)]
         if numbered:
             return sorted(numbered, key=lambda path: int(path.name))
         if model_suffix(base):
             return [base]
-    return [folder] if model_suffix(folder) else []
+    return dense or ([folder] if model_suffix(folder) else [])
+
+
+def _image_folder(folder, model):
+    """Returns the folder of a model's images: images/, beside a model in dense/, or else the dataset's folder."""
+    if model.is_relative_to(folder / "dense"):
+        folder = model.parent if model.name == "sparse" else model.parent.parent
+    return folder / "images" if (folder / "images").is_dir() else folder
 
 
 def _other_models(folder, model):
-    others = [path.name for path in models_in(folder) if path != model]
+    models = models_in(folder)
+    base = os.path.commonpath(models)
+    others = [os.path.relpath(path, base) for path in models if path != model]
     note = f"{model}: used, as it has most images; other models skipped: {', '.join(others)}"
     return [note] if others else []
 
 
-def _find_images(images, folder, source):
+def _find_images(images, root, source):
     """Returns (path, name below the folder of images, Image) of those with a file, and the notes."""
-    root = folder / "images" if (folder / "images").is_dir() else folder
-    found, missing = {}, []
+    found, missing, finder = {}, [], ImageFinder(root)
     for image in images:
-        path = root / check_inside(image.name, key="its name", source=image.where)
+        name = check_inside(image.name, key="its name", source=image.where)
+        path = finder.find_exact(name) or finder.find_exact(name.removeprefix(f"{root.name}/")) or root / name
         if path in found:
             raise ValueError(
                 f"{image.where}: {image.name[:80]!r} occurs twice, expected one pose for each image; {AGAIN}"
             )
-        if os.path.isfile(path):  # Path.is_file raises if the name is too long
+        if os.path.isfile(path):
             found[path] = (path, path.relative_to(root).with_suffix("").as_posix(), image)
         else:
             missing.append(image.name)
+    notes = finder.notes(source)
     if not missing:
-        return list(found.values()), []
+        return list(found.values()), notes
     named = ", ".join(repr(name[:80]) for name in sorted(missing)[:5]) + ", ..." * (len(missing) > 5)
+    hint = nearly(finder, *sorted(missing))
     note = f"{root}: lacks {len(missing)} of {len(images)} images of {source}, {named}"
     if len(missing) > len(images) / 2:
-        raise ValueError(f"{note}; expected at least half of them; copy them there")
-    return list(found.values()), [f"{note}; they are skipped"]
+        raise ValueError(f"{note}; expected at least half of them{hint or '; copy them there'}")
+    return list(found.values()), [*notes, f"{note}; they are skipped{hint}"]
 
 
 def _frame(path, name, image, intrinsics, ids):
@@ -181,6 +196,10 @@ def _check_seen(frames, present, model):
     total = sum(len(image.points) for *_, image in present)
     kept = sum(len(frame.seen) for frame in frames)
     path, images = model_file(model, "points3D"), model_file(model, "images").name
+    if not os.path.lexists(path):
+        others = ", ".join(sorted(other.name for other in model.glob("points3D*")))
+        beside = f", and {others} is not read" if others else ""
+        return [f"{path}: no such file{beside}, so depths are inferred from the cameras alone"]
     if total and not kept:
         raise ValueError(f"{path}: has none of the points that {images} refers to, expected them; {AGAIN}")
     note = f"{path}: lacks the points of {total - kept} observations in {images}; they are skipped"

@@ -85,6 +85,10 @@ class Image(NamedTuple):
     seen_at: Float[np.ndarray, "M 2"]
 
 
+# Where models lie below a dataset's folder: COLMAP's, nerfstudio's, and the undistorter's, which has its own images.
+MODEL_FOLDERS = ("sparse", "colmap/sparse", "dense/sparse", "dense/*/sparse")
+
+
 def model_suffix(folder: Path) -> str | None:
     """Returns the suffix of the model's files in a folder, ".bin" before ".txt"; None if there is no model."""
     for suffix in (".bin", ".txt"):
@@ -95,21 +99,25 @@ def model_suffix(folder: Path) -> str | None:
 
 def check_complete(folder: str | os.PathLike) -> None:
     """Raises a ValueError if a dataset's folder holds a part of a model, but not its cameras and images."""
-    for base in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."):
+    places = [place for base in MODEL_FOLDERS for place in (f"{base}/0", base)]
+    for base in (*(path for place in places for path in sorted(Path(folder).glob(place))), Path(folder)):
         for suffix in (".bin", ".txt"):
             names = [f"{name}{suffix}" for name in ("cameras", "images", "points3D")]
-            found = [name for name in names if os.path.isfile(Path(folder, base, name))]
+            found = [name for name in names if os.path.isfile(base / name)]
             missing = [name for name in names[:2] if name not in found]
             if found and missing:
                 raise ValueError(
-                    f"{Path(folder, base)}: has {' and '.join(found)} but no {' and '.join(missing)}, expected all "
+                    f"{base}: has {' and '.join(found)} but no {' and '.join(missing)}, expected all "
                     f"files of a COLMAP model; {AGAIN}"
                 )
 
 
 def model_file(folder: Path, name: str) -> Path:
-    """Returns the path of a model's file "cameras", "images" or "points3D"."""
-    return folder / f"{name}{model_suffix(folder)}"
+    """Returns the path of a model's file "cameras", "images" or "points3D"; the latter may be of the other kind."""
+    suffix = model_suffix(folder)
+    other = folder / f"{name}{'.txt' if suffix == '.bin' else '.bin'}"
+    path = folder / f"{name}{suffix}"
+    return other if not os.path.isfile(path) and os.path.isfile(other) else path
 
 
 def count_images(folder: Path) -> int:
@@ -123,7 +131,7 @@ def count_images(folder: Path) -> int:
 def read_model(
     folder: Path,
 ) -> tuple[dict[int, Intrinsics], list[Image], Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
-    """Returns a model's {id: Intrinsics}, images, point ids in ascending order, and points.
+    """Returns a model's {id: Intrinsics}, images, point ids in ascending order, and points; none without points3D.
 
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
@@ -139,7 +147,8 @@ def read_model(
         raise ValueError(f"{images_path}: holds no image, expected at least one; {AGAIN}")
     for image in images:
         _check_image(image, cameras, path)
-    rows = list((_binary_points if binary else _text_points)(points_path))
+    parse = _binary_points if points_path.suffix == ".bin" else _text_points
+    rows = list(parse(points_path)) if os.path.lexists(points_path) else []
     ids = np.array([row[0] for row in rows], np.int64)
     points = np.array([row[1:] for row in rows], np.float64).reshape(-1, 3)
     _check_points(ids, points, points_path)
@@ -253,10 +262,37 @@ def _entries(lines):
 
 
 def _image_lines(path):
-    """Yields (where, line of the image, line of its observations, which may be empty)."""
-    lines = _lines(path)
-    for where, line in _entries(lines):
-        yield where, line, next(lines, ("", ""))[1]
+    """Yields (where, line of the image, line of its observations, which may be empty or absent)."""
+    image = None
+    for where, line in _lines(path):
+        if image and _is_image(line):
+            yield *image, ""
+            image = where, line
+        elif image:
+            yield *image, line
+            image = None
+        elif line and not line.startswith("#"):
+            image = where, line
+    if image:
+        yield *image, ""
+
+
+def _is_image(line):
+    """Returns whether a line is an image's and not one of observations, which are numbers in threes."""
+    *words, name = [*line.split(maxsplit=9), ""][:10]
+    if not name or not _is_of(words, (int, *(float,) * 7, int)):
+        return False
+    rest = name.split()
+    return len(rest) % 3 != 0 or not _is_of(rest, (float,) * len(rest))
+
+
+def _is_of(words, kinds):
+    try:
+        for kind, word in zip(kinds, words, strict=False):
+            kind(word)
+    except (ValueError, OverflowError):
+        return False
+    return True
 
 
 def _split(where, line, kinds, expected):

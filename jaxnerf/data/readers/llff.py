@@ -8,6 +8,7 @@ from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.images.downscaled_copies import downscaled_folders, list_images
 from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.json_frames import rounding_notes
 from jaxnerf.data.readers.validation import MAX_FLOAT32, read_npy
 from jaxnerf.registry import Reader
 
@@ -19,7 +20,7 @@ def read_capture(folder: Path) -> Capture:
         ValueError: names the file, what was found, what is expected and what to do.
     """
     source = folder / "poses_bounds.npy"
-    poses, bounds, shapes = _read_poses(source)
+    poses, bounds, shapes, notes = _read_poses(source)
     paths = _image_paths(folder)
     if len(paths) != len(poses):
         raise ValueError(
@@ -36,11 +37,11 @@ def read_capture(folder: Path) -> Capture:
             width=int(width),
         )
         frames.append(Frame(path.stem, path, camera, follow_exif=False, bounds=tuple(bound.tolist())))
-    return Capture("llff", source, tuple(frames))
+    return Capture("llff", source, tuple(frames), notes=tuple(notes))
 
 
 def _read_poses(path):
-    """Returns poses [N, 3, 4] (x right, y up, looking along -z), bounds [N, 2] and (h, w, f) [N, 3]."""
+    """Returns poses [N, 3, 4] (x right, y up, looking along -z), bounds [N, 2], (h, w, f) [N, 3] and notes."""
     rows = read_npy(path, "floats [N, 17]")
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind != "f":
         raise ValueError(f"{path}: holds {rows.dtype} {rows.shape}, expected floats [N, 17]; export it again")
@@ -58,10 +59,9 @@ def _read_poses(path):
             raise ValueError(f"{path}: row {row} has {found}, expected pixels above 0; export it again")
     # The file's axes are down, right, backwards.
     axes = [matrices[..., 1], -matrices[..., 0], matrices[..., 2], matrices[..., 3]]
-    poses = np.stack(axes, axis=-1)
-    for row, pose in enumerate(poses):
-        check_pose(pose, source=f"{path}, row {row}", shape=(3, 4))
-    return poses, bounds, matrices[..., 4]
+    stated = np.stack(axes, axis=-1)
+    poses = [check_pose(pose, source=f"{path}, row {row}", shape=(3, 4)) for row, pose in enumerate(stated)]
+    return poses, bounds, matrices[..., 4], rounding_notes(path, poses, stated)
 
 
 def _image_paths(folder):

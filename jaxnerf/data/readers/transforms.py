@@ -1,32 +1,28 @@
 """Reader of the format of nerfstudio and instant-ngp: one transforms.json beside images."""
 
-import math
 import os
-import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxnerf.core.types import Camera
-from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size
 from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.image_paths import ImageFinder, fold, nearly
+from jaxnerf.data.readers.intrinsics import number_in, wrong_value
+from jaxnerf.data.readers.json_frames import read_cameras, read_poses, read_splits, split_ranges
 from jaxnerf.data.readers.ply import read_points
-from jaxnerf.data.readers.validation import check_inside, is_number, read_json, read_times, required, short_repr
+from jaxnerf.data.readers.split_files import SPLITS, full_cameras, split_files
+from jaxnerf.data.readers.validation import is_number, read_json, read_times, required
 from jaxnerf.registry import Reader
-
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
-_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-_UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")  # instant-ngp's other lenses
-_ANGLES = ("camera_angle_x", "camera_angle_y")
-_OTHERS = ("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
 def read_capture(folder: str | os.PathLike) -> Capture:
-    """Returns the Capture of the images that <folder>/transforms.json lists.
+    """Returns the Capture of the images that <folder>/transforms.json lists, or transforms_{train,val,test}.json.
 
-    A field of a frame's camera overrides the file's field. Frames whose image is missing are skipped and noted.
+    The latter are read if they state more cameras' facts than Blender's renders do, see `full_cameras`.
+
+    A field of a frame's camera overrides the file's field. Frames whose image is missing are skipped and noted,
+    and so is a file of another split than "train" that cannot be read.
     Of an absolute path, such as one of another computer, the longest end that exists in the folder is used; this
     is noted, too.
     The world is that of the file's poses: applied_transform and applied_scale are checked for their form, but
@@ -39,35 +35,81 @@ def read_capture(folder: str | os.PathLike) -> Capture:
         folder: holds transforms.json. Relative paths in that file that lead out of the folder are errors.
 
     Returns:
-        Capture. Its splits are the file's lists of names that are not empty. A camera's height and width are
-        those that the file states; if center or focal depend on the size and it is not stated, they are the
-        upright image's.
+        Capture. Its splits are the files' if there are several, or the file's lists of names that are not empty.
+        A camera's height and width are those that the file states; if center or focal depend on the size and it is
+        not stated, they are the upright image's. Points and box are those of the first file.
 
     Raises:
         ValueError: names file and frame, what was found, what is expected and what to do.
     """
     if not isinstance(folder, str | os.PathLike):
         raise ValueError(f"folder is {folder!r}, expected the path of a dataset's folder; pass one")
-    source = Path(folder) / "transforms.json"
-    content = read_json(source)
-    entries, notes = _entries(content, source)
-    kept = [entry for entry in entries if entry.image is not None]
-    masks, times = _masks(entries, kept, source), read_times([(entry.where, entry.content) for entry in kept])
-    _check_applied(content, source)
-    points, points_notes = _points(content, source)
-    box, box_notes = _box(content, source)
+    folder, stated = Path(folder), full_cameras(folder)
+    if stated:
+        return _read_splits(folder, stated)
+    source, finder = folder / "transforms.json", ImageFinder(folder)
+    file = _read_file(source, finder)
+    splits, split_notes = _splits(file, finder)
     return Capture(
         format="transforms",
         source=source,
-        frames=tuple(
-            Frame(entry.name, entry.image, _camera(content, source, entry), mask, time=time)
-            for entry, mask, time in zip(kept, masks, times, strict=True)
-        ),
-        splits=_splits(content, source, entries, kept),
-        points=points,
-        box=box,
-        notes=(*notes, *points_notes, *box_notes),
+        frames=file.frames,
+        splits=splits,
+        points=file.points,
+        box=file.box,
+        notes=(*file.notes, *finder.notes(source), *split_notes),
+        choices=tuple(_world(file)),
     )
+
+
+def _read_splits(folder, stated):
+    """Returns the Capture of a file for each split; stated: see `full_cameras`."""
+    paths, finder = split_files(folder), ImageFinder(folder)
+    files, notes = read_splits(paths, lambda path: _read_file(path, finder))
+    first = files["train"]
+    frames = dict(zip(files, _common_names(files), strict=True))
+    if (folder / "transforms.json").is_file():
+        notes.append(f"{folder / 'transforms.json'}: not used beside {first.source.name}; rename that to read it")
+    choice = f"{stated}: world, near and far follow from the cameras; --format=blender takes near 2 and far 6"
+    alone = f"{first.source.name}: every 8th view is a test view, as there is no file of another split"
+    held_out = [alone] if len(paths) == 1 else []
+    return Capture(
+        format="transforms",
+        source=first.source,
+        frames=sum(frames.values(), ()),
+        splits=split_ranges(paths, frames) if len(paths) > 1 else None,
+        points=first.points,
+        box=first.box,
+        notes=(*sum((file.notes for file in files.values()), ()), *finder.notes(first.source), *notes),
+        choices=(choice, *held_out, *_world(first)),
+    )
+
+
+class _File(NamedTuple):
+    """What one file states.
+
+    Attributes:
+        source: its path.
+        content: its JSON object.
+        base: the folder that holds all its images, from which they are named.
+        entries: all, sorted by name.
+        frames: of the entries with an image.
+        points, box, notes: see `Capture`.
+    """
+
+    source: Path
+    content: dict
+    base: str
+    entries: list
+    frames: tuple[Frame, ...]
+    points: np.ndarray | None
+    box: tuple | None
+    notes: tuple[str, ...]
+
+    @property
+    def kept(self):
+        """The entries with an image."""
+        return [entry for entry in self.entries if entry.image is not None]
 
 
 class _Entry(NamedTuple):
@@ -88,22 +130,37 @@ class _Entry(NamedTuple):
     content: dict
 
 
-def _entries(content, source):
-    """Returns all entries, sorted by name, and notes."""
+def _read_file(source, finder):
+    content = read_json(source)
+    entries, base, notes = _entries(content, source, finder)
+    kept = [entry for entry in entries if entry.image is not None]
+    masks, times = _masks(entries, kept, finder), read_times([(entry.where, entry.content) for entry in kept])
+    _check_applied(content, source)
+    points, points_notes = _points(content, source, finder)
+    box, box_notes = _box(content, source)
+    poses, pose_notes = read_poses(source, [(entry.where, entry.content) for entry in kept])
+    cameras, camera_notes = read_cameras(
+        [(source, content)], [(entry.where, entry.content, entry.image) for entry in kept], poses
+    )
+    frames = tuple(
+        Frame(entry.name, entry.image, camera, mask, time=time)
+        for entry, camera, mask, time in zip(kept, cameras, masks, times, strict=True)
+    )
+    notes = (*notes, *pose_notes, *camera_notes, *points_notes, *box_notes)
+    return _File(source, content, base, entries, frames, points, box, notes)
+
+
+def _entries(content, source, finder):
+    """Returns all entries, sorted by name, the folder that holds all their images, and notes."""
     frames = required(content, "frames", source)
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise _wrong(source, "frames", frames, "a list of one object {...} per image; export it again")
+        raise wrong_value(source, "frames", frames, "a list of one object {...} per image; export it again")
     places = [f"{source}, frame {index}" for index in range(len(frames))]
     stated = [required(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
-    paths = [
-        _path(source.parent, path, key="file_path", source=where) for path, where in zip(stated, places, strict=True)
-    ]
-    images = [_find(source.parent, path) for path in paths]
+    paths = [finder.inside(path, key="file_path", source=where) for path, where in zip(stated, places, strict=True)]
+    images = [finder.find(path) for path in paths]
     base = os.path.commonpath([os.path.dirname(path) for path in paths])
-    names = []
-    for path, image in zip(paths, images, strict=True):
-        whole = image is not None and image.name != os.path.basename(path)  # the file_path has no extension
-        names.append(os.path.relpath(path if whole else os.path.splitext(path)[0], base or "."))
+    names = [os.path.relpath(_without_suffix(*pair), base or ".") for pair in zip(paths, images, strict=True)]
     entries = sorted(map(_Entry, places, paths, images, names, frames), key=lambda entry: entry.name)
     for entry, other in zip(entries[:-1], entries[1:], strict=True):
         if entry.name == other.name:
@@ -111,55 +168,44 @@ def _entries(content, source):
             raise ValueError(f"{source}: {found}, expected different names; remove or rename one")
     depths = sum("depth_file_path" in frame or "depth_path" in frame for frame in frames)
     notes = [f"{source}: depth files of {depths} frames are not used"] if depths else []
-    absolute = [index for index, path in enumerate(stated) if _parts_of_absolute(path)]
-    if absolute:
-        example = f"{short_repr(stated[absolute[0]])} as {paths[absolute[0]]}"
-        notes.append(f"{source}: has {len(absolute)} absolute file_paths, read from its own folder: {example}")
-    return entries, [*_missing(entries, source), *notes]
+    return entries, base, [*_missing(entries, source, finder), *notes]
 
 
-def _path(folder, name, *, key, source):
-    """Returns a path of the file relative to its folder; see `check_inside`, and `read_capture` for absolute ones."""
-    parts = _parts_of_absolute(name)
-    if not parts or ".." in parts:
-        return check_inside(name, key=key, source=source)
-    ends = ["/".join(parts[start:]) for start in range(len(parts))] + [f"images/{parts[-1]}"]
-    ends = list(dict.fromkeys(ends))
-    for end in ends:
-        if _find(folder, end):
-            return check_inside(end, key=key, source=source)
-    raise ValueError(
-        f"{source}: {key} {short_repr(name)} leaves the folder, and {folder} has no {' or '.join(ends[-2:])} either; "
-        "copy the file there, or correct the path"
-    )
+def _without_suffix(path, image):
+    """Returns a file_path without extension; it may have none, and dots in its name."""
+    name = os.path.basename(path)
+    has_none = image is not None and image.name != name and fold(image.stem) == fold(name)
+    return path if has_none else os.path.splitext(path)[0]
 
 
-def _parts_of_absolute(name):
-    """Returns the folders and the name of an absolute path of any system; [] if it is relative."""
-    match = re.match(r"([A-Za-z]:)?[/\\](.*)", name, re.DOTALL) if isinstance(name, str) else None
-    return [part for part in re.split(r"[/\\]", match[2]) if part not in ("", ".")] if match else []
+def _common_names(files):
+    """Returns the frames of each file, named from the folder of all images, and after the split if names repeat."""
+    base = os.path.commonpath([file.base for file in files.values()])
+    named = {}
+    for split, file in files.items():
+        prefix = os.path.relpath(file.base or ".", base or ".")
+        names = [os.path.normpath(f"{prefix}/{frame.name}") for frame in file.frames]
+        named[split] = tuple(frame._replace(name=name) for frame, name in zip(file.frames, names, strict=True))
+    names = [frame.name for frames in named.values() for frame in frames]
+    if len(set(names)) == len(names):
+        return list(named.values())
+    return [tuple(frame._replace(name=f"{split}/{frame.name}") for frame in frames) for split, frames in named.items()]
 
 
-def _find(folder, path):
-    """Returns the file at a path in the folder, with or without extension; None if there is none."""
-    for candidate in (path, *(path + extension for extension in IMAGE_SUFFIXES)):
-        if os.path.isfile(folder / candidate):
-            return folder / candidate
-    return None
-
-
-def _missing(entries, source):
-    names = [entry.name for entry in entries if entry.image is None]
-    if not names:
+def _missing(entries, source, finder):
+    missing = [entry for entry in entries if entry.image is None]
+    if not missing:
         return []
+    names, hint = [entry.name for entry in missing], nearly(finder, *(entry.path for entry in missing))
     count = f"{len(names)} of {len(entries)} frames have no file"
     listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     if 2 * len(names) > len(entries):
-        raise ValueError(f"{source}: {count} ({listed}), expected most of them; copy them or correct file_path")
-    return [f"{source}: {count} and are skipped: {listed}"]
+        todo = hint or "; copy them or correct file_path"
+        raise ValueError(f"{source}: {count} ({listed}), expected most of them{todo}")
+    return [f"{source}: {count} and are skipped: {listed}{hint}"]
 
 
-def _masks(entries, kept, source):
+def _masks(entries, kept, finder):
     """Returns the mask of each kept entry; either all have one or none."""
     without = [entry.where for entry in entries if "mask_path" not in entry.content]
     if len(without) == len(entries):
@@ -168,48 +214,54 @@ def _masks(entries, kept, source):
         raise ValueError(f"{without[0]}: has no mask_path, other frames have; expected all or none; complete them")
     masks = []
     for entry in kept:
-        path = _path(source.parent, entry.content["mask_path"], key="mask_path", source=entry.where)
-        masks.append(_find(source.parent, path))
+        path = finder.inside(entry.content["mask_path"], key="mask_path", source=entry.where)
+        masks.append(finder.find(path))
         if masks[-1] is None:
-            raise ValueError(f"{entry.where}: mask {path!r} does not exist, expected its file; copy it")
+            hint = nearly(finder, path) or "; copy it"
+            raise ValueError(f"{entry.where}: mask {path!r} does not exist, expected its file{hint}")
     return masks
 
 
-def _splits(content, source, entries, kept):
-    known = {entry.path for entry in entries}
-    places = {entry.path: index for index, entry in enumerate(kept)}
-    places |= {os.path.relpath(entry.image, source.parent): index for index, entry in enumerate(kept)}
-    splits = {}
-    for split in ("train", "val", "test"):
+def _splits(file, finder):
+    """Returns the splits of the file's lists of names, None if it has none, and notes."""
+    places = {entry.path: index for index, entry in enumerate(file.kept)}
+    places |= {entry.image: index for index, entry in enumerate(file.kept)}
+    absent = {entry.path for entry in file.entries if entry.image is None}
+    splits, notes = {}, []
+    for split in SPLITS:
         key = f"{split}_filenames"
-        names = content.get(key, [])
+        names = file.content.get(key, [])
         if not isinstance(names, list):
-            raise _wrong(source, key, names, "a list of file_paths; correct or remove it")
-        chosen = set()
-        for name in names:
-            path = _path(source.parent, name, key=key, source=source)
-            if path not in places:
-                found = "which has no file" if path in known else "which is not among the frames"
-                raise ValueError(
-                    f"{source}: {key} has {path!r}, {found}; expected a frame with a file; copy or remove it"
-                )
-            chosen.add(places[path])
-        if chosen:
+            raise wrong_value(file.source, key, names, "a list of file_paths; correct or remove it")
+        paths = [finder.inside(name, key=key, source=file.source) for name in names]
+        chosen = {places.get(path, places.get(finder.find(path))) for path in paths if path not in absent}
+        if None in chosen:
+            wrong = next(path for path in paths if path not in absent and places.get(finder.find(path)) is None)
+            found = f"{key} has {wrong!r}, which is not among the frames"
+            raise ValueError(f"{file.source}: {found}; expected a frame; add or remove it")
+        if skipped := len(absent & set(paths)):
+            notes.append(f"{file.source}: {skipped} of {len(paths)} names in {key} have no file and are skipped")
+        if paths:
             splits[split] = tuple(sorted(chosen))
-    return splits or None
+    unused = len(file.kept) - len(set().union(*splits.values()))
+    if "train" in splits and len(splits) > 1 and unused:
+        notes.append(f"{file.source}: {unused} frames are in no list of names, so no split has them")
+    return splits or None, notes
 
 
-def _camera(content, source, entry):
-    matrix = required(entry.content, "transform_matrix", entry.where)
-    pose = check_pose(matrix, source=entry.where)
-    return _read_camera([(source, content), (entry.where, entry.content)], to_world=pose, image=entry.image)
+def _world(file):
+    """Returns a line about fields that say how the file's world was made from another, if there are any."""
+    keys = [key for key in ("applied_transform", "applied_scale", "orientation_override") if key in file.content]
+    if not keys:
+        return []
+    return [f"{file.source.name}: {', '.join(keys)} not undone: the world of the file is that of its poses"]
 
 
-def _points(content, source):
+def _points(content, source, finder):
     """Returns the points of the file's PLY file, or None; and notes."""
     if "ply_file_path" not in content:
         return None, []
-    path = source.parent / _path(source.parent, content["ply_file_path"], key="ply_file_path", source=source)
+    path = source.parent / finder.inside(content["ply_file_path"], key="ply_file_path", source=source)
     if not os.path.isfile(path):
         return None, [f"{source}: ply_file_path {path.name} does not exist, so no points are used"]
     try:
@@ -225,12 +277,12 @@ def _box(content, source):
     if "aabb" in content or "normal_mts_args" in content:  # these define scale and offset differently
         return None, [f"{source}: aabb_scale is not used, as the file has aabb or normal_mts_args"]
     fields = {key: (content[key], source) for key in ("aabb_scale", "scale") if key in content}
-    side = _number(fields, "aabb_scale", "a number from 1e-6 to 1e6", 1e-6, 1e6)
-    scale = _number(fields, "scale", "a number from 1e-6 to 1e6", 1e-6, 1e6) if "scale" in content else 0.33
+    side = number_in(fields, "aabb_scale", "a number from 1e-6 to 1e6", 1e-6, 1e6)
+    scale = number_in(fields, "scale", "a number from 1e-6 to 1e6", 1e-6, 1e6) if "scale" in content else 0.33
     offset = content.get("offset", 0.5)
     offset = offset if isinstance(offset, list) else [offset] * 3
     if len(offset) != 3 or not all(is_number(value) for value in offset):
-        raise _wrong(source, "offset", content["offset"], "three numbers; correct or remove it")
+        raise wrong_value(source, "offset", content["offset"], "three numbers; correct or remove it")
     # A cube around 0.5 is invariant under the cyclic permutation of the axes, which is therefore not undone.
     center, half = (0.5 - np.array(offset, np.float64)) / scale, 0.5 * side / scale
     return (center - half, center + half), []
@@ -241,121 +293,13 @@ def _check_applied(content, source):
         rows = content["applied_transform"]
         lists = isinstance(rows, list) and len(rows) in (3, 4) and all(isinstance(row, list) for row in rows)
         if not lists or not all(len(row) == 4 and all(map(is_number, row)) for row in rows):
-            raise _wrong(source, "applied_transform", rows, "3 or 4 rows of 4 numbers; correct or remove it")
+            raise wrong_value(source, "applied_transform", rows, "3 or 4 rows of 4 numbers; correct or remove it")
     if "applied_scale" in content:
-        _number({"applied_scale": (content["applied_scale"], source)}, "applied_scale", "more than 0", 1e-30)
+        number_in({"applied_scale": (content["applied_scale"], source)}, "applied_scale", "more than 0", 1e-30)
 
 
-def _read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: Path) -> Camera:
-    """Returns the float64 camera of one image.
-
-    The center defaults to the middle of the image, the focal length in y to that in x. A perspective lens
-    whose coefficients are all 0 is a pinhole. The size is the stated one. If it is not stated and center or
-    focal depend on it, it is the image's after EXIF rotation; otherwise it is None.
-
-    Args:
-        levels: [(where, entries)]: the file's, then the frame's. Later levels override earlier ones field by
-            field; a later level's angle overrides an earlier one's focal length. where: for messages.
-        to_world: [3, 4].
-        image: opened only if its size is needed.
-
-    Raises:
-        ValueError: names where, what was found, what is expected and what to do.
-    """
-    fields, where = _fields(levels), levels[-1][0]
-    size = [_size(fields, key) for key in "wh"]
-    if None in size and (size != [None, None] or not {"cx", "cy", "fl_x"} <= fields.keys()):
-        found = image_size(image)
-        size = [have if stated is None else stated for stated, have in zip(size, found, strict=True)]
-    lens, distortion = _lens(fields, where)
-    center = [
-        _number(fields, key, "a number of px") if key in fields else length / 2
-        for key, length in zip(("cx", "cy"), size, strict=True)
-    ]
-    return Camera(
-        to_world=to_world,
-        focal=_focal(fields, size, where),
-        center=np.array(center, np.float64),
-        distortion=distortion,
-        lens=lens,
-        height=size[1],
-        width=size[0],
-    )
+def _detect(folder):
+    return (folder / "transforms.json").is_file() or bool(full_cameras(folder))
 
 
-def _number(fields, key, expected, low=-math.inf, high=math.inf):
-    """Returns the float in fields, {key: (value, where)}; ValueError unless it is a number in [low, high]."""
-    value, where = fields[key]
-    if not is_number(value) or not low <= value <= high:
-        raise _wrong(where, key, value, f"{expected}; correct it or export the file again")
-    return float(value)
-
-
-def _wrong(where, key, value, expected):
-    return ValueError(f"{where}: {key} is {short_repr(value)}, expected {expected}")
-
-
-def _fields(levels):
-    """Returns {key: (value, where it is stated)} of all fields of a camera."""
-    fields, keys = {}, (*_OTHERS, *_ANGLES, *_COEFFICIENTS, *_UNSUPPORTED)
-    for where, level in levels:
-        if "fl_x" not in level and any(key in level for key in _ANGLES):
-            fields = {key: field for key, field in fields.items() if key not in ("fl_x", "fl_y")}
-        fields |= {key: (level[key], where) for key in keys if key in level}
-        if "distortion_params" in level:
-            values = level["distortion_params"]
-            if not isinstance(values, list) or len(values) != 6:
-                raise _wrong(where, "distortion_params", values, "the numbers k1 k2 k3 k4 p1 p2; export the file again")
-            fields |= {key: (value, where) for key, value in zip(_COEFFICIENTS, values, strict=True)}
-    return fields
-
-
-def _focal(fields, size, where):
-    lengths = []
-    for axis, pixels in zip("xy", size, strict=True):
-        if f"fl_{axis}" in fields:
-            lengths.append(_number(fields, f"fl_{axis}", "px between 0.001 and 1e9", 1e-3, 1e9))
-        elif f"camera_angle_{axis}" in fields and "fl_x" not in fields:
-            angle = _number(fields, f"camera_angle_{axis}", "radians between 0 and pi", 1e-6, math.pi - 1e-6)
-            lengths.append(0.5 * pixels / math.tan(0.5 * angle))
-    if not lengths:
-        raise ValueError(
-            f"{where}: has no fl_x or camera_angle_x, nor has the file; expected one; export the file again"
-        )
-    return np.array([lengths[0], lengths[-1]], np.float64)
-
-
-def _lens(fields, where):
-    """Returns the lens and its coefficients; the latter are None for a pinhole."""
-    model, place = fields.get("camera_model", (None, where))
-    fisheye, flag = fields.get("is_fisheye", (model == "OPENCV_FISHEYE", where))
-    other = [key for key in _UNSUPPORTED if key in fields]
-    if other or model not in (None, *_PERSPECTIVE, "OPENCV_FISHEYE"):
-        found = f"has {other[0]}" if other else f"camera_model is {short_repr(model)}"
-        expected = f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE"
-        raise ValueError(f"{place}: {found}, expected {expected}; convert the images to one of these")
-    if not isinstance(fisheye, bool) or (model is not None and fisheye != (model == "OPENCV_FISHEYE")):
-        expected = "true or false" if model is None else f"the value that camera_model {model} implies"
-        raise _wrong(flag, "is_fisheye", fisheye, f"{expected}; correct or remove it")
-    values = {key: _number(fields, key, "a number") if key in fields else 0.0 for key in _COEFFICIENTS}
-    for key in ("p1", "p2") if fisheye else ("k4",):
-        if values[key]:
-            kind = "fisheye lens has k1 k2 k3 k4" if fisheye else "perspective lens has k1 k2 k3 p1 p2"
-            raise _wrong(fields[key][1], key, values[key], f"0, as a {kind}; calibrate without it")
-    if fisheye:
-        return "fisheye", np.array([values[key] for key in ("k1", "k2", "k3", "k4")])
-    keys = ("k1", "k2", "p1", "p2", "k3") if values["k3"] else ("k1", "k2", "p1", "p2")
-    distortion = np.array([values[key] for key in keys])
-    return ("opencv", distortion) if distortion.any() else ("pinhole", None)
-
-
-def _size(fields, key):
-    if key not in fields:
-        return None
-    pixels = _number(fields, key, "whole pixels from 1 to 1000000", 1, 1e6)
-    if pixels != int(pixels):
-        raise _wrong(fields[key][1], key, pixels, "whole pixels; correct or remove it")
-    return int(pixels)
-
-
-READER = Reader(read_capture, detect=lambda folder: (folder / "transforms.json").is_file())
+READER = Reader(read_capture, detect=_detect)

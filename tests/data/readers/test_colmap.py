@@ -249,6 +249,99 @@ def test_points_may_be_deleted_but_not_another_models(tmp_path):
     assert all(frame.seen is None and frame.seen_at is None for frame in unknown.frames)
 
 
+@pytest.mark.parametrize("write", [binary, text])
+@pytest.mark.parametrize("beside", [None, "points3D.ply"])
+def test_a_model_without_points_is_read_with_a_note(tmp_path, write, beside):
+    """The observations of points that are not there are dropped, as if the file of points were empty."""
+    put(tmp_path, write(*model()))
+    expected = colmap.read_capture(tmp_path).frames
+    next((tmp_path / "sparse" / "0").glob("points3D*")).unlink()
+    if beside:
+        (tmp_path / "sparse" / "0" / beside).touch()
+    capture = colmap.read_capture(tmp_path)
+    assert capture.points is None and all(frame.seen is None for frame in capture.frames)
+    jax.tree.map(np.testing.assert_array_equal, [f.camera for f in capture.frames], [f.camera for f in expected])
+    assert len(capture.notes) == 1 and "no such file" in capture.notes[0]
+    assert (f"{beside} is not read" in capture.notes[0]) == (beside is not None)
+
+
+def test_points_may_be_of_the_other_kind(tmp_path):
+    put(tmp_path, text(*model()))
+    expected = colmap.read_capture(tmp_path)
+    (tmp_path / "sparse" / "0" / "points3D.txt").unlink()
+    (tmp_path / "sparse" / "0" / "points3D.bin").write_bytes(binary(*model())["points3D.bin"])
+    assert_same(colmap.read_capture(tmp_path), expected)
+
+
+@pytest.mark.parametrize("names", [NAMES, ("1", "2 3 4", "5.5"), ("4.jpg", "a 1 2", "7 8 b")])
+@pytest.mark.parametrize("kept", [(), (0,), (1,), (0, 2)])
+def test_lines_of_observations_may_be_absent(tmp_path, names, kept):
+    """Images of the lines in `kept` have observations, the others neither these nor an empty line."""
+    cameras, images, points = model()
+    seen = [(1.5, 2.0, 5), (3.0, 4.0, 900), (7.0, 8.0, 12)]
+    images = [
+        (*image[:3], name, seen if index in kept else [])
+        for index, (image, name) in enumerate(zip(images, names, strict=True))
+    ]
+    if names[1] == "2 3 4":
+        images[1] = (*images[1][:3], "2 3 x", images[1][4])  # three numbers in its place would be observations
+    contents = text(cameras, images, points)
+    files = [image[3] for image in images]
+    expected = colmap.read_capture(put(tmp_path / "whole", contents, images=files))
+    contents["images.txt"] = contents["images.txt"].replace(b"\n\n", b"\n")
+    assert_same(colmap.read_capture(put(tmp_path / "short", contents, images=files)), _moved(expected, tmp_path))
+    assert colmap.count_images(tmp_path / "short" / "sparse" / "0") == 3
+
+
+def _moved(capture, folder):
+    """Returns a Capture of whole/ as if it were of short/."""
+    frames = [
+        frame._replace(image=folder / "short" / frame.image.relative_to(folder / "whole")) for frame in capture.frames
+    ]
+    return capture._replace(frames=tuple(frames))
+
+
+@pytest.mark.parametrize("base", ["dense/0/sparse", "dense/sparse", "dense/1/sparse"])
+def test_the_undistorters_models_have_images_of_their_own(tmp_path, base):
+    put(tmp_path, text(*model()), base=base)  # originals in images/
+    own = (tmp_path / base).parent / "images"
+    for name in NAMES:
+        (own / name).parent.mkdir(parents=True, exist_ok=True)
+        (own / name).touch()
+    capture = readers.read_capture(tmp_path)
+    assert capture.format == "colmap" and capture.source == tmp_path / base
+    assert [frame.image for frame in capture.frames] == [own / name for name in sorted(NAMES)]
+    put(tmp_path, text(*model()))
+    assert colmap.read_capture(tmp_path).source == tmp_path / "sparse" / "0"
+
+
+def test_of_several_undistorted_models_the_largest_is_read(tmp_path):
+    cameras, images, points = model()
+    for number, count in enumerate((2, 3, 1)):
+        put(tmp_path, text(cameras, images[:count], points), base=f"dense/{number}/sparse")
+    (tmp_path / "dense" / "1" / "images").symlink_to(tmp_path / "images")
+    capture = colmap.read_capture(tmp_path)
+    assert capture.source == tmp_path / "dense" / "1" / "sparse" and len(capture.frames) == 3
+    assert capture.notes[0].endswith("other models skipped: 0/sparse, 2/sparse")
+
+
+def test_names_may_begin_with_images_or_differ_in_case(tmp_path):
+    cameras, images, points = model()
+    put(tmp_path, text(cameras, images, points))
+    expected = colmap.read_capture(tmp_path)
+    for change, notes in ((lambda name: f"images/{name}", 0), (lambda name: name.swapcase(), 1)):
+        stated = [(*image[:3], change(image[3]), image[4]) for image in images]
+        capture = colmap.read_capture(put(tmp_path, text(cameras, stated, points)))
+        assert_same(capture, expected)
+        assert len(capture.notes) == notes and not notes or "3 paths differ from the files" in capture.notes[0]
+
+
+def test_converted_images_are_named(tmp_path):
+    put(tmp_path, text(*model()), images=["a.png", "b.webp"])
+    with pytest.raises(ValueError, match=r"lacks 3 of 3 images .*images/a.png nearly fits 'a.jpg': rename it"):
+        colmap.read_capture(tmp_path)
+
+
 @pytest.mark.parametrize("name", ["/etc/passwd", "../a.jpg", "side/../../a.jpg", ".."])
 def test_a_name_that_leaves_the_folder_is_an_error(tmp_path, name):
     cameras, images, points = model()
@@ -314,13 +407,12 @@ def test_errors_of_the_numbers(tmp_path, parts, message):
         ("points3D.txt", b"9" * 20 + b" 1 2 3 4 5 6 7", "line 1: is '9"),
         ("points3D.txt", b"-5 1 2 3 4 5 6 7", "negative id"),
         ("points3D.txt", b"", "has none of the points that images.txt refers to"),
-        ("points3D.txt", None, "No such file"),
     ],
 )
 def test_errors_of_a_text_file(tmp_path, name, content, message):
     put(tmp_path, text(*model()))
     path = tmp_path / "sparse" / "0" / name
-    path.unlink() if content is None else path.write_bytes(content)
+    path.write_bytes(content)
     with pytest.raises(ValueError, match=message) as caught:
         colmap.read_capture(tmp_path)
     assert name in str(caught.value) and "\n" not in str(caught.value)

@@ -88,3 +88,16 @@ def test_masks_are_part_of_the_fingerprint(tmp_path, shots):
     with_masks = base.fingerprint(base.read_capture(folder))
     (folder / "masks").rename(folder / "no_masks")
     assert base.fingerprint(base.read_capture(folder)) != with_masks
+
+
+@pytest.mark.parametrize("names", ["{}.PNG", "{}.jpg.png", "{}.JPG.png"])
+def test_masks_may_differ_in_case_from_their_images(tmp_path, shots, names):
+    content = captures.write_transforms(tmp_path, shots, kind="jpg", masks=True)
+    for frame in content["frames"]:
+        del frame["mask_path"]
+        name = frame["file_path"][-7:-4]
+        os.rename(tmp_path / "images" / f"{name}.jpg", tmp_path / "images" / f"{name}.JPG")
+        os.rename(tmp_path / "masks" / f"{name}.png", tmp_path / "masks" / names.format(name))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    frames = base.read_capture(tmp_path).frames
+    assert [frame.mask for frame in frames] == [tmp_path / "masks" / names.format(name) for name in NAMES]
