@@ -23,7 +23,8 @@ class Changes(enum.Flag):
     """What depends on an option.
 
     Attributes:
-        NOTHING: the results of a run do not; other options may be inferred from it.
+        NOTHING: finished steps and given images do not, so a run may be resumed with another value; other options may
+            be inferred from it.
         TRAINING: the parameters that training finds. A run is resumed with the same value only.
         IMAGES: the images that given parameters render.
         SPEED: the speed on a device. An "auto" value is inferred at every start, and stays "auto" in the workdir.
@@ -133,7 +134,7 @@ class Facts(NamedTuple):
         sampler: the name of the run's sampler.
         large_field: whether an update of the field's parameters takes as long as half of a step's rays.
         busy_rays: rays per step that keep the device busy; None: no more than on a CPU.
-        batch_size: rays per step.
+        batch_size: rays per step; 0 while that is inferred itself.
     """
 
     num_views: int
@@ -321,7 +322,7 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
 
 def read_value(declared: Option, kind: Any, value: Any, name: str) -> Any:
     """Returns the value of one option, with tuples in place of lists; ValueError where it is none."""
-    value = _tuples(value)
+    value = as_tuples(value)
 
     def refuse(expected):
         raise ValueError(f"--config.{name} is {short_repr(value)}, expected {expected}; correct it")
@@ -388,5 +389,6 @@ def _numbers(value):
             yield each
 
 
-def _tuples(value):
-    return tuple(map(_tuples, value)) if isinstance(value, tuple | list) else value
+def as_tuples(value: Any) -> Any:
+    """Returns a value with tuples in place of lists, which JSON and flags have."""
+    return tuple(map(as_tuples, value)) if isinstance(value, tuple | list) else value

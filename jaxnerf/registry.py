@@ -153,9 +153,9 @@ def register_field(name: str, make: Callable[..., Any], *, options: type[Options
             `make` gets the section as a dict, without checks.
 
     Raises:
-        ValueError: if another field has that name.
+        ValueError: if another field has that name, or if `options` is no such class.
     """
-    FIELDS.add(name, Part(make, options))
+    FIELDS.add(name, Part(make, _checked_options("register_field", options)))
 
 
 def register_sampler(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
@@ -167,9 +167,9 @@ def register_sampler(name: str, make: Callable[..., Any], *, options: type[Optio
         options: the class of `context.options`, as of `register_field`.
 
     Raises:
-        ValueError: if another sampler has that name.
+        ValueError: if another sampler has that name, or if `options` is no such class.
     """
-    SAMPLERS.add(name, Part(make, options))
+    SAMPLERS.add(name, Part(make, _checked_options("register_sampler", options)))
 
 
 def register_loss(
@@ -231,6 +231,14 @@ def register_exporter(name: str, export: Callable[..., Any]) -> None:
         ValueError: if another exporter has that name.
     """
     EXPORTERS.add(name, export)
+
+
+def _checked_options(function, options):
+    """Returns the class of options of a part; ValueError if it is none."""
+    is_class = isinstance(options, type) and issubclass(options, Options) and "__dataclass_fields__" in vars(options)
+    if options is not None and not is_class:
+        raise ValueError(f"{function}: options is {options!r}, expected a frozen dataclass that inherits from Options")
+    return options
 
 
 def _never(folder):

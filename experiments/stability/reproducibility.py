@@ -27,7 +27,7 @@ from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime import cli
 
 DRIFT = 50  # steps
-# Taken from default.py, the paper's, for embedded_small.py, whose learning rate is sixteen times as high.
+# The paper's values, in place of those of embedded_small.py, whose learning rate is sixteen times as high.
 _PAPER_ADAM = ("lr_init", "lr_final", "lr_decay_power", "lr_steps", "warmup_steps", "beta2")
 _DEVICES = "--xla_force_host_platform_device_count="
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs.", required=True)

@@ -1,1 +1,1 @@
-"""The config files of runs; `jaxnerf.configs` in the package. default.py lists every field."""
+"""The config files of runs; `jaxnerf.configs` in the package. docs/configuration.md lists every option."""

@@ -17,10 +17,10 @@ NEEDS = ("radius", "length", "time", "image_index", "progress")
 
 _REMEDIES = {
     "radius": "set Rays.radius, see cameras.pixel_radius (rays in NDC have none, as cones are no cones there)",
-    "length": "give it",
+    "length": "samples have it",
     "time": "set Rays.time; a dataset states it in each frame",
     "image_index": "set Rays.image_index",
-    "progress": "it is a number of the model, not of rays",
+    "progress": "a trained run has it in its parameters",
 }
 _EXAMPLES = {"radius": "0.01", "length": "0.01", "time": "0.0", "image_index": "0", "progress": "1.0"}
 

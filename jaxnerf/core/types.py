@@ -134,21 +134,44 @@ class Rendering:
     median_depth: Float[Array, "*batch"] | None = None
 
 
+@jax.tree_util.register_pytree_node_class
 class Renderings(tuple[Rendering, ...]):
     """The renderings of a training step.
 
     As a tuple it holds those whose colours are compared with the batch, that of images last. `outputs["name"]` is the
-    rendering of any network, such as one that only proposes samples.
+    rendering of any network, such as one that only proposes samples. It is a JAX pytree.
     """
 
-    def __new__(cls, by_network: Mapping[str, Rendering], compared: Iterable[str]) -> "Renderings":
-        """Makes the tuple from the renderings by network, and the names of those that are compared."""
-        renderings = super().__new__(cls, (by_network[name] for name in compared))
-        renderings._by_network = by_network
+    def __new__(cls, by_network: Mapping[str, Rendering], compared: Sequence[str]) -> "Renderings":
+        """Makes the tuple from the renderings by network, and the names of those that are compared.
+
+        Raises:
+            ValueError: if one of these networks has no rendering.
+        """
+        renderings = super().__new__(cls, (_rendering_of(by_network, name) for name in compared))
+        renderings._by_network, renderings._compared = dict(by_network), tuple(compared)
         return renderings
 
     def __getitem__(self, key):
-        return self._by_network[key] if isinstance(key, str) else super().__getitem__(key)
+        return _rendering_of(self._by_network, key) if isinstance(key, str) else super().__getitem__(key)
+
+    def tree_flatten(self) -> tuple[tuple[Rendering, ...], tuple]:
+        """Returns the renderings of all networks, and the names."""
+        return tuple(self._by_network.values()), (tuple(self._by_network), self._compared)
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple, renderings: Sequence[Rendering]) -> "Renderings":
+        """Makes the tuple from what `tree_flatten` returns."""
+        return cls(dict(zip(names[0], renderings, strict=True)), names[1])
+
+
+def _rendering_of(by_network, name):
+    if name not in by_network:
+        raise ValueError(
+            f"there is no rendering of the network {name!r}, the sampler has {', '.join(map(repr, by_network))}; "
+            "correct the name, or Model.image_networks"
+        )
+    return by_network[name]
 
 
 def without_samples(rendering: Rendering) -> Rendering:

@@ -124,7 +124,7 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
     Args:
         dir: of a dataset in any registered format: Blender, transforms.json, COLMAP or LLFF, for example.
         split: "train", "test", or another split of the dataset.
-        **options: fields of the config's data section, see configs/default.py. Where near or far is not set, each
+        **options: options of DataOptions. Where near or far is not set, each
             view has its own, from the dataset.
 
     Returns:

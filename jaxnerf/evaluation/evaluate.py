@@ -38,7 +38,7 @@ def train_and_evaluate(config: Config, workdir: str | os.PathLike, *, views: Vie
     """Trains as a config says, from the last checkpoint in a workdir if there is one, and scores the result.
 
     Args:
-        config: see configs/default.py.
+        config: as a config file returns it, such as `jaxnerf.configs.default.get_config()`.
         workdir: made if missing.
         views: of the split "train" where they have been read.
 

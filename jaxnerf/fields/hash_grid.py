@@ -85,7 +85,9 @@ class HashGridOptions(Options):
         15, "outputs of the density network that the colour network reads", range=at_least(0)
     )
     view_depth: int = option(2, "hidden layers of the colour network", range=between(0, _MAX_LAYERS))
-    view_width: int = option(128, "outputs of such a layer; auto: as width", range=at_least(1), auto=True)
+    view_width: int = option(
+        128, "outputs of a hidden layer of the colour network; auto: as `width`", range=at_least(1), auto=True
+    )
     use_viewdirs: bool = option(True, "whether colour depends on the direction")
     feature_scale: float = option(
         4.0, "features are table entries times this; it scales the table's learning rate", range=POSITIVE
@@ -189,7 +191,7 @@ def from_options(options: HashGridOptions, box: Box | None) -> Field:
     return hash_grid_field(lower=box[0], upper=box[1], **values)
 
 
-FIELD = Part(from_options, HashGridOptions)
+FIELD = Part(from_options, HashGridOptions, section="hash_grid")
 
 
 @jax.custom_jvp

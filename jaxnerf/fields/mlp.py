@@ -102,7 +102,7 @@ def from_options(options: MlpOptions, box: Box | None) -> Field:
     return mlp_field(**{**dataclasses.asdict(options), "compute_dtype": jnp.dtype(options.compute_dtype)})
 
 
-FIELD = Part(from_options, MlpOptions)
+FIELD = Part(from_options, MlpOptions, section="fine")
 
 
 class MLP(linen.Module):

@@ -1,6 +1,7 @@
 """Flags, signals and error messages that the command-line programs share."""
 
 import ast
+import contextlib
 import ctypes
 import gc
 import importlib
@@ -126,12 +127,14 @@ def use_saved_config() -> None:
 
 
 def _given_flag(name: str) -> str:
-    """Returns the value of a flag on the command line, before flags are parsed; "" where it is not given."""
-    value = ""
-    for index, argument in enumerate(sys.argv[1:], 1):
+    """Returns the value of a flag in the command line or --flagfile before it is parsed; "" where it is not given."""
+    arguments, value = sys.argv[1:], ""
+    with contextlib.suppress(flags.Error):  # absl reports it
+        arguments = flags.FLAGS.read_flags_from_files(arguments)
+    for index, argument in enumerate(arguments):
         found, equals, given = argument.lstrip("-").partition("=")
         if argument.startswith("-") and found == name:
-            value = given if equals else next(iter(sys.argv[index + 1 :]), "")
+            value = given if equals else next(iter(arguments[index + 1 :]), "")
     return value
 
 

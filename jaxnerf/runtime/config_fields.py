@@ -21,7 +21,7 @@ def typed(value: Any, kind: Any, *, auto: bool) -> Any:
         return FieldReference(value, field_type=_SCHEDULE)
     if auto and kind is not str:
         return FieldReference(value, field_type=_AUTO_TYPES[tuple if is_tuple(kind) else kind])
-    return value
+    return float(value) if kind is float else value  # the type of a flag is that of the value
 
 
 class _Accepts(type):

@@ -102,7 +102,11 @@ def resolve_for_device(config: Config, platform: str | None = None) -> tuple[Run
     config = _resolve_sections(config, others, None, device, lines)
     if is_auto(config.train.microbatch_size) and not is_auto(config.train.batch_size):
         device = device._replace(samples_per_ray=build_model(config).samples_per_ray)
-    return _resolve_sections(config, ["train"], None, device, lines), lines
+    config = _resolve_sections(config, ["train"], None, device, lines)
+    left = [name for name in auto_fields(config) if name in device_fields(config)]
+    if left and not is_auto(config.train.batch_size):
+        raise ValueError(f"{left[0]} is 'auto', which `resolve_for_device` of its options does not infer; set a value")
+    return config, lines
 
 
 def device_fields(config: RunConfig) -> list[str]:

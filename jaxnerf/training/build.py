@@ -23,7 +23,6 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.training.camera_parameters import CameraParameters
 from jaxnerf.training.config import Config, RunConfig, read_config
 from jaxnerf.training.optimizer import make_optimizer
-from jaxnerf.training.options import UNLIMITED_STEPS
 from jaxnerf.training.step import ProgressData, StepLoss, TrainData
 
 # The optional fields that datasets provide.
@@ -325,9 +324,8 @@ def _prepare(config, model, extras, views):
             sparse = dataclasses.replace(sparse, interpolated=depths)
     progress = None
     if "progress" in model.needs:
-        train = config.train  # of several processes that only time ends, the learning rate has a planned end
-        steps = train.lr_steps if train.max_steps >= UNLIMITED_STEPS else train.max_steps
-        progress = ProgressData(np.float32(steps), np.float32(0))
+        # Like the learning rate: a longer run that goes on with the same lr_steps does not go back.
+        progress = ProgressData(np.float32(config.train.lr_steps), np.float32(0))
     # The mask is part of the active pixels.
     views = dataclasses.replace(views, mask=None, sparse=sparse)
     return cells, TrainData(seed, views, active, indices, progress=progress)

@@ -36,12 +36,12 @@ class CameraOptions(Options):
     refine: bool = option(False, "whether each pose and, common to all images, the focal length are corrected")
     refine_lr: float = option(
         5e-4,
-        "as `exposure_lr`",
+        "initial learning rate of the corrections",
         unit="radians, fractions of the cameras' spread and of the focal length",
         range=POSITIVE,
     )
     refine_start_step: int = option(300, "training step before which cameras do not move", range=at_least(0))
-    num_images: int = option("auto", "of the split `train`; do not set it", auto=True)
+    num_images: int = option("auto", "images of the split `train`; do not set it", auto=True, changes=Changes.NOTHING)
 
     def resolve(self, facts: Facts, device: Device) -> tuple["CameraOptions", list[str]]:
         """Infers the number of images."""

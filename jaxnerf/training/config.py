@@ -17,6 +17,7 @@ from jaxnerf.options import (
     Option,
     Options,
     Schedule,
+    as_tuples,
     declarations,
     is_auto,
     option,
@@ -47,7 +48,7 @@ class RunConfig(Options):
             that it uses. A part without a class of options has a dict.
     """
 
-    seed: int = option(0, "of everything random", max_int=_MAX_SEED)
+    seed: int = option(0, "seed of all random numbers", max_int=_MAX_SEED)
     field: str = option(
         "mlp", "the field of the final rendering: `mlp` (section `fine`), `hash_grid`, or a registered one"
     )
@@ -102,10 +103,20 @@ def default_weights() -> dict[str, Any]:
 
 
 def default_plugins() -> dict[str, Options]:
-    """Returns the default options of all registered fields and samplers that are not built in, by name."""
-    own = {field.type for field in dataclasses.fields(RunConfig)}
+    """Returns the default options of all registered fields and samplers that are not built in, by name.
+
+    Raises:
+        ValueError: if one has the name of an option or section of every config.
+    """
     parts = {name: registry.get(name) for registry in (FIELDS, SAMPLERS) for name in registry.names()}
-    return {name: part.options() for name, part in parts.items() if part.options and part.options not in own}
+    plugins = {name: part for name, part in parts.items() if part.section is None}
+    for field in dataclasses.fields(RunConfig):
+        if field.name in plugins:
+            raise ValueError(
+                f"a field or sampler is registered as {field.name!r}, which every config has for something else; "
+                "register it under another name"
+            )
+    return {name: part.options() for name, part in plugins.items() if part.options}
 
 
 def read_config(config: Config) -> RunConfig:
@@ -126,7 +137,13 @@ def read_config(config: Config) -> RunConfig:
     losses = {name: _read_weight(name, weight) for name, weight in _section(content, "losses").items()}
     plugins = {name: _read_plugin(name, section) for name, section in {**top.plugins, **content}.items()}
     config = dataclasses.replace(top, **parts, losses=losses, plugins=plugins)
-    used = used_sections(config)
+    used, known = used_sections(config), {*kinds, "losses", *FIELDS.names(), *SAMPLERS.names()}
+    unknown = sorted(name for name in plugins if name not in known | used)
+    if unknown:
+        raise ValueError(
+            f"--config.{unknown[0]} is no field, expected one of {sorted(known | set(declarations(RunConfig)))}; "
+            "correct the name, or import the module that registers it with --plugins=MODULE"
+        )
     config = replaced(config, plugins={name: part for name, part in plugins.items() if name in used})
     _check(config)
     return config
@@ -142,9 +159,10 @@ def to_config_dict(config: RunConfig) -> ConfigDict:
 
 
 def auto_fields(config: Config) -> list[str]:
-    """Returns the dotted names of the options that are still "auto"."""
-    flat = flatten(config.to_dict() if hasattr(config, "to_dict") else config)
-    return [name for name, value in flat.items() if is_auto(value) and name != "train.parallel"]
+    """Returns the dotted names of the options that are still "auto"; for some "auto" is a value like any other."""
+    config = read_config(config)
+    values = {name for name, option_, _, _ in declared(config) if not option_.auto and not name.startswith("losses.")}
+    return [name for name, value in flatten(config.to_dict()).items() if is_auto(value) and name not in values]
 
 
 def flatten(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -188,12 +206,12 @@ def weight_option(name: str) -> Option:
 def identity(config: RunConfig) -> str:
     """Returns as text the options that renderings depend on; not training, nor the dataset's folder.
 
-    Those of images alone, which evaluation may change, are absent.
+    Those of the section `eval`, which evaluation may change, are absent.
     """
     render = {
         name: value
         for name, option_, _, value in declared(config)
-        if option_.changes & Changes.IMAGES and option_.changes != Changes.IMAGES
+        if option_.changes & Changes.IMAGES and not name.startswith("eval.")
     }
     plain = {name: part for name, part in config.plugins.items() if not isinstance(part, Options)}
     return json.dumps({**render, **plain}, sort_keys=True)
@@ -225,7 +243,7 @@ def _read_plugin(name, section):
     if not isinstance(section, Mapping):
         raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
     if part is None or part.options is None:
-        return dict(section)
+        return {field: as_tuples(value) for field, value in section.items()}
     return read(part.options, {**values_of(part.options()), **section}, f"{name}.")
 
 
@@ -254,5 +272,5 @@ def used_sections(config: RunConfig) -> set[str]:
     used = {"data", "train", "eval", "cameras", "losses"}
     for name, registry in ((config.field, FIELDS), (config.sampler, SAMPLERS)):
         part = registry.get(name) if name in registry.names() else Part(None)
-        used.add("fine" if name == "mlp" else part.section or name)
+        used.add(part.section or name)
     return used | ({"coarse"} if config.sampler == "hierarchical" else set())

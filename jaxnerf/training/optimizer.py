@@ -46,7 +46,7 @@ class OptimizerOptions(Options):
     warmup_steps: int = option(0, "steps in which the learning rate rises linearly from 0", range=at_least(0))
     beta1: float = option(0.9, "decay of Adam's first moment", range=BELOW_ONE)
     beta2: float = option(0.999, "decay of Adam's second moment", range=BELOW_ONE)
-    epsilon: float = option(1e-8, "of Adam", range=POSITIVE)
+    epsilon: float = option(1e-8, "added to the denominator of Adam", range=POSITIVE)
     muon: float = option(
         0.0,
         "Above 0: Muon (arXiv:2502.16982) updates the matrices of the layers instead of Adam. Its updates have this "

@@ -11,7 +11,7 @@ _DEPENDS = {
     Changes.IMAGES: "images depend on it",
     Changes.SPEED: "only the speed depends on it",
     Changes.SPEED | Changes.IMAGES: "speed and, by rounding, images depend on it",
-    Changes.NOTHING: "results do not depend on it",
+    Changes.NOTHING: "a run may be resumed with another value",
 }
 
 

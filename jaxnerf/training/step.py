@@ -21,21 +21,21 @@ class ProgressData(NamedTuple):
     """What the progress of training depends on beside the step; data, so that it is no constant of a compiled step.
 
     Attributes:
-        max_steps: float32 [], steps of the run.
+        steps: float32 [], at which the progress is 1.
         time_fraction: float32 [], the fraction that has passed of a limited time; 0 where it is not limited.
     """
 
-    max_steps: Any
+    steps: Any
     time_fraction: Any
 
     def at(self, step: jax.typing.ArrayLike) -> jax.Array:
         """Returns the progress in [0, 1] when a number of steps are done: by steps or by time, which is larger."""
-        by_steps = jnp.asarray(step, jnp.float32) / self.max_steps
+        by_steps = jnp.asarray(step, jnp.float32) / self.steps
         return jnp.clip(jnp.maximum(by_steps, self.time_fraction), 0, 1)
 
 
 class TrainData(NamedTuple):
-    """What the steps of a run read and never change.
+    """What training steps read; no step writes it.
 
     Attributes:
         seed: uint32 []. It is data, not a constant, so that runs with different seeds share a compiled step.

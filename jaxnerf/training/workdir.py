@@ -1,6 +1,7 @@
 """The folder of a run: its config.json, and a lock that lets one training at a time write there."""
 
 import contextlib
+import json
 import os
 import pathlib
 import socket
@@ -60,7 +61,7 @@ def _check_same_run(workdir, config):
             f"{workdir}: belongs to a run of another version, whose {gone[0]} no longer exists; resume it with "
             "that version, or give another --workdir. It can still be evaluated, rendered and exported"
         )
-    old, new = flatten(read_config(content).to_dict()), flatten(config.to_dict())
+    old, new = (_as_saved(each) for each in (read_config(content), config))
     free = {name for name, option, _, _ in declared(config) if not option.changes & Changes.TRAINING}
     fixed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key) and key not in free]
     if fixed:
@@ -72,13 +73,25 @@ def _check_same_run(workdir, config):
         )
 
 
+def _as_saved(config):
+    """Returns {"section.option": value} as JSON has it, without losses of weight 0: plug-ins may have added some."""
+    flat = flatten(json.loads(config.to_json()))
+    return {name: value for name, value in flat.items() if not (name.startswith("losses.") and value == 0)}
+
+
 def load_config(workdir: str | os.PathLike, **values: Any) -> RunConfig:
     """Reads the config of the run in a workdir, with other values of some sections' options: section={option: value}.
 
     Raises:
         ValueError: if there is no run; names the file.
     """
-    config = read_config(migrate(_content(workdir))[0])
+    try:
+        config = read_config(migrate(_content(workdir))[0])
+    except ValueError as error:
+        if not str(error).startswith("--config."):
+            raise
+        where = pathlib.Path(workdir) / "config.json"
+        raise ValueError(f"{where}: {str(error).removeprefix('--config.')}, or use the version that wrote it") from None
     return changed(config, flatten(values)) if values else config
 
 

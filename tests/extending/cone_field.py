@@ -9,8 +9,9 @@ Train with it by
     jaxnerf-train --plugins=cone_field --config=embedded_small --config.field=cone --config.sampling.num_fine=0 \\
         --workdir=runs/cone
 
-where cone_field.py is in the current folder or on PYTHONPATH; `--config.cone.width=128` sets an option. To render well at several resolutions, the field must see them in training: call
-`jaxnerf.train_and_evaluate(config, workdir, views=multi_scale(views))` with the Views of the split "train".
+where cone_field.py is in the current folder or on PYTHONPATH; `--config.cone.width=128` sets an option. To render well
+at several resolutions, the field must see them in training: call `jaxnerf.train_and_evaluate(config, workdir,
+views=multi_scale(views))` with the Views of the split "train".
 """
 
 import dataclasses

@@ -36,6 +36,7 @@ class MovingOptions(Options):
     num_freqs: int = option(6, "octaves of the position's encoding", range=between(0, 64))
     num_time_freqs: int = option(4, "octaves of the time's encoding", range=between(0, 64))
 
+
 ANGLE = 0.7  # radians, the horizontal field of view
 
 

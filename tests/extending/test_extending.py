@@ -1,6 +1,7 @@
 """The examples of this folder: each adds a part from one file outside the package, and trains with it by name."""
 
 import shutil
+import sys
 
 import density_exporter
 import gabor_field  # noqa: F401
@@ -9,13 +10,17 @@ import numpy as np
 import pytest
 import tum_reader
 import uniform_sampler  # noqa: F401
+from ml_collections import ConfigDict
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import captures
 import export_sources
 import jaxnerf
-from jaxnerf.registry import EXPORTERS
+from jaxnerf.options import Options, option
+from jaxnerf.registry import EXPORTERS, FIELDS, Part
+from jaxnerf.runtime import cli
+from jaxnerf.runtime.config_fields import typed
 from jaxnerf.training import auto_config
 from jaxnerf.training.metric_log import read_rows
 from runs import ROOT, SMOKE_FLAGS, smoke_config, start
@@ -158,3 +163,35 @@ def test_the_programs_import_plugins(compiled_once, tmp_path):
     _, err = trained.communicate(timeout=120)
     assert trained.returncode == 0, err
     assert "loss_mask" in read_rows(tmp_path / "run")[-1]
+
+
+def test_registrations_that_cannot_work_are_refused(monkeypatch):
+    class NoDataclass(Options):
+        num = option(1, "a number")
+
+    with pytest.raises(ValueError, match="register_field: options is .*NoDataclass.*, expected a frozen dataclass"):
+        jaxnerf.register_field("wrong", lambda options, box: None, options=NoDataclass)
+    monkeypatch.setitem(FIELDS._parts, "train", Part(lambda options, box: None))
+    with pytest.raises(ValueError, match="registered as 'train', which every config has for something else"):
+        smoke_config()
+
+
+def test_a_section_that_no_part_has_is_refused(tmp_path):
+    config = smoke_config(max_steps=1)
+    config.trian = {"batch_size": 64}
+    with pytest.raises(ValueError, match="--config.trian is no field, expected one of .*'train'"):
+        jaxnerf.train_and_evaluate(config, tmp_path / "run")
+
+
+def test_a_number_of_type_float_takes_fractions_whatever_its_default():
+    config = ConfigDict({"number": typed(2, float, auto=False)})
+    config.number = 2.5
+    assert config.number == 2.5
+
+
+def test_plugins_in_a_file_of_flags_are_imported(tmp_path, monkeypatch):
+    (tmp_path / "flags.txt").write_text("--plugins=uniform_sampler,mask_loss\n")
+    monkeypatch.setattr(sys, "argv", ["train", f"--flagfile={tmp_path / 'flags.txt'}", "--workdir=run"])
+    assert cli._given_flag("plugins") == "uniform_sampler,mask_loss" and cli._given_flag("workdir") == "run"
+    monkeypatch.setattr(sys, "argv", ["train", "--flagfile=missing.txt", "--workdir=run"])
+    assert cli._given_flag("workdir") == "run"

@@ -378,7 +378,7 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
         safe = jax.lax.stop_gradient(flat[first]) if flat.size else jnp.zeros(3)
         x = jnp.where(kept[..., None], x, safe.reshape(*(1,) * (x.ndim - 1), 3))
         if flat.size:
-            per_sample = {name: value for name, value in inputs.items() if value.shape == kept.shape}
+            per_sample = {name: value for name, value in inputs.items() if jnp.shape(value) == kept.shape}
             fixed = {name: jax.lax.stop_gradient(value.reshape(-1)[first]) for name, value in per_sample.items()}
             inputs |= {name: jnp.where(kept, value, fixed[name]) for name, value in per_sample.items()}
         density, rgb = scene(x, viewdirs, **inputs)
