@@ -24,7 +24,14 @@ def trained(folder, steps, **fields):
 
 
 def test_a_proposal_network_with_a_loss_of_its_own(compiled_once, tmp_path):
-    network = {"depth": 3, "width": 48, "skip_layer": 1, "num_freqs": 6, "density_activation": "softplus"}
+    network = {
+        "depth": 3,
+        "width": 48,
+        "view_width": 24,
+        "skip_layer": 1,
+        "num_freqs": 6,
+        "density_activation": "softplus",
+    }
     changes = {f"fine.{name}": value for name, value in network.items()}
     rows, psnr = trained(tmp_path / "run", 300, **changes, sampler="proposal", **{"losses.proposal": 1.0})
     assert psnr > 19.5  # 20.7 dB; 20.3 with 24 samples evenly along the ray
@@ -37,7 +44,7 @@ def test_a_proposal_network_with_a_loss_of_its_own(compiled_once, tmp_path):
 
 def test_a_curriculum_follows_the_progress_of_training(compiled_once, tmp_path):
     rows, psnr = trained(tmp_path / "run", 300, field="coarse_to_fine", **{"train.lr_init": 5e-3})
-    assert psnr > 17  # 18.6 dB
+    assert psnr > 17  # 19.0 dB
     run = restore_run(tmp_path / "run")
     x = np.random.default_rng(0).uniform(-1, 1, (1, 64, 3)).astype(np.float32)
     scenes = [run.experiment.model.scene(*run.variables(step)) for step in (150, 300)]
