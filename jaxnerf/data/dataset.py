@@ -404,6 +404,8 @@ def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -
         far=take(views.far),
         mask=None if views.mask is None else pick(views.mask),
         free_depth=None if views.free_depth is None else take(views.free_depth),
+        time=None if views.time is None else take(views.time),
+        image_index=None if views.image_index is None else take(views.image_index),
         names=tuple(views.names[index] for index in indices) if views.names else (),
         sparse=None if views.sparse is None else _select_observations(views.sparse, indices),
     )

@@ -132,8 +132,9 @@ def _facts(config, views):
         views,
         ndc=config.data.ndc,
         world=config.data.world,
-        # Alpha bounds the box of a field that is defined in it. A box only for rendering holds all that cameras see.
-        use_alpha=occupancy.use_alpha and not paper,
+        # Alpha bounds the box of a field that is defined in it, unless the scene moves: no image then shows where all
+        # of it ever is. A box only for rendering holds all that cameras see.
+        use_alpha=occupancy.use_alpha and not paper and views.time is None,
         sampler=config.sampler,
         contracted=occupancy.contracted,
         lower=occupancy.lower,

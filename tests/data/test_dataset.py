@@ -108,6 +108,12 @@ def test_selecting_all_views_changes_nothing(views):
         jax.tree.map(np.testing.assert_array_equal, got, given)
 
 
+def test_selected_views_keep_their_times_and_indices(views):
+    moving = dataclasses.replace(views, time=np.float32([0, 0.25, 0.5, 1]), image_index=np.arange(4, dtype=np.int32))
+    got = select_views(moving, [3, 1])
+    assert got.time.tolist() == [1, 0.25] and got.image_index.tolist() == [3, 1]
+
+
 def test_selecting_copies_pixels(views):
     got = select_views(views, [0, 1])
     got.pixels[:] = 0

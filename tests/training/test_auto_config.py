@@ -488,6 +488,20 @@ def test_images_get_more_samples_than_training(views):
     assert got.eval.sample_multiplier == 1.5 and "images        1.5 times the samples of training" in lines
 
 
+def test_alpha_does_not_bound_the_box_of_a_scene_that_moves(views):
+    """Each image shows the bodies where they are at one time; the intersection of all would cut them off."""
+
+    def box(views, **options):
+        occupancy = resolve(auto_config(contracted=False, **options), views).config.occupancy
+        return occupancy.lower, occupancy.upper
+
+    pixels = views.pixels.reshape(-1, 24, 24, 4).copy()
+    pixels[:, :9], pixels[:, 15:], pixels[:, :, :9], pixels[:, :, 15:] = 0, 0, 0, 0
+    views = dataclasses.replace(views, pixels=pixels.reshape(-1, 4))
+    moving = dataclasses.replace(views, time=np.linspace(0, 1, len(views.size), dtype=np.float32))
+    assert box(moving, use_alpha=True) == box(views, use_alpha=False) != box(views, use_alpha=True)
+
+
 def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
     def sizes(contracted, factor):
         larger = dataclasses.replace(
