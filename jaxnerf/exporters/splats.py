@@ -37,7 +37,6 @@ _NEAR = 1e-2  # of the largest depth: Gaussians closer to the camera are not dra
 _MAX_PAIRS = 4_000_000  # of pixels and Gaussians that are held at once
 # The file's harmonics of degrees 0, 1 and 2 are those of `harmonics` in this order and with these signs.
 _ORDER, _SIGNS = [0, 1, 2, 3, 4, 5, 7, 6, 8], np.float32([1, -1, 1, -1, 1, -1, 1, -1, 1])
-_REST = 15  # harmonics above degree 0 in the file, which viewers expect up to degree 3
 
 
 class Gaussians(NamedTuple):
@@ -158,15 +157,16 @@ def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
 
 
 def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Writes the PLY layout of the released code, which viewers read: logits, logarithms and 3 x 16 harmonics."""
-    count = len(gaussians.mean)
+    """Writes the PLY layout of the released code, which viewers read: logits, logarithms and harmonics.
+
+    Of these it has the 9 up to degree 2, by whose number readers find the degree, and there are no normals, which the
+    released code sets to 0.
+    """
     ordered = gaussians.harmonics[:, _ORDER] * _SIGNS[None, :, None]
-    rest = np.zeros((count, 3, _REST), np.float32)  # channel by channel; degree 3 is 0
-    rest[:, :, :8] = ordered[:, 1:].transpose(0, 2, 1)
+    rest = ordered[:, 1:].transpose(0, 2, 1).reshape(len(ordered), -1)  # channel by channel
     columns = dict(zip("xyz", gaussians.mean.T, strict=True))
-    columns |= dict.fromkeys(("nx", "ny", "nz"), np.zeros(count, np.float32))
     columns |= {f"f_dc_{i}": ordered[:, 0, i] for i in range(3)}
-    columns |= {f"f_rest_{i}": values for i, values in enumerate(rest.reshape(count, -1).T)}
+    columns |= {f"f_rest_{i}": values for i, values in enumerate(rest.T)}
     columns["opacity"] = np.log(gaussians.opacity / (1 - gaussians.opacity))
     columns |= {f"scale_{i}": np.log(gaussians.scale[:, i]) for i in range(3)}
     columns |= {f"rot_{i}": gaussians.rotation[:, i] for i in range(4)}
