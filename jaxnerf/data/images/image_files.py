@@ -139,8 +139,21 @@ def _use(path, use):
 
 
 def _orientation(image):
-    turn = image.getexif().get(_ORIENTATION, 1)
+    # For a PNG without metadata before the pixels Pillow decodes them all, in case that some follow.
+    known = image.format != "PNG" or image.fp is None or "exif" in image.info or _has_exif(image.fp)
+    turn = (image.getexif() if known else Image.Image.getexif(image)).get(_ORIENTATION, 1)
     return turn if turn in _UPRIGHT else 1
+
+
+def _has_exif(file):
+    """Returns whether a PNG file has a chunk of EXIF data anywhere; leaves the file where it was."""
+    start, found = file.tell(), b""
+    file.seek(8)
+    while len(head := file.read(8)) == 8 and found != b"eXIf":
+        found = head[4:]
+        file.seek(int.from_bytes(head[:4], "big") + 4, os.SEEK_CUR)
+    file.seek(start)
+    return found == b"eXIf"
 
 
 def _raw(image):

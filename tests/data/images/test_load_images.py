@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from captures import write_image
 from jaxnerf import Camera
 from jaxnerf.data.images import load_images
-from jaxnerf.data.images.image_files import image_size, read_image, read_mask
+from jaxnerf.data.images.image_files import image_form, image_size, read_image, read_mask
 from jaxnerf.data.readers.base import Capture, Frame
 
 HEIGHT, WIDTH = 6, 8
@@ -169,6 +169,27 @@ def test_images_without_alpha_become_opaque_beside_others_with_alpha(tmp_path):
     assert (views.pixels[HEIGHT * WIDTH :, 3] == 255).all()
     plain = load_images.load_capture(capture, hold=9)
     assert plain.pixels.shape[-1] == 3 and plain.background is None
+
+
+@pytest.mark.parametrize("place", ["before", "behind", "none"])
+def test_the_form_of_a_png_is_read_without_its_pixels(tmp_path, place):
+    """EXIF data may be before the pixels or, as ImageMagick writes it, behind them."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = tmp_path / "turned.png"
+    Image.fromarray(pixels(0, 40, 70)).save(path, exif=exif)
+    content = path.read_bytes()
+    start = content.index(b"eXIf") - 4
+    end = start + 12 + int.from_bytes(content[start : start + 4], "big")
+    chunk, rest = content[start:end], content[:start] + content[end:]
+    if place != "before":
+        path.write_bytes(rest[:-12] + chunk + rest[-12:] if place == "behind" else rest)
+    turned = place != "none"
+    assert image_size(path) == ((40, 70) if turned else (70, 40))
+    assert image_form(path)[0] == read_image(path).shape == ((70, 40, 3) if turned else (40, 70, 3))
+    if place != "behind":
+        path.write_bytes(path.read_bytes()[:-200])  # the pixels are incomplete
+        assert image_form(path)[0][0] == (70 if turned else 40)
 
 
 @pytest.mark.parametrize("turn", range(1, 9))
