@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from jaxnerf.configs import smoke
+from jaxnerf.training.config import read_config
+from jaxnerf.training.workdir import save_config
 from runs import ROOT
 
 SIDE = 16
@@ -21,7 +23,7 @@ def run(tmp_path):
     scored, frames = folder / "eval" / "20", folder / "renders" / "arc-20" / "color"
     for kind in (scored / "color", scored / "gt-color", scored / "depth", frames):
         kind.mkdir(parents=True)
-    (folder / "config.json").write_text(smoke.get_config().to_json())
+    save_config(folder, read_config(smoke.get_config()))
     results = {"training_seconds": 12.0, "psnr": 31.416, "ssim": 0.9, "views": 3, "seconds_per_frame": 0.25}
     (scored / "results.json").write_text(json.dumps(results))
     for view in range(3):
