@@ -22,6 +22,7 @@ from jaxnerf.viewer.render_loop import Delivery, Request
 RESOLUTIONS = ("100", "200", "400", "800", "1600")  # px of the longer side
 _AXES = {"+x": (1, 0, 0), "+y": (0, 1, 0), "+z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 _MAX_FRUSTUMS, _THUMBNAIL, _BESIDE = 120, 64, 400  # views, px, px
+_NARROW = 0.75  # width over height of a window, below which the controls are folded at first: a phone's
 _MAX_CELLS = 30_000  # cells of the occupancy grid that are drawn
 _STATUS_EVERY = 0.25  # s between changes of the status while the camera moves
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # viser's cameras look along +z with y down
@@ -52,8 +53,8 @@ class Page:
 
     def open(self) -> None:
         """Adds the controls, sets the first view and requests the first frame."""
-        gui = self._client.gui
-        with gui.add_folder("Rendering"):
+        gui, wide = self._client.gui, self._width_over_height(1.0) >= _NARROW
+        with gui.add_folder("Rendering", expand_by_default=wide):
             self._mode = self._add(gui.add_dropdown("Show", MODES), lambda: self._redraw())
             self._resolution = self._add(gui.add_dropdown("Resolution (px)", RESOLUTIONS, initial_value="800"))
             self._crop = self._add(gui.add_checkbox("Crop", False))
@@ -62,7 +63,7 @@ class Page:
                 self._add(gui.add_multi_slider(axis, low, high, (high - low) / 200, (low, high)))
                 for axis, low, high in zip("xyz", lower, upper, strict=True)
             ]
-        with gui.add_folder("Scene"):
+        with gui.add_folder("Scene", expand_by_default=wide):
             self._show_grid = self._add(gui.add_checkbox("Occupancy grid", False), self._draw_cells)
             self._show_cameras = self._add(gui.add_checkbox("Training cameras", False), self._draw_frustums)
             self._up = self._add(gui.add_dropdown("Up", ("dataset", *_AXES)), self._set_up)
@@ -224,9 +225,24 @@ class Page:
             camera.look_at = self._look_at(pose)
             camera.fov = fov
 
-    def _view_fov(self, index):
-        focal = float(np.asarray(self._viewer.views.cameras.focal)[index, 1])
-        return 2 * math.atan(0.5 * float(self._viewer.views.size[index, 0]) / focal)
+    def _view_fov(self, index, aspect=math.inf):
+        """Returns the vertical angle of a training view, or that which shows all its width at an aspect ratio."""
+        focal = np.asarray(self._viewer.views.cameras.focal, np.float64)[index]
+        height, width = np.float64(self._viewer.views.size[index]) / focal[::-1]  # at distance 1
+        return 2 * math.atan(0.5 * max(height, width / aspect))
+
+    def _show_view(self, index, up):
+        """Goes to a training view; the page shows all its height and all its width."""
+        self._go_to(self._poses[index], self._view_fov(index, self._width_over_height(math.inf)), up)
+
+    def _width_over_height(self, unknown):
+        """Returns the aspect ratio of the page's window, at least a tenth, or a value where the page sent none."""
+        sent = self._client.camera
+        try:
+            ratio = float(sent.image_width) / float(sent.image_height)
+        except (TypeError, ValueError, ZeroDivisionError):
+            return unknown
+        return max(ratio, 0.1) if ratio < np.inf else unknown
 
     def _dataset_up(self):
         return path_poses.up_of(self._poses)
@@ -236,7 +252,7 @@ class Page:
         self._up.value = "dataset"
         self._beside.visible = False
         self._client.camera.near, self._client.camera.far = 1e-3 * self._size, 1e3 * self._size
-        self._go_to(self._poses[0], self._view_fov(0), self._dataset_up())
+        self._show_view(0, self._dataset_up())
 
     def _set_up(self):
         up = _AXES.get(self._up.value)
@@ -284,7 +300,7 @@ class Page:
         )
 
         def visit():
-            self._go_to(pose, self._view_fov(index), pose[:, 1])
+            self._show_view(index, pose[:, 1])
             self._beside.image = _view_image(views, index, _BESIDE)
             self._beside.label = views.names[index] if views.names else f"view {index}"
             self._beside.visible = True

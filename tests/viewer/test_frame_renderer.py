@@ -1,15 +1,18 @@
 """Frames of a free camera: the program compiled once, equal to what jaxnerf-render writes, and its pictures."""
 
 import json
+import types
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 
 import ball_runs
+from jaxnerf.data.synthetic import load_synthetic
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_with_grid
 from jaxnerf.viewer.frame_renderer import MAX_SIDE, FrameCamera, FrameRenderer, frame_image
+from jaxnerf.viewer.page import Page
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -169,3 +172,15 @@ def _directions(camera):
     local = np.stack([x - camera.width / 2, camera.height / 2 - y, np.full_like(x, -camera.focal)], axis=-1)
     local /= np.linalg.norm(local, axis=-1, keepdims=True)
     return local @ np.asarray(camera.to_world)[:, :3].T
+
+
+@pytest.mark.parametrize("aspect, widens", [(1.6, 1.0), (1.0, 1.0), (0.5, 2.0), (None, 1.0)])
+def test_a_narrow_window_shows_the_width_of_a_training_view(aspect, widens):
+    """Square views fill the height of a wide window, and the width of a phone's."""
+    views = load_synthetic(size=8)
+    page = object.__new__(Page)
+    page._viewer = types.SimpleNamespace(views=views)
+    width, height = (None, None) if aspect is None else (100 * aspect, 100)
+    page._client = types.SimpleNamespace(camera=types.SimpleNamespace(image_width=width, image_height=height))
+    fov = page._view_fov(0, page._width_over_height(np.inf))
+    assert np.tan(fov / 2) == pytest.approx(widens * 4 / views.cameras.focal[0, 1])
