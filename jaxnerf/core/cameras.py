@@ -240,7 +240,7 @@ def ndc_to_t(
         near_plane: as in ndc_rays.
 
     Returns:
-        [...] in t of the world rays: at the near plane for 0, inf for 1.
+        [...] in t of the world rays: at the near plane for 0, inf for 1, with gradient 0.
 
     Raises:
         ValueError: on other shapes.
@@ -248,7 +248,9 @@ def ndc_to_t(
     check_shapes("ndc_to_t", t=(t, "..."), near=(rays.near, "..."))
     depth = rays.directions[..., 2]
     shift = -(near_plane + rays.origins[..., 2]) / depth
-    return shift - near_plane * t / ((1 - t) * depth)
+    infinite = (t == 1) & (jnp.abs(depth) > 0)
+    finite = shift - near_plane * t / (jnp.where(infinite, 1, 1 - t) * depth)
+    return jnp.where(infinite, jnp.where(depth < 0, jnp.inf, -jnp.inf), finite)
 
 
 def _lens(function, camera):

@@ -129,10 +129,10 @@ def _fractions(t, delta, used, near, far, rule):
     start = jnp.where(infinite & (near > 0), near, 1)
     position, unbounded = jnp.where(infinite, jnp.maximum(t, start), start), jnp.isinf(delta)
     finite = jnp.where(unbounded, 0, delta)
-    lower = position if rule == "points" else position - jnp.where(unbounded, position, finite) / 2
-    clipped = jnp.maximum(lower, start)
-    # start / lower - start / upper, without cancellation.
-    visible = (finite - (clipped - lower)) / jnp.where(unbounded, 1, lower + finite)
+    lower = t if rule == "points" else t - jnp.where(unbounded, t, finite) / 2
+    # The length of the part beyond start, as start / lower - start / upper, without cancellation.
+    clipped, upper = jnp.maximum(lower, start), jnp.maximum(lower + finite, start)
+    visible = jnp.maximum(finite - (clipped - lower), 0) / jnp.where(unbounded, 1, upper)
     inverse = 1 - start / position, start / clipped * jnp.where(unbounded, 1, visible)
     linear = (t - near) / span, jnp.where(infinite, 0, delta) / span
     return tuple(jnp.where(infinite, a, b) for a, b in zip(inverse, linear, strict=True))

@@ -354,8 +354,10 @@ def _draw_between(key, lower, upper):
 def _interpolate(lower, upper, fraction):
     """Interpolates linearly in t, or in 1 / t where upper is inf."""
     infinite = jnp.isinf(upper)
-    reciprocal = lower / (1 - jnp.where(infinite, fraction, 0))
-    return jnp.where(infinite, reciprocal, lower + fraction * (jnp.where(infinite, lower, upper) - lower))
+    at_end = infinite & (fraction == 1)  # where the gradient is infinite, too
+    reciprocal = lower / (1 - jnp.where(infinite & ~at_end, fraction, 0))
+    finite = lower + fraction * (jnp.where(infinite, lower, upper) - lower)
+    return jnp.where(at_end, upper, jnp.where(infinite, reciprocal, finite))
 
 
 def _width(lower, upper):

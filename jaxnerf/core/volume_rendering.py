@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core.loops import short_loop
-from jaxnerf.core.safe_math import at_least_float32, divide
+from jaxnerf.core.safe_math import at_least_float32, clamp, divide
 from jaxnerf.core.types import check_shapes
 from jaxnerf.core.varying import vary_like
 
@@ -222,7 +222,8 @@ def half_depths(
         depth is.
     """
     behind = behind + before
-    fraction = jnp.clip(1 - (behind - math.log(2)) / jnp.where(depth > 0, depth, 1), 0, 1)
+    positive = jnp.where(depth > 0, depth, 1)
+    fraction = 1 - divide(clamp(behind - math.log(2), 0, positive), positive)
     fraction = fraction if rule == "points" else fraction - 0.5
     place = t + fraction * jnp.where(jnp.isinf(delta), 0, delta)
     return jnp.where((behind < math.log(2)) | (depth <= 0), jnp.inf, place)
@@ -280,7 +281,8 @@ def divide_or_zero(weight: Float[ArrayLike, "*#shape"], t: Float[ArrayLike, "*#s
     """Computes weight / t with 0 / 0 = 0; an infinite quotient has gradient 0."""
     zero = t == 0
     quotient = divide(jnp.where(zero, 0, weight), jnp.where(zero, 1, t))
-    return jnp.where(zero & (weight != 0), jnp.inf * jax.lax.stop_gradient(weight), quotient)
+    infinite = zero & (weight != 0)
+    return jnp.where(infinite, jnp.inf * jnp.where(infinite, jax.lax.stop_gradient(weight), 1), quotient)
 
 
 def multiply_or_zero(weight: Float[ArrayLike, "*#shape"], t: Float[ArrayLike, "*#shape"]) -> Float[Array, "*#shape"]:
@@ -306,8 +308,8 @@ def optical_depth(
     """
     density, length = at_least_float32(density, length)
     check_shapes(function, density=(density, "... S"), length=(length, "... S"))
-    opaque = density * length > OPAQUE
     empty = (length <= 0) | (jnp.isinf(length) & (density == 0))
+    opaque = jnp.where(empty, 0, density) * jnp.where(empty, 0, length) > OPAQUE  # 0 times infinity would be NaN
     plain = ~(opaque | empty)
     depth = jnp.where(plain, density, 0) * jnp.where(plain, length, 0)
     return jnp.where(opaque & ~empty, OPAQUE, depth)

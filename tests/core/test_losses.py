@@ -107,6 +107,19 @@ def test_the_linear_sum_is_the_double_sum(near, far, rule):
         np.testing.assert_allclose(compiled_distortion(*given, near, far, rule=rule), want, rtol=2e-6, atol=1e-12)
 
 
+@pytest.mark.parametrize("rule", ["segments", "points"])
+@pytest.mark.parametrize("edges", [(0.2, 0.7, 1.6, 3.0), (0.0, 1.0, 2.0, 9.0), (0.1, 40.0), (0.0, 0.5), (0.5, 0.9, 1.2)])
+def test_segments_of_a_ray_from_0_to_infinity_are_cut_at_1(edges, rule):
+    """The definition: s(t) = 1 - 1 / max(t, 1), and a segment's length is the difference of s at its ends."""
+    edges = np.array(edges)
+    lower, upper, t = edges[:-1], edges[1:], edges[:-1] if rule == "points" else (edges[1:] + edges[:-1]) / 2
+    s, lengths = 1 - 1 / np.maximum(t, 1), 1 / np.maximum(lower, 1) - 1 / np.maximum(upper, 1)
+    weights = np.linspace(0.1, 0.3, len(t))
+    want = (weights * weights[:, None] * np.abs(s - s[:, None])).sum() + (weights**2 * lengths).sum() / 3
+    got = compiled_distortion(*map(np.float32, (weights, t, upper - lower)), 0.0, np.inf, rule=rule)
+    np.testing.assert_allclose(got, want, rtol=2e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize("near, far", [FINITE_FAR, INFINITE_FAR])
 def test_the_gradient_is_that_of_the_double_sum(near, far):
     given = random_samples(4, 40, near, far)
