@@ -9,7 +9,7 @@ import importlib as _importlib
 import typing as _typing
 
 import jaxnerf.runtime.quiet_start as _quiet_start  # noqa: F401
-from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, rays_from_pixels, undistort
+from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, pixel_radius, project, rays_from_pixels, undistort
 from jaxnerf.core.encoding import positional_encoding
 from jaxnerf.core.losses import distortion_loss
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
@@ -21,7 +21,7 @@ from jaxnerf.core.occupancy.grid import (
     update_grid,
 )
 from jaxnerf.core.occupancy.packed import render_packed
-from jaxnerf.core.poses import look_at, turntable
+from jaxnerf.core.poses import look_at, se3_exponential, turntable
 from jaxnerf.core.rendering import (
     points_on_rays,
     render_hierarchical,
@@ -86,8 +86,8 @@ def __dir__():
 
 __all__ = [
     # cameras and rays
-    "Camera", "Rays", "pixel_grid", "undistort", "rays_from_pixels", "ndc_rays", "ndc_to_t", "look_at",
-    "turntable",
+    "Camera", "Rays", "pixel_grid", "undistort", "rays_from_pixels", "pixel_radius", "project", "ndc_rays", "ndc_to_t",
+    "look_at", "turntable", "se3_exponential",
     # samples along rays
     "Samples", "uniform_edges", "stepped_edges", "samples_from_edges", "samples_from_points", "inverse_cdf",
     "importance_points", "merge_edges", "points_on_rays",

@@ -35,7 +35,10 @@ def make_rays(camera: jaxnerf.Camera) -> jaxnerf.Rays:
         far=rays.far,
     )
     t: Array = jaxnerf.ndc_to_t(jaxnerf.ndc_rays(forward, camera).near, forward, near_plane=1.0)
-    assert t.shape == rays.near.shape
+    radius: Array = jaxnerf.pixel_radius(camera, jaxnerf.pixel_grid(16, 16))
+    place, depth = jaxnerf.project(camera, forward.origins + forward.directions)
+    motion: Array = jaxnerf.se3_exponential(jnp.zeros(6))
+    assert t.shape == rays.near.shape == radius.shape == depth.shape and place.shape[-1] + motion.shape[0] == 5
     return rays
 
 

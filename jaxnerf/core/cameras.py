@@ -3,6 +3,7 @@
 Camera axes are x right, y up, looking along -z. Image axes are x right, y down.
 """
 
+import dataclasses
 import math
 
 import jax
@@ -81,19 +82,21 @@ def rays_from_pixels(
     """Computes the rays from a camera through pixels.
 
     Args:
-        camera: one Camera (use jax.vmap for a stack).
+        camera: one Camera, or several, whose poses are [V, 3, 4] and whose other arrays may be common to all.
         pixels: [..., 2] px, as from pixel_grid.
         near: scalar or [...] in t, which here is the distance along the camera's axis.
         far: as near.
 
     Returns:
-        Rays [...]; directions reach the plane at distance 1 (not unit length), as in the released
-        codes. The ray of a pixel without a preimage has near = far and runs along the axis.
+        Rays [...], or [V, ...] of several cameras; directions reach the plane at distance 1 (not unit length), as in
+        the released codes. The ray of a pixel without a preimage has near = far and runs along the axis.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
     """
     pixels = jnp.asarray(pixels)
+    if jnp.ndim(camera.to_world) == 3:
+        return _rays_of_cameras(camera, pixels, near, far)
     check_shapes("rays_from_pixels", pixels=(pixels, "... 2"), to_world=(camera.to_world, "3 4"))
     points, converged = undistort(camera, pixels)
     to_world = jnp.asarray(camera.to_world)
@@ -110,6 +113,21 @@ def rays_from_pixels(
         near=near,
         far=jnp.where(converged, far, near),
     )
+
+
+def _rays_of_cameras(cameras, pixels, near, far):
+    """Computes the Rays [V, ...] of V cameras."""
+    count = len(cameras.to_world)
+    common = {
+        name: jnp.broadcast_to(value, (count, jnp.shape(value)[-1]))
+        for name in ("focal", "center", "distortion")
+        if (value := getattr(cameras, name)) is not None
+    }
+    cameras = dataclasses.replace(cameras, to_world=jnp.asarray(cameras.to_world), **common)
+    rays = jax.vmap(lambda camera: rays_from_pixels(camera, pixels, near=0.0, far=1.0))(cameras)
+    has_preimage, shape = rays.far > rays.near, rays.near.shape
+    near, far = (jnp.broadcast_to(jnp.asarray(value, rays.near.dtype), shape) for value in (near, far))
+    return dataclasses.replace(rays, near=near, far=jnp.where(has_preimage, far, near))
 
 
 def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Array, "*batch"]:
@@ -137,7 +155,7 @@ def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Ar
 
 
 def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
-    """Projects points of the world into the image, the inverse of `rays_from_pixels`.
+    """Projects points of the world into the image, the inverse of `rays_from_pixels` (Hartley and Zisserman 2004, 6.1).
 
     Args:
         camera: one Camera (use jax.vmap for a stack).

@@ -21,7 +21,8 @@ _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the
 
 
 def squared_error(rendering: Rendering, batch: Batch) -> Float[Array, "*batch"]:
-    """Computes the squared error of each ray's colour, averaged over the channels."""
+    """Computes the squared error of each ray's colour, averaged over the channels; ValueError on other shapes."""
+    check_shapes("squared_error", rgb=(rendering.rgb, "... C"), batch=(batch.rgb, "... C"))
     return ((rendering.rgb - batch.rgb) ** 2).mean(axis=-1)
 
 

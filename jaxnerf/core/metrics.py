@@ -11,31 +11,49 @@ from jaxnerf.core.types import check_shapes
 
 
 def mse(
-    a: Num[ArrayLike, "*batch H W C"],
-    b: Num[ArrayLike, "*batch H W C"],
+    a: Num[ArrayLike, "*batch H W C"] | Num[ArrayLike, "B C"],
+    b: Num[ArrayLike, "*batch H W C"] | Num[ArrayLike, "B C"],
     *,
-    mask: Bool[ArrayLike, "*batch H W"] | None = None,
+    mask: Bool[ArrayLike, "*batch H W"] | Bool[ArrayLike, " B"] | None = None,
 ) -> Float[Array, "*batch"]:
-    """Computes the mean squared error of images over pixels and channels.
+    """Computes the mean squared error of images over pixels and channels, or of the colours of a batch of rays.
 
     Args:
-        a: [..., H, W, C].
-        b: [..., H, W, C].
-        mask: [..., H, W] bool, the pixels that count; all when None.
+        a: [..., H, W, C], or [B, C].
+        b: as a.
+        mask: [..., H, W] or [B] bool, the pixels that count; all when None.
 
     Returns:
-        [...]; NaN where the mask is empty.
+        [...], or [] for rays; NaN where the mask is empty.
 
     Raises:
-        ValueError: if the shapes differ.
+        ValueError: if the shapes differ, or on integers, such as the bytes of an image.
     """
-    a, b = at_least_float32(a, b)
-    check_shapes("mse", a=(a, "... H W C"), b=(b, "... H W C"))
+    return _mean_squared_error("mse", a, b, mask)
+
+
+def _mean_squared_error(function, a, b, mask):
+    a, b = _colors(function, a=a, b=b)
+    pixels = "B" if a.ndim == 2 else "... H W"
+    check_shapes(function, a=(a, f"{pixels} C"), b=(b, f"{pixels} C"))
+    axes = tuple(range(-min(a.ndim, 3), 0))
     if mask is None:
-        return ((a - b) ** 2).mean(axis=(-3, -2, -1))
-    check_shapes("mse", a=(a, "... H W C"), mask=(mask, "... H W"))
+        return ((a - b) ** 2).mean(axis=axes)
+    check_shapes(function, a=(a, f"{pixels} C"), mask=(mask, pixels))
     kept = jnp.where(mask[..., None], a - b, 0)  # before the square, so that excluded pixels get gradient 0
-    return (kept**2).sum(axis=(-3, -2, -1)) / (mask.sum(axis=(-2, -1)) * a.shape[-1])
+    return (kept**2).sum(axis=axes) / (mask.sum(axis=axes[1:]) * a.shape[-1])
+
+
+def _colors(function, **arrays):
+    """Returns arrays of colours, at least float32; ValueError on integers, which are no colours in [0, 1]."""
+    for name, array in arrays.items():
+        kind = jnp.asarray(array).dtype
+        if not jnp.issubdtype(kind, jnp.floating):
+            raise ValueError(
+                f"{function}: {name} has type {kind}, expected floats in [0, 1]; divide 8 bit images by 255 "
+                "and 16 bit images by 65535"
+            )
+    return at_least_float32(*arrays.values())
 
 
 @jax.custom_jvp
@@ -55,25 +73,23 @@ def _decibels_jvp(primals, tangents):
 
 
 def psnr(
-    a: Num[ArrayLike, "*batch H W C"],
-    b: Num[ArrayLike, "*batch H W C"],
+    a: Num[ArrayLike, "*batch H W C"] | Num[ArrayLike, "B C"],
+    b: Num[ArrayLike, "*batch H W C"] | Num[ArrayLike, "B C"],
     *,
-    mask: Bool[ArrayLike, "*batch H W"] | None = None,
+    mask: Bool[ArrayLike, "*batch H W"] | Bool[ArrayLike, " B"] | None = None,
 ) -> Float[Array, "*batch"]:
-    """Computes the peak signal-to-noise ratio in dB of images with colours in [0, 1].
+    """Computes the peak signal-to-noise ratio in dB of images, or of a batch of rays, with colours in [0, 1].
 
     Args:
-        a: [..., H, W, C].
-        b: [..., H, W, C].
-        mask: [..., H, W] bool, the pixels that count; all when None.
+        a, b, mask: see mse.
 
     Returns:
         [...] dB: inf for identical images, with gradient 0; NaN if a colour that counts is NaN.
 
     Raises:
-        ValueError: if the shapes differ.
+        ValueError: as mse.
     """
-    return decibels(mse(a, b, mask=mask))
+    return decibels(_mean_squared_error("psnr", a, b, mask))
 
 
 def ssim(a: Num[ArrayLike, "*batch H W C"], b: Num[ArrayLike, "*batch H W C"]) -> Float[Array, "*batch"]:
@@ -90,9 +106,9 @@ def ssim(a: Num[ArrayLike, "*batch H W C"], b: Num[ArrayLike, "*batch H W C"]) -
         [...] in [-1, 1], 1 for identical images.
 
     Raises:
-        ValueError: if the shapes differ, or a side is shorter than 11 pixels.
+        ValueError: if the shapes differ, a side is shorter than 11 pixels, or on integers.
     """
-    a, b = at_least_float32(a, b)
+    a, b = _colors("ssim", a=a, b=b)
     check_shapes("ssim", a=(a, "... H W C"), b=(b, "... H W C"))
     size, deviation = 11, 1.5
     if min(a.shape[-3:-1]) < size:

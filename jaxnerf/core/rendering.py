@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -31,12 +31,13 @@ def render_samples(
     """Renders rays through a scene that is evaluated at the given samples (Eq. 3).
 
     Args:
-        scene: (x [..., S, 3], viewdirs [..., 1, 3]) -> (density [..., S], rgb [..., S, 3]). What else it needs, it
-            asks for by keyword-only parameters: radius, length, time or image_index, see core.scene.NEEDS.
+        scene: (x [..., S, 3], viewdirs [..., 1, 3]) -> (density [..., S], rgb [..., S, 3]). The directions broadcast to
+            the samples. In place of three colours it may return any number of channels, such as features. What else it
+            needs, it asks for by keyword-only parameters: radius, length, time or image_index, see core.scene.NEEDS.
         rays: Rays [...].
         samples: Samples [..., S]. Where delta is 0, the scene is evaluated at the near end of the ray, and
             the result, even NaN, affects neither value nor gradient.
-        background: the colour behind the scene, [3] or [..., 3]; None for black.
+        background: the colour behind the scene, [3] or [..., 3], with as many channels as the scene; None for black.
         median_depth: whether the Rendering has a median depth; see volume_rendering.median_depth.
 
     Returns:
@@ -61,10 +62,10 @@ def render_samples(
     inputs = sample_inputs("render_samples", scene, rays, t, samples.delta)
     per_sample = {name: value for name, value in inputs.items() if value.shape == kept.shape}
     inputs |= {name: jnp.where(kept, value, jax.lax.stop_gradient(value)) for name, value in per_sample.items()}
-    density, rgb = scene(x, rays.viewdirs[..., None, :], **inputs)
-    check_scene_output("render_samples", density, rgb, x)
+    density, rgb = evaluate_scene("render_samples", scene, x, rays.viewdirs[..., None, :], inputs)
     density = jnp.where(kept, density, 0)
-    rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in range(3)], axis=-1)  # channel by channel, as in composite
+    channels = range(rgb.shape[-1])
+    rgb = jnp.stack([jnp.where(kept, rgb[..., i], 0) for i in channels], axis=-1)  # one by one, as in composite
     length = segment_lengths(samples.delta, rays)
     dtype = jnp.result_type(length.dtype, density.dtype, rgb.dtype)
     density, rgb = (
@@ -231,13 +232,40 @@ def _join_chunks(parts, *, shape):
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
 
 
-def check_scene_output(function: str, density: Array, rgb: Array, x: Float[ArrayLike, "*batch 3"]) -> None:
-    """Raises a ValueError unless a scene's density and rgb fit the positions x [..., 3]."""
-    if density.shape != x.shape[:-1] or rgb.shape != x.shape:
+def evaluate_scene(
+    function: str,
+    scene: SceneFn,
+    x: Float[ArrayLike, "*batch samples 3"],
+    viewdirs: Float[ArrayLike, "*batch #samples 3"],
+    inputs: Mapping[str, Num[ArrayLike, "..."]],
+) -> tuple[Num[Array, "*batch samples"], Num[Array, "*batch samples channels"]]:
+    """Evaluates a scene, and checks what it returns.
+
+    Args:
+        function: name of the calling function, for messages.
+        scene: see render_samples.
+        x: [..., S, 3] world units.
+        viewdirs: [..., 1 or S, 3].
+        inputs: what the scene asks for, see `sample_inputs`.
+
+    Returns:
+        density [..., S] and rgb [..., S, C].
+
+    Raises:
+        ValueError: if they have other shapes. An error of the scene itself gets a note with the shapes it was given.
+    """
+    try:
+        density, rgb = scene(x, viewdirs, **inputs)
+    except Exception as error:
+        error.add_note(f"{function} called the scene with x {x.shape} and viewdirs {viewdirs.shape}, which broadcast")
+        raise
+    fits = density.shape == x.shape[:-1] == rgb.shape[:-1] and rgb.shape[-1] > 0
+    if not fits:
         raise ValueError(
             f"{function}: the scene returned density {density.shape} and rgb {rgb.shape} for positions "
-            f"{x.shape}, expected {x.shape[:-1]} and {x.shape}"
+            f"{x.shape}, expected {x.shape[:-1]} and {x.shape}, or another number of channels than 3"
         )
+    return density, rgb
 
 
 def sample_inputs(

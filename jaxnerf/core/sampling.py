@@ -314,7 +314,12 @@ def _draw(distribution, key, shape):
 
 
 def _typed(key):
-    return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
+    kind = getattr(key, "dtype", type(key).__name__)
+    if hasattr(key, "dtype") and jnp.issubdtype(kind, jax.dtypes.prng_key):
+        return key
+    if kind != jnp.uint32 or not jnp.ndim(key):
+        raise ValueError(f"key is {key!r} ({kind}), expected a key such as jax.random.key(0), one key per ray, or None")
+    return jax.random.wrap_key_data(key)
 
 
 def _per_ray(function, keys):

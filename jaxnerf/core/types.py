@@ -34,7 +34,7 @@ def pytree(*, static: Iterable[str] = ()) -> Callable[[type[_T]], type[_T]]:
 
 # (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S] in 1 / world unit, rgb [..., S, 3]). A scene that
 # needs more asks for it by keyword-only parameters: radius, length, time, image_index, progress, see core.scene.NEEDS.
-SceneFn: TypeAlias = Callable[..., tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]]
+SceneFn: TypeAlias = Callable[..., tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples channels"]]]
 
 # One key or an array of keys, typed or raw; functions say whether they take one key per ray.
 Keys: TypeAlias = Key[Array, "..."] | UInt32[ArrayLike, "... 2"]
@@ -42,7 +42,7 @@ Keys: TypeAlias = Key[Array, "..."] | UInt32[ArrayLike, "... 2"]
 Vector: TypeAlias = Num[ArrayLike, "3"] | Sequence[float]
 
 # One colour, or one per ray.
-Background: TypeAlias = Num[ArrayLike, "*#batch 3"] | Sequence[float]
+Background: TypeAlias = Num[ArrayLike, "*#batch channels"] | Sequence[float]
 
 
 @pytree()

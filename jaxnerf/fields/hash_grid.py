@@ -147,7 +147,7 @@ def hash_grid_field(**options: Any) -> Field:
     """Makes a Field of multi-resolution features (after arXiv:2201.05989).
 
     Args:
-        **options: attributes of HashGrid.
+        **options: attributes of HashGrid; lower and upper are required.
 
     Returns:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3]) returns density [..., S] in
@@ -157,7 +157,10 @@ def hash_grid_field(**options: Any) -> Field:
     Raises:
         ValueError: if the box is empty, or a level has fewer than 2 vertices along its longest side.
     """
-    network = HashGrid(**options)
+    try:
+        network = HashGrid(**options)
+    except TypeError as error:
+        raise TypeError(str(error).replace("HashGrid.__init__()", "hash_grid_field()")) from None
     lower, upper = np.asarray(network.lower, float), np.asarray(network.upper, float)
     if lower.shape != (3,) or upper.shape != (3,) or not (lower < upper).all():
         raise ValueError(f"hash_grid_field: the box is {network.lower} to {network.upper}, expected lower < upper")

@@ -74,7 +74,10 @@ def mlp_field(**options: Any) -> Field:
     Raises:
         ValueError: if density_activation is unknown.
     """
-    network = MLP(**options)
+    try:
+        network = MLP(**options)
+    except TypeError as error:
+        raise TypeError(str(error).replace("MLP.__init__()", "mlp_field()")) from None
     if network.density_activation not in DENSITY_ACTIVATIONS:
         raise ValueError(
             f"mlp_field: density_activation is {network.density_activation!r}, expected one of "

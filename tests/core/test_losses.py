@@ -108,7 +108,9 @@ def test_the_linear_sum_is_the_double_sum(near, far, rule):
 
 
 @pytest.mark.parametrize("rule", ["segments", "points"])
-@pytest.mark.parametrize("edges", [(0.2, 0.7, 1.6, 3.0), (0.0, 1.0, 2.0, 9.0), (0.1, 40.0), (0.0, 0.5), (0.5, 0.9, 1.2)])
+@pytest.mark.parametrize(
+    "edges", [(0.2, 0.7, 1.6, 3.0), (0.0, 1.0, 2.0, 9.0), (0.1, 40.0), (0.0, 0.5), (0.5, 0.9, 1.2)]
+)
 def test_segments_of_a_ray_from_0_to_infinity_are_cut_at_1(edges, rule):
     """The definition: s(t) = 1 - 1 / max(t, 1), and a segment's length is the difference of s at its ends."""
     edges = np.array(edges)

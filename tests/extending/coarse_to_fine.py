@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxnerf
-from jaxnerf.fields.base import Field
-from jaxnerf.options import FRACTION, Options, at_least, between, option
+from jaxnerf.extend import FRACTION, Field, Options, at_least, between, option
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,8 +18,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxnerf
-from jaxnerf.fields.base import Field
-from jaxnerf.options import POSITIVE, Options, at_least, infer, option
+from jaxnerf.extend import POSITIVE, Field, Options, at_least, infer, option
 
 
 @dataclasses.dataclass(frozen=True)

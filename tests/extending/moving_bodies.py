@@ -23,8 +23,7 @@ from flax import linen
 from PIL import Image
 
 import jaxnerf
-from jaxnerf.fields.base import Field
-from jaxnerf.options import Options, at_least, between, option
+from jaxnerf.extend import Field, Options, at_least, between, option
 
 
 @dataclasses.dataclass(frozen=True)

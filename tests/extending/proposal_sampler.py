@@ -16,11 +16,17 @@ import jax
 import jax.numpy as jnp
 
 import jaxnerf
-from jaxnerf.core.sampling import split_key
-from jaxnerf.core.types import without_samples
-from jaxnerf.fields.base import field_scene, needs_of_fields
-from jaxnerf.models.base import Model
-from jaxnerf.options import Options, at_least, between, option
+from jaxnerf.extend import (
+    Model,
+    Options,
+    at_least,
+    between,
+    field_scene,
+    needs_of_fields,
+    option,
+    split_key,
+    without_samples,
+)
 
 _EPS = 1e-7  # added to weights in a denominator, as in the paper's code
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import jaxnerf
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.extend import Capture, Frame
 
 DOWN_FORWARD_TO_UP_BACKWARD = [1, -1, -1]  # jaxnerf's cameras have x right, y up, and look along -z
 

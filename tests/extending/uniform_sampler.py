@@ -12,10 +12,7 @@ import dataclasses
 import functools
 
 import jaxnerf
-from jaxnerf.core.types import without_samples
-from jaxnerf.fields.base import field_scene, needs_of_fields
-from jaxnerf.models.base import Model
-from jaxnerf.options import Options, at_least, option
+from jaxnerf.extend import Model, Options, at_least, field_scene, needs_of_fields, option, without_samples
 
 
 @dataclasses.dataclass(frozen=True)

@@ -72,10 +72,11 @@ def create_grid(
         OccupancyGrid with fields [X, Y, Z], occupied wherever it is valid, unless its own density is 0.
 
     Raises:
-        ValueError: on other shapes.
+        ValueError: on other shapes, or if valid is not bool.
     """
     lower, upper, valid = (jnp.asarray(value) for value in (lower, upper, valid))
     check_shapes("create_grid", lower=(lower, "3"), upper=(upper, "3"), valid=(valid, "X Y Z"))
+    _check_bool("create_grid", valid=valid)
     density = jnp.broadcast_to(jnp.asarray(initial_density, jnp.float32), valid.shape)
     # Without an update a single number says nothing about any cell.
     occupied = valid if jnp.ndim(initial_density) == 0 else valid & (density > 0)
@@ -318,8 +319,16 @@ def is_occupied(
     grid: OccupancyGrid, rays: Rays, t: Float[ArrayLike, "*batch samples"]
 ) -> Bool[Array, "*batch samples"]:
     """Returns whether the cell around each x(t) is occupied; True where t or the ray is NaN, so that it is visible."""
+    _check_bool("OccupancyGrid", occupied=grid.occupied)
     index, inside = _cells_of(grid, _along_rays(grid, rays, t))
     return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t) | has_nan(rays)[..., None]
+
+
+def _check_bool(function, **cells):
+    """Raises a ValueError unless arrays of cells are bool; numbers would be masks by accident."""
+    for name, array in cells.items():
+        if array.dtype != bool:
+            raise ValueError(f"{function}: {name} has type {array.dtype}, expected bool; compare it with a threshold")
 
 
 def has_nan(rays: Rays) -> Bool[Array, "*batch"]:
@@ -367,6 +376,8 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
         The given scene is not evaluated in empty cells unless no position is in an occupied one. NaN is evaluated, so
         that it is visible.
     """
+
+    _check_bool("mask_scene", occupied=grid.occupied)
 
     @functools.wraps(scene)
     def masked(x, viewdirs, **inputs):

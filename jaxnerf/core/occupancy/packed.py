@@ -213,7 +213,7 @@ class _Sums(NamedTuple):
     Attributes:
         transmittance: [B].
         opacity: [B] 1 - transmittance, without cancellation.
-        rgb: [B, 3] on black.
+        rgb: [B, C] on black.
         depth: [B] sum of w t.
         disparity: [B] sum of w / t.
         median_depth: [B] in t, inf where the transmittance stays above one half; None unless it is wanted.
@@ -266,7 +266,12 @@ def _rendering(sums, num_dropped, far, shape, background, samples):
     """Returns the Rendering [*shape], with PackedSamples or None."""
     rgb = sums.rgb
     if background is not None:
-        behind = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), (*shape, 3)).reshape(-1, 3)
+        behind, channels = jnp.asarray(background, rgb.dtype), rgb.shape[-1:]
+        if behind.shape not in (channels, (*shape, *channels)):
+            raise ValueError(
+                f"render_packed: background has shape {behind.shape}, expected {channels} or {(*shape, *channels)}"
+            )
+        behind = jnp.broadcast_to(behind, (*shape, *channels)).reshape(-1, *channels)
         rgb = rgb + sums.transmittance[:, None] * _at_least_one(behind)
     flat = Rendering(
         rgb=rgb,
@@ -374,7 +379,7 @@ def _evaluate(function, scene, rays, t, ray_index, used, delta):
     with a gradient that is NaN. If no slot is used, that place is the near end of a ray, as in render_samples.
 
     Returns:
-        density [K] and rgb [K, 3], both 0 in unused slots.
+        density [K] and rgb [K, C], both 0 in unused slots.
     """
     first = ray_index[0]
     t = jnp.where(used, t, jnp.where(used[0], t[0], rays.near[first]))
@@ -383,8 +388,7 @@ def _evaluate(function, scene, rays, t, ray_index, used, delta):
     x = sample_rays.origins + t[:, None] * sample_rays.directions
     x = jnp.where(used[:, None], x, jax.lax.stop_gradient(x))[None]
     inputs = _packed_inputs(function, scene, sample_rays, t, used, delta) if needs_of(scene) else {}
-    density, rgb = scene(x, sample_rays.viewdirs[None], **inputs)
-    rendering.check_scene_output(function, density, rgb, x)
+    density, rgb = rendering.evaluate_scene(function, scene, x, sample_rays.viewdirs[None], inputs)
     return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
 
 
@@ -405,7 +409,7 @@ def _composite(function, scene, rays, placed, *, rule, longest, median_depth=Fal
     length = jnp.where(placed.used, rendering.lengths_at_speeds(placed.delta, speed, unknown), 0)
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
     weights, optical_depth = volume_rendering.packed_weights(density, length, starts, longest=longest)
-    colors = [rgb[:, axis] * weights for axis in range(3)]
+    colors = [rgb[:, channel] * weights for channel in range(rgb.shape[1])]
     moments = volume_rendering.multiply_or_zero(weights, t), volume_rendering.divide_or_zero(weights, t)
     parts = [optical_depth, *colors, *moments]
     sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
@@ -420,9 +424,9 @@ def _composite(function, scene, rays, placed, *, rule, longest, median_depth=Fal
     return _Sums(
         transmittance=jnp.exp(-sums[:, 0]),
         opacity=-jnp.expm1(-sums[:, 0]),
-        rgb=sums[:, 1:4],
-        depth=sums[:, 4],
-        disparity=sums[:, 5],
+        rgb=sums[:, 1:-2],
+        depth=sums[:, -2],
+        disparity=sums[:, -1],
         median_depth=median,
     ), packed
 
@@ -436,7 +440,7 @@ class _Slots(NamedTuple):
     Attributes:
         ray: [L] int32; B: none.
         num_done: [L] int32, the number of the ray's samples that were evaluated.
-        sums: [7, L], the columns of _Sums; [8, L] with the median depth, which is not a sum.
+        sums: [C + 4, L], the columns of _Sums; [C + 5, L] with the median depth, which is not a sum.
     """
 
     ray: Array
@@ -483,7 +487,8 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
     no_ray = jnp.full(slot_count, ray_count)
     none_done = jnp.zeros_like(no_ray)
     run = jax.eval_shape(evaluate, no_ray, none_done, jnp.ones(slot_count))
-    start = jnp.zeros((run.shape[0], 1), run.dtype).at[0].set(1).at[7:].set(jnp.inf)
+    rows = run.shape[0] - median_depth
+    start = jnp.zeros((run.shape[0], 1), run.dtype).at[0].set(1).at[rows:].set(jnp.inf)
 
     def refill(slots, num_taken):
         """Gives the next rays to the slots without one; returns the _Slots and how many rays were taken."""
@@ -498,14 +503,14 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
         slots, num_taken = refill(slots, num_taken)
         transmittance = slots.sums[:1]
         run = evaluate(slots.ray, slots.num_done, transmittance[0])
-        sums = [transmittance * run[:1], slots.sums[1:7] + transmittance * run[1:7]]
+        sums = [transmittance * run[:1], slots.sums[1:rows] + transmittance * run[1:rows]]
         if median_depth:
-            sums.append(jnp.where(jnp.isinf(slots.sums[7:]), run[7:], slots.sums[7:]))
+            sums.append(jnp.where(jnp.isinf(slots.sums[rows:]), run[rows:], slots.sums[rows:]))
         sums = jnp.concatenate(sums)
         num_done = slots.num_done + row.size
         terminates = ~(sums[0] > early_stop_eps)  # NaN terminates, so that it is visible
         ends = terminates | (num_done >= count.at[slots.ray].get(mode="clip"))
-        sums = jnp.where(terminates & (sums[1] > 0), _made_opaque(sums), sums)
+        sums = jnp.where(terminates & (sums[1] > 0), _made_opaque(sums, rows), sums)
         finished = finished.at[:, jnp.where(ends, slots.ray, ray_count)].set(sums, mode="drop")
         return _Slots(jnp.where(ends, ray_count, slots.ray), num_done, sums), num_taken, finished
 
@@ -517,8 +522,8 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
     finished = jnp.broadcast_to(start, (start.shape[0], ray_count))
     state = vary_like((slots, jnp.zeros_like(waiting), finished), run)
     finished = jax.lax.while_loop(continues, step, state)[2]
-    transmittance, opacity, *rgb, depth, disparity = finished[:7]
-    median = finished[7] if median_depth else None
+    transmittance, opacity, *rgb, depth, disparity = finished[:rows]
+    median = finished[rows] if median_depth else None
     return _Sums(transmittance, opacity, jnp.stack(rgb, axis=-1), depth, disparity, median)
 
 
@@ -534,9 +539,9 @@ def _longest_first(count, most):
     return (jnp.sort(numbers) % rays).astype(jnp.int32)
 
 
-def _made_opaque(sums):
-    """Returns the sums [7, L] or [8, L] of terminated rays, whose remaining light looks like the rest of the ray."""
-    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:7] / sums[1:2], sums[7:]])
+def _made_opaque(sums, rows):
+    """Returns the sums [C + 4 or 5, L] of terminated rays, whose remaining light looks like the rest of the ray."""
+    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:rows] / sums[1:2], sums[rows:]])
 
 
 def _nth_samples(rays, samples, words, up_to, ray, n, used):
@@ -554,14 +559,14 @@ def _nth_samples(rays, samples, words, up_to, ray, n, used):
 
 
 def _sum_run(function, scene, rays, samples, used, rule, transmittance):
-    """Returns [7, L], the columns of _Sums of consecutive samples, as if nothing lay in front of them.
+    """Returns [C + 4, L], the columns of _Sums of consecutive samples, as if nothing lay in front of them.
 
-    If the transmittance [L] in front of them is given, the result is [8, L], with the median depth.
+    If the transmittance [L] in front of them is given, the result is [C + 5, L], with the median depth.
     """
     t, delta = samples
     x = rendering.points_on_rays(rays, t)
-    density, rgb = scene(x, rays.viewdirs[:, None], **rendering.sample_inputs(function, scene, rays, t, delta))
-    rendering.check_scene_output(function, density, rgb, x)
+    inputs = rendering.sample_inputs(function, scene, rays, t, delta)
+    density, rgb = rendering.evaluate_scene(function, scene, x, rays.viewdirs[:, None], inputs)
     density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
     length = rendering.segment_lengths(delta, rays)
     weights = volume_rendering.weights_from_density(density, length)
