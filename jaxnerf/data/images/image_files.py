@@ -18,6 +18,8 @@ from jaxnerf.runtime.atomic_files import open_regular
 # What Pillow decodes by itself. Left to choose by a file's content, it would start Ghostscript for an EPS.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_GREY_MODES = ("I;16", "I;16B", "I;16L", "I", "F")  # Pillow's, of more than 8 bits
+_ROUNDING = 1e-4  # by which floats may leave [0, 1]
 _ORIENTATION = 0x0112  # the EXIF tag
 _UPRIGHT = {  # value of the tag -> function that makes the image upright
     2: np.fliplr,
@@ -28,6 +30,10 @@ _UPRIGHT = {  # value of the tag -> function that makes the image upright
     7: lambda pixels: np.rot90(np.swapaxes(pixels, 0, 1), 2),
     8: np.rot90,
 }
+
+
+class _WrongRangeError(ValueError):
+    """An image's numbers are no colours."""
 
 
 def is_hidden(name: str) -> bool:
@@ -41,7 +47,8 @@ def read_image(
     """Reads the pixels of an image file, upright, with the file's precision.
 
     Args:
-        path: an 8 or 16 bit PNG, or an 8 bit file of another of the FORMATS.
+        path: of one of the FORMATS: 8 bits, 16 bits in a PNG or grey, or in a grey TIFF floats in [0, 1] or whole
+            numbers of 32 bits up to 65535.
         camera_size: (height, width) that the camera's intrinsics refer to, or a multiple of the image's size.
             If only the stored, unrotated pixels fit it, the EXIF orientation is ignored.
         follow_exif: whether EXIF orientation is followed at all.
@@ -101,9 +108,12 @@ def fits(found: tuple, declared: tuple) -> bool:
 
 
 def read_mask(path: str | os.PathLike, *, camera_size: tuple | None = None) -> Bool[np.ndarray, "H W"]:
-    """Reads a grey image as a mask: True where a pixel is at least half bright. See `read_image`."""
-    pixels = read_image(path, camera_size=camera_size)
-    return pixels[..., 0] > np.iinfo(pixels.dtype).max // 2
+    """Reads an image as a mask: True where a pixel is brighter than half of the brightest one. See `read_image`.
+
+    The values may be 0 and 1, 0 and 255 or any others, and palettes of any colours; a black image excludes all.
+    """
+    values = read_image(path, camera_size=camera_size)[..., :3].max(axis=-1)
+    return values > values.max(initial=0) // 2
 
 
 def image_size(path: str | os.PathLike, *, follow_exif: bool = True) -> tuple[int, int]:
@@ -130,12 +140,18 @@ def _use(path, use):
             return use(image)
     except FileNotFoundError:
         raise
+    except _WrongRangeError as error:
+        raise ValueError(f"{path}: {error}; convert it to 8 or 16 bits") from None
     except Exception as error:  # Pillow's decoders raise almost any exception on a damaged file
         unknown = isinstance(error, UnidentifiedImageError)
-        reason = f"it is no {'/'.join(FORMATS)}" if unknown else " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(
-            f"{path}: unreadable ({reason}), expected a complete image file; copy or render it again"
-        ) from error
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        remedy = "expected a complete image file; copy or render it again"
+        if unknown:
+            reason, remedy = (
+                f"it is no {'/'.join(FORMATS)}, or of a kind that Pillow does not read",
+                ("expected an image of 8 or 16 bits; copy it again, or convert it to PNG"),
+            )
+        raise ValueError(f"{path}: unreadable ({reason}), {remedy}") from error
 
 
 def _orientation(image):
@@ -165,7 +181,7 @@ def _depth(image):
     raw = _raw(image)
     if raw in ("RGB;16B", "RGBA;16B"):
         return (4 if raw.startswith("RGBA") else 3), np.dtype(np.uint16)
-    if image.mode == "I;16":
+    if image.mode in _GREY_MODES:
         return 3, np.dtype(np.uint16)
     return (4 if image.has_transparency_data else 3), np.dtype(np.uint8)
 
@@ -177,10 +193,22 @@ def _decode(path, image):
         # so two passes give all sixteen bits.
         high, low = np.asarray(image), _second_bytes(path, raw)
         return high.astype(np.uint16) * 256 + low
-    if image.mode == "I;16":
-        return np.repeat(np.asarray(image)[..., None], 3, axis=-1)
+    if image.mode in _GREY_MODES:
+        return np.repeat(_sixteen_bits(np.asarray(image))[..., None], 3, axis=-1)
     mode = "RGBA" if image.has_transparency_data else "RGB"
     return np.asarray(image if image.mode == mode else image.convert(mode))
+
+
+def _sixteen_bits(values):
+    """Returns floats in [0, 1] or whole numbers up to 65535 as uint16; ValueError on any other range."""
+    low, high = values.min(initial=0), values.max(initial=0)
+    if values.dtype.kind == "f":
+        if not (low >= -_ROUNDING and high <= 1 + _ROUNDING):  # not NaN either
+            raise _WrongRangeError(f"its values are from {low:g} to {high:g}, expected floats from 0 to 1")
+        values = np.rint(65535 * np.clip(values, 0, 1))
+    elif not 0 <= low <= high <= 65535:
+        raise _WrongRangeError(f"its values are from {low} to {high}, expected whole numbers from 0 to 65535")
+    return values.astype(np.uint16)
 
 
 def _second_bytes(path, raw):

@@ -25,7 +25,8 @@ class Frame(NamedTuple):
         name: the image's path below the folder of images, without extension, with / between folders.
         image: an existing file.
         camera: float64. Height and width are those that the format states for the image, or None.
-        mask: an existing grey image; pixels are ignored where it is 0. None: no pixel is ignored.
+        mask: an existing image; pixels are ignored where it is at most half as bright as its brightest pixel. None: no
+            pixel is ignored.
         follow_exif: whether EXIF orientation is applied. COLMAP's pixel coordinates, for example, refer to the
             pixels as they are stored.
         bounds: nearest and farthest matter along the camera's axis, world units; None: not known.
