@@ -76,22 +76,8 @@ def render_chunk(params, rays):
 
 def render_view(params, views, index):
     """Renders a view of Views: rgb [H, W, 3]."""
-    height, width = (int(size) for size in views.size[index])
-    camera = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), views.cameras)
-    pixels = jaxnerf.pixel_grid(height, width)
-    rays = jaxnerf.rays_from_pixels(camera, pixels, near=views.near[index], far=views.far[index])
-    image = jaxnerf.render_image(functools.partial(render_chunk, params), rays, chunk=CHUNK)
+    image = jaxnerf.render_image(functools.partial(render_chunk, params), views.rays(index), chunk=CHUNK)
     return jaxnerf.round_to_8_bits(image.rgb)
-
-
-def image_of(views, index):
-    """Returns the image of a view: rgb [H, W, 3], alpha composited over the background."""
-    height, width = (int(size) for size in views.size[index])
-    start = int(views.offset[index])
-    pixels = np.asarray(views.pixels[start : start + height * width]).reshape(height, width, -1)
-    pixels = pixels / np.iinfo(pixels.dtype).max
-    alpha = pixels[..., 3:] if pixels.shape[-1] == 4 else 1.0
-    return alpha * pixels[..., :3] + (1 - alpha) * np.asarray(BACKGROUND)
 
 
 def main():
@@ -105,7 +91,7 @@ def main():
     options = {"factor": flags.factor} if flags.data_dir else {"format": "synthetic"}
     params = train(jaxnerf.load_dataset(flags.data_dir, split="train", **options), flags.steps)
     test = jaxnerf.load_dataset(flags.data_dir, split="test", **options)
-    images = [(image_of(test, index), render_view(params, test, index)) for index in range(len(test.names))]
+    images = [(test.image(index), render_view(params, test, index)) for index in range(len(test.names))]
     print(f"PSNR {np.mean([jaxnerf.psnr(*pair) for pair in images]):.2f} dB on {len(images)} test views")
     imageio.imwrite(flags.out, np.uint8(np.round(255 * np.concatenate(images[0], axis=1))))
     print(f"wrote {flags.out}: a test image and its rendering")

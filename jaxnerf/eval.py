@@ -104,7 +104,11 @@ def _reference_config():
     from jaxnerf.training.workdir import load_config
 
     if _CONFIG.value is None and not _WORKDIR.value:
-        return None
+        if not _DATA_DIR.value:
+            return None
+        from jaxnerf.configs import default
+
+        return read_config(cli.use_data(default.get_config(), _DATA_DIR.value))
     config = load_config(_WORKDIR.value) if _CONFIG.value is None else read_config(_CONFIG.value)
     return dataset_at(config, _DATA_DIR.value)
 

@@ -267,6 +267,42 @@ class Views:
     time: Float[Array, " V"] | None = None
     image_index: Int[Array, " V"] | None = None
 
+    def image(self, index: int) -> Float[Array, "H W 3"]:
+        """Returns a view's colours [H, W, 3] in [0, 1]; alpha is composited over the background, or over black."""
+        height, width = (int(side) for side in self.size[index])
+        first = int(self.offset[index])
+        pixels = jnp.asarray(self.pixels[first : first + height * width])
+        return pixel_colors(pixels, self.background).reshape(height, width, 3)
+
+    def camera(self, index: Int[ArrayLike, ""]) -> Camera:
+        """Returns a view's Camera; it has a height and a width if all views have the same."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.cameras)
+
+    def rays(self, index: int) -> Rays:
+        """Returns the Rays [H, W] through the centres of a view's pixels, between its near and its far."""
+        from jaxnerf.core.cameras import pixel_grid, rays_from_pixels  # they take the types of this module
+
+        height, width = (int(side) for side in self.size[index])
+        near, far = (jnp.asarray(bound)[index] for bound in (self.near, self.far))
+        return rays_from_pixels(self.camera(index), pixel_grid(height, width), near=near, far=far)
+
+
+def pixel_colors(pixels: UInt[ArrayLike, "*batch C"], background: Vector | None) -> Float[ArrayLike, "*batch 3"]:
+    """Returns the colours of uint8 or uint16 pixels in [0, 1].
+
+    Pixels of C = 4 channels have straight alpha and are composited over background (None: black). Pixels of
+    C = 3 channels are opaque.
+    """
+    largest = jnp.iinfo(pixels.dtype).max
+    values = pixels.astype(jnp.float32) / largest
+    if pixels.shape[-1] == 3:
+        return values
+    rgb, alpha = values[..., :3], values[..., 3:]
+    if background is None:
+        return rgb * alpha
+    behind = jnp.broadcast_to(jnp.asarray(background, jnp.float32), rgb.shape)
+    return rgb * alpha + behind * (1 - alpha)
+
 
 @pytree()
 class Batch:

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, Num, UInt
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_radius, rays_from_pixels
 from jaxnerf.core.loops import search_sorted
 from jaxnerf.core.safe_math import norm
-from jaxnerf.core.types import Batch, Camera, Rays, Vector, Views, pytree
+from jaxnerf.core.types import Batch, Camera, Rays, Views, pixel_colors, pytree
 
 BATCHINGS = ("all_images", "single_image")
 DEPTH_STRIDE = 4  # px between the places of `SparsePoints.interpolated`
@@ -64,23 +64,6 @@ class PixelRuns:
         return (np.arange(self.size) + np.repeat(self.first - self.before, lengths)).astype(np.int32)
 
 
-def pixel_colors(pixels: UInt[ArrayLike, "*batch C"], background: Vector | None) -> Float[ArrayLike, "*batch 3"]:
-    """Returns the colours of uint8 or uint16 pixels in [0, 1].
-
-    Pixels of C = 4 channels have straight alpha and are composited over background (None: black). Pixels of
-    C = 3 channels are opaque.
-    """
-    largest = jnp.iinfo(pixels.dtype).max
-    values = pixels.astype(jnp.float32) / largest
-    if pixels.shape[-1] == 3:
-        return values
-    rgb, alpha = values[..., :3], values[..., 3:]
-    if background is None:
-        return rgb * alpha
-    behind = jnp.broadcast_to(jnp.asarray(background, jnp.float32), rgb.shape)
-    return rgb * alpha + behind * (1 - alpha)
-
-
 def view_rays(
     views: Views,
     index: Int[ArrayLike, ""],
@@ -98,7 +81,7 @@ def view_rays(
         ndc: whether the rays are in normalised device coordinates.
         needs: what a scene asks for, see `with_needs`. Rays have a time only if the views do.
     """
-    camera = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], views.cameras)
+    camera = views.camera(index)
     near, far = jnp.asarray(views.near)[index], jnp.asarray(views.far)[index]
     rays = rays_from_pixels(camera, pixels, near=near, far=far)
     if needs:

@@ -20,7 +20,7 @@ import jax
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Views
 from jaxnerf.evaluation import aggregate, output_images
-from jaxnerf.evaluation.metrics import image_metrics, pixel_mask, reference
+from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
 from jaxnerf.runtime import atomic_files, processes, shards
@@ -215,7 +215,7 @@ def _score_views(run, render, views, folder, shard):
         rays = run.experiment.view_rays(views, index, pixels)
         image = jax.block_until_ready(render(rays))
         seconds = time.perf_counter() - started
-        truth = reference(views, index)
+        truth = views.image(index)
         row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
         output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)

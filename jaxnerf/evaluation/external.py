@@ -2,17 +2,19 @@
 
 import json
 import os
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from absl import logging
 from jax.typing import ArrayLike
 
-from jaxnerf.data.images.image_files import read_image
+from jaxnerf.data.images.image_files import is_hidden, read_image
 from jaxnerf.evaluation import protocol
 from jaxnerf.evaluation.aggregate import means
-from jaxnerf.evaluation.metrics import image_metrics, pixel_mask, reference
+from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import build
 from jaxnerf.training.config import Config
@@ -28,8 +30,9 @@ def score_folder(
     """Scores a folder of predictions and writes results.json into it.
 
     Args:
-        folder: holds the images, or color/ with them. They are matched with the views by name if all names
-            agree, otherwise in the order of their names.
+        folder: holds the images, or color/ with them. They are paired with the views by name if all names agree,
+            otherwise by the last number in each name if these agree, otherwise in order: images in that of their names,
+            r_9 before r_10, views as the dataset lists them. A warning says how, unless names agree.
         config: its dataset is the reference; None: the folder's own gt-color/.
         split: of that dataset; the config's eval.split when None.
         overwrite: whether an earlier results.json is replaced.
@@ -52,7 +55,7 @@ def score_folder(
     else:
         views, split, conventions = build.load_split(config, split)
         truths = views.names
-        references = [np.asarray(reference(views, index)) for index in range(len(truths))]
+        references = [np.asarray(views.image(index)) for index in range(len(truths))]
         masks = [pixel_mask(views, index) for index in range(len(truths))]
         about = protocol.of_views(conventions, views, split=split)
     if len(paths) != len(truths):
@@ -60,11 +63,9 @@ def score_folder(
             f"{paths[0].parent}: holds {len(paths)} images, expected {len(truths)}, one for each reference; add or "
             "remove images"
         )
-    names = [Path(str(truth)).stem for truth in truths]
-    if sorted(names) == sorted(path.stem for path in paths):
-        paths.sort(key=lambda path: names.index(path.stem))
+    paths, how = _paired(paths, [Path(str(truth)).stem for truth in truths])
     names = [path.name for path in paths]
-    results = score_predictions(map(_colors, paths), references, names=names, masks=masks) | about
+    results = score_predictions(map(_colors, paths), references, names=names, masks=masks) | {"paired_by": how, **about}
     atomic_files.write_text(target, json.dumps(results, indent=2) + "\n")
     return results
 
@@ -98,10 +99,45 @@ def score_predictions(
     return {**means(rows), "views": len(rows), "images": rows}
 
 
+def _paired(paths, names):
+    """Returns the paths, given in natural order, in the order of the references, and by what they were paired."""
+    for how, key in {"name": str, "number": _last_number}.items():
+        found, expected = {key(path.stem): path for path in paths}, [key(name) for name in names]
+        if len(found) == len(set(expected)) == len(paths) and found.keys() == set(expected):
+            return _reported([found[each] for each in expected], names, how)
+    return _reported(paths, names, "order")
+
+
+def _reported(paths, names, how):
+    """Returns the arguments paths and how; warns of a pairing by anything but names."""
+    if how != "name":
+        pairs = ", ".join(f"{path.name} with {name}" for path, name in zip(paths[:3], names[:3], strict=True))
+        by = "the numbers in them" if how == "number" else "order, as the numbers in them differ, too"
+        folder = paths[0].parent
+        logging.warning("%s: names differ from those of the references; paired by %s: %s ...", folder, by, pairs)
+    return paths, how
+
+
+def _last_number(name):
+    """Returns the last number in a name, as an integer; the name itself without one."""
+    numbers = re.findall(r"\d+", name)
+    return int(numbers[-1]) if numbers else name
+
+
+def _natural(name):
+    """Returns a key for sorting names by their numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+
 def _image_paths(folder):
-    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    found = [path for path in folder.glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    paths = sorted((path for path in found if not is_hidden(path.name)), key=lambda path: _natural(path.stem))
     if not paths:
-        raise ValueError(f"{folder}: holds no PNG or JPEG images, expected the images to score; correct the folder")
+        raise ValueError(
+            f"{folder}: holds no PNG or JPEG images, expected images; correct the folder, or name the dataset of the "
+            "references with --data_dir, --config or --workdir"
+        )
     return paths
 
 

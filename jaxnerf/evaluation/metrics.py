@@ -9,7 +9,6 @@ from jax.typing import ArrayLike
 
 from jaxnerf.core.metrics import align_colors, decibels, mse, psnr, round_to_8_bits, ssim
 from jaxnerf.core.types import Views
-from jaxnerf.data.ray_batches import pixel_colors
 from jaxnerf.runtime import memory
 
 _SSIM_MARGIN = 10  # rows that a window of SSIM covers below its first
@@ -43,14 +42,6 @@ def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
     unit = f"rows of an image of {width} x {height} at once"
     found, _ = memory.back_off(attempt, height, cause="metrics", unit=unit)
     return {key: float(value) for key, value in found.items()}
-
-
-def reference(views: Views, index: int) -> jax.Array:
-    """Returns the colours [H, W, 3] of one of Views, over its background."""
-    height, width = (int(value) for value in views.size[index])
-    first = int(views.offset[index])
-    pixels = jnp.asarray(views.pixels[first : first + height * width])
-    return pixel_colors(pixels, views.background).reshape(height, width, 3)
 
 
 def pixel_mask(views: Views, index: int) -> jax.Array | None:

@@ -15,7 +15,7 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.types import Views
 from jaxnerf.evaluation import output_images
-from jaxnerf.evaluation.metrics import pixel_mask, reference
+from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_run
 from jaxnerf.runtime import atomic_files, memory, processes
 from jaxnerf.training import metric_log
@@ -157,7 +157,7 @@ class Previews:
         every = math.ceil(math.sqrt(height * width / _MAX_RAYS))
         pixels = pixel_grid(height, width, offset=experiment.config.data.pixel_offset)[::every, ::every]
         rgb = self._run.render_image(variables, experiment.view_rays(views, index, pixels)).rgb
-        truth, mask = reference(views, index)[::every, ::every], pixel_mask(views, index)
+        truth, mask = views.image(index)[::every, ::every], pixel_mask(views, index)
         mask = None if mask is None else mask[::every, ::every]
         score = float(psnr(round_to_8_bits(rgb), round_to_8_bits(truth), mask=mask))
         return score, np.concatenate([output_images.to_8_bits(rgb), output_images.to_8_bits(truth)], axis=1)

@@ -16,7 +16,7 @@ from jaxnerf.core.metrics import psnr
 from jaxnerf.core.occupancy.grid import cell_inputs
 from jaxnerf.core.types import Camera, Vector
 from jaxnerf.data.geometry.world import poses_in_file
-from jaxnerf.evaluation.metrics import pixel_mask, reference
+from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import refined_views
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.points import surface_points, thinned, write_ply
@@ -152,7 +152,7 @@ def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
             ]
             image = np.stack(planes, axis=-1).reshape(height, width, 3)
         image = np.clip(image, 0, 1).astype(np.float32)
-        values.append(float(psnr(jnp.asarray(image), reference(views, index), mask=pixel_mask(views, index))))
+        values.append(float(psnr(jnp.asarray(image), views.image(index), mask=pixel_mask(views, index))))
     return float(np.mean(values)), count
 
 

@@ -12,7 +12,6 @@ from jaxnerf.core import contraction
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import gaze_center
 from jaxnerf.evaluation import output_images
-from jaxnerf.evaluation.metrics import reference
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import newest_step
 from jaxnerf.viewer.frame_renderer import MAX_SIDE, MODES, FrameCamera, frame_image
@@ -440,7 +439,7 @@ def _quaternion(rotation):
 
 def _view_image(views, index, longest):
     """Returns a training image over its background, uint8, subsampled to at most so many px."""
-    image = np.asarray(reference(views, index))
+    image = np.asarray(views.image(index))
     every = -(-max(image.shape[:2]) // longest)
     return output_images.to_8_bits(image[::every, ::every])
 

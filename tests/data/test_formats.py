@@ -15,10 +15,11 @@ import pytest
 import captures
 from jaxnerf import Rays, render_rays
 from jaxnerf.configs import capture
+from jaxnerf.core.types import pixel_colors
 from jaxnerf.data import dataset
 from jaxnerf.data.active_pixels import unmasked_pixels
 from jaxnerf.data.dataset import DataOptions
-from jaxnerf.data.ray_batches import pixel_colors, view_rays
+from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.fields import still_life
 from jaxnerf.options import replaced, values_of
 from jaxnerf.training import workdir

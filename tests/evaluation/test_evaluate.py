@@ -10,10 +10,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+import captures
 import oracle
-from jaxnerf import load_scene, pixel_grid, render_image
+from jaxnerf import load_dataset, load_scene, pixel_grid, render_image
 from jaxnerf.evaluation import external
-from jaxnerf.evaluation.evaluate import evaluate, reference, score_run, watch
+from jaxnerf.evaluation.evaluate import evaluate, score_run, watch
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import build
@@ -137,6 +138,52 @@ def test_predictions_have_the_metrics_of_the_evaluation_that_wrote_them(scored, 
         external.score_folder(tmp_path / "20", overwrite=True)
 
 
+@pytest.mark.parametrize(
+    "found, expected, how, pairs",
+    [
+        (["r_2", "r_10"], ["r_10", "r_2"], "name", [1, 0]),
+        ([f"pred_{index}" for index in range(12)], [f"gt_{index:03d}" for index in range(12)], "number", range(12)),
+        (["7", "8", "9", "10"], ["a9", "a7", "a10", "a8"], "number", [2, 0, 3, 1]),
+        ([f"r_{index}" for index in range(5, 13)], [f"{index:03d}" for index in range(8)], "order", range(8)),
+        (["b", "a"], ["x", "y"], "order", [1, 0]),
+        (["1_1", "2_1"], ["a", "b"], "order", [0, 1]),
+    ],
+)
+def test_predictions_are_paired_by_name_or_number_or_in_natural_order(tmp_path, caplog, found, expected, how, pairs):
+    """The pictures are of grey levels, so that each pair is known."""
+    for index, place in enumerate(pairs):
+        level = np.full((12, 12, 3), 10 * index, np.uint8)
+        for folder, name in ((tmp_path / "color", found[place]), (tmp_path / "gt-color", expected[index])):
+            folder.mkdir(exist_ok=True)
+            iio.imwrite(folder / f"{name}.png", level)
+    results = external.score_folder(tmp_path)
+    assert results["paired_by"] == how and results["psnr"] == np.inf
+    warned = [record.getMessage() for record in caplog.records if "paired by" in record.getMessage()]
+    assert len(warned) == (how != "name")
+
+
+@pytest.mark.slow
+def test_a_flat_folder_is_scored_against_a_dataset(tmp_path):
+    """--data_dir alone names the dataset; without it the message says what to give."""
+    shots = captures.shoot(captures.orbit(4))
+    for split in ("train", "test"):
+        captures.write_blender(tmp_path / "data", shots, split=split)
+    views = load_dataset(tmp_path / "data", split="test")
+    (tmp_path / "flat").mkdir()
+    for index in range(4):
+        iio.imwrite(tmp_path / "flat" / f"{index:03d}.png", np.uint8(np.rint(255 * np.asarray(views.image(index)))))
+    flag = f"--predictions={tmp_path / 'flat'}"
+    _, err = start("eval", flag).communicate(timeout=120)
+    assert (
+        "flat/gt-color: holds no PNG or JPEG images" in err
+        and "name the dataset of the references with --data_dir" in err
+    )
+    process = start("eval", flag, f"--data_dir={tmp_path / 'data'}")
+    process.communicate(timeout=120)
+    results = json.loads((tmp_path / "flat" / "results.json").read_text())
+    assert process.returncode == 0 and results["psnr"] > 50 and results["views"] == 4
+
+
 @pytest.mark.slow
 def test_watching_waits_scores_each_checkpoint_and_ends(trained, tmp_path):
     """Watches an empty folder, then one checkpoint, then the last two."""
@@ -178,7 +225,7 @@ def test_the_reference_is_the_datasets_image_over_its_background():
     views = build.load_split(smoke_config(), "test")[0]
     pixels = views.pixels[576 : 2 * 576].reshape(24, 24, 4) / 65535
     expected = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
-    np.testing.assert_allclose(reference(views, 1), expected, atol=1e-6)
+    np.testing.assert_allclose(views.image(1), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

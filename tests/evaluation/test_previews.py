@@ -10,7 +10,6 @@ import pytest
 
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
-from jaxnerf.evaluation.metrics import reference
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import build, loop, metric_log
@@ -87,7 +86,7 @@ def test_without_held_out_views_training_views_are_shown(folder, views, monkeypa
     assert lines[3].startswith("held-out      no images (no split 'test'); --config.data.hold_out=8 with a new")
     assert not any("jaxnerf-eval" in line for line in lines)
     image = iio.imread(folder / "previews" / "20.png")
-    np.testing.assert_array_equal(image[:, 24:], output_images.to_8_bits(reference(views, 30)))
+    np.testing.assert_array_equal(image[:, 24:], output_images.to_8_bits(views.image(30)))
 
 
 @pytest.mark.slow
@@ -131,4 +130,4 @@ def test_large_images_are_subsampled(folder, views, monkeypatch):
     previews.summary(views)
     image, shown = iio.imread(folder / "previews" / "20.png"), build.load_split(smoke_config(), "test")[0]
     assert image.shape == (12, 24, 3)
-    np.testing.assert_array_equal(image[:, 12:], output_images.to_8_bits(reference(shown, 4))[::2, ::2])
+    np.testing.assert_array_equal(image[:, 12:], output_images.to_8_bits(shown.image(4))[::2, ::2])
