@@ -145,8 +145,9 @@ def _results(run, workdir, views, variables, finished, provenance):
 
 
 def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Returns the mean over the images of each metric."""
-    return {key: float(np.mean([row[key] for row in rows])) for key in _MEANS}
+    """Returns the mean over the images of each metric; that of lpips where all have it."""
+    names = [*_MEANS, *(["lpips"] if all("lpips" in row for row in rows) else [])]
+    return {key: float(np.mean([row[key] for row in rows])) for key in names}
 
 
 def _on_contact_sheet(count):

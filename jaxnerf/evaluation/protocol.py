@@ -11,6 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxnerf.core.types import Views
+from jaxnerf.evaluation.metrics import lpips_convention
 
 METRICS = {
     "rounding": "psnr and ssim: 8 bits, to nearest, both images; psnr_float: none; psnr_truncated: 8 bits, "
@@ -22,7 +23,6 @@ METRICS = {
     "data_range": 1.0,
     "pixels": "all; PSNR excludes masked pixels, and SSIM sees the dataset's image there",
     "mean": "over the images",
-    "lpips": "absent: no package contains the parameters of its networks",
 }
 # How a reader chooses the split "test".
 _TEST_SPLITS = {
@@ -74,7 +74,8 @@ def of_views(conventions: Mapping[str, Any], views: Views, *, split: str) -> dic
 def of_images(conventions: Mapping[str, Any], size: ArrayLike | Sequence[Sequence[int]]) -> dict[str, Any]:
     """Returns the same as `of_views` for images of size [V, 2] (height, width), with any known conventions."""
     pairs = np.unique(np.asarray(size), axis=0).tolist()
-    found = {**conventions, "views": len(size), "size": pairs[0] if len(pairs) == 1 else pairs, **METRICS}
+    of_metrics = {**METRICS, "lpips": lpips_convention()}
+    found = {**conventions, "views": len(size), "size": pairs[0] if len(pairs) == 1 else pairs, **of_metrics}
     return {"conventions": found, "comparable_with": comparable_with(found)}
 
 

