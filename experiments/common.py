@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from absl import flags
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.runtime.atomic_files import partial_file, write_text
 from jaxnerf.runtime.devices import split_positions

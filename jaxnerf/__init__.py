@@ -38,7 +38,8 @@ from jaxnerf.core.sampling import (
     stepped_edges,
     uniform_edges,
 )
-from jaxnerf.core.types import Batch, Camera, PackedSamples, Rays, Rendering, Samples, SceneFn, SparsePoints, Views
+from jaxnerf.core.types import Batch, Camera, PackedSamples, Rays, Rendering, Samples, SceneFn, SparsePoints
+from jaxnerf.core.views import Views
 from jaxnerf.core.volume_rendering import (
     composite,
     expected_depth,

@@ -9,7 +9,8 @@ import numpy as np
 
 import captures
 import jaxnerf
-from jaxnerf.core.types import Rendering, Views
+from jaxnerf.core.types import Rendering
+from jaxnerf.core.views import Views
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model
 from jaxnerf.training import auto_config, build, workdir

@@ -34,7 +34,7 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf import Rays, render_hierarchical, render_rays
-from jaxnerf.core.types import pixel_colors
+from jaxnerf.core.views import pixel_colors
 from jaxnerf.evaluation import restore
 from jaxnerf.fields.mlp import mlp_field
 from jaxnerf.runtime import cli

@@ -31,7 +31,8 @@ import common
 
 from jaxnerf.core import contraction
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.core.types import Rays, SceneFn, Views
+from jaxnerf.core.types import Rays, SceneFn
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation.evaluate import reference
 from jaxnerf.evaluation.metrics import image_metrics
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, restore_run

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 
 from jaxnerf.core.occupancy.grid import clip_rays_to_box, is_occupied
 from jaxnerf.core.occupancy.ray_marching import march_rays
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data.geometry.seen_cells import likely_empty_cells, seen_cells
 from jaxnerf.data.geometry.visual_hull import visual_hull
 from jaxnerf.data.ray_batches import PixelRuns, view_rays

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxnerf.core.types import SparsePoints, Views
+from jaxnerf.core.types import SparsePoints
+from jaxnerf.core.views import Views
 from jaxnerf.data import synthetic
 from jaxnerf.data.facts import LookAt, mean_color
 from jaxnerf.data.geometry import bounds, world

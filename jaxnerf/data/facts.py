@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import poses, visual_hull
 from jaxnerf.data.observations import num_shared
 from jaxnerf.data.ray_batches import view_rays

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 from jaxnerf.core.cameras import project
-from jaxnerf.core.types import SparsePoints, Views
+from jaxnerf.core.types import SparsePoints
+from jaxnerf.core.views import Views
 
 _ACCURATE = 0.5  # px, standard deviation of an observation below which points do not differ in confidence
 _LEAST = 0.05  # confidence below which an observation is dropped

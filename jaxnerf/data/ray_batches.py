@@ -11,7 +11,8 @@ from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, Num, UInt
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_radius, rays_from_pixels
 from jaxnerf.core.loops import search_sorted
 from jaxnerf.core.safe_math import norm
-from jaxnerf.core.types import Batch, Camera, Rays, Views, pixel_colors, pytree
+from jaxnerf.core.types import Batch, Camera, Rays, pytree
+from jaxnerf.core.views import Views, pixel_colors
 
 BATCHINGS = ("all_images", "single_image")
 DEPTH_STRIDE = 4  # px between the places of `SparsePoints.interpolated`

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt16
 
 from jaxnerf.core import cameras
-from jaxnerf.core.types import Camera, Rays, Views
+from jaxnerf.core.types import Camera, Rays
+from jaxnerf.core.views import Views
 from jaxnerf.data.images import image_files
 from jaxnerf.data.images.pixel_cache import num_workers
 from jaxnerf.fields import portable_math, still_life

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxnerf.core.types import Rendering, Views
+from jaxnerf.core.types import Rendering
+from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images, protocol

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation import aggregate, output_images
 from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.evaluation.previews import Previews

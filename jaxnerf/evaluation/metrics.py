@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxnerf.core.metrics import align_colors, decibels, mse, psnr, round_to_8_bits, ssim
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.runtime import memory
 
 _MIN_LPIPS_SIDE = 32  # px; the network halves the image four times

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_run

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation.metrics import lpips_convention
 
 METRICS = {

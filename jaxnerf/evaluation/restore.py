@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxnerf.core.types import Rays, Rendering, SceneFn, Views
+from jaxnerf.core.types import Rays, Rendering, SceneFn
+from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.models.base import Model

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
 from jaxnerf.registry import EXPORTERS
 from jaxnerf.runtime import atomic_files

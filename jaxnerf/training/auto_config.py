@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.facts import dataset_facts
 from jaxnerf.options import Changes, Device, Facts, changing, is_auto, replaced

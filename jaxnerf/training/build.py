@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.geometry.free_space import interpolated_depths

@@ -16,7 +16,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.poses import se3_exponential
 from jaxnerf.core.safe_math import norm
-from jaxnerf.core.types import Batch, Camera, Rays, Rendering, Views
+from jaxnerf.core.types import Batch, Camera, Rays, Rendering
+from jaxnerf.core.views import Views
 from jaxnerf.models.base import Model
 from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
 

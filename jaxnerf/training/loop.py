@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import BatchPixels
 from jaxnerf.runtime import devices, memory, processes, signals
 from jaxnerf.training import build, metric_log, workdir

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxnerf.core.metrics import decibels
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.runtime.atomic_files import naming, open_regular, parse_json, partial_file, read_bytes, write_text
 from jaxnerf.runtime.devices import devices_of
 from jaxnerf.training.dead_networks import dead_networks

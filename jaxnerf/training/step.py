@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.core.losses import squared_error
-from jaxnerf.core.types import Renderings, Views
+from jaxnerf.core.types import Renderings
+from jaxnerf.core.views import Views
 from jaxnerf.data import ray_batches
 from jaxnerf.data.active_pixels import PixelRuns
 from jaxnerf.models.base import Model

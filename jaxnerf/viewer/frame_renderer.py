@@ -17,7 +17,8 @@ from jaxnerf.core.cameras import ndc_rays, ndc_to_t, rays_from_pixels
 from jaxnerf.core.occupancy.from_scene import crop_grid
 from jaxnerf.core.occupancy.grid import clip_rays
 from jaxnerf.core.safe_math import norm
-from jaxnerf.core.types import Camera, Views
+from jaxnerf.core.types import Camera
+from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import with_needs
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.restore import TrainedRun

@@ -9,7 +9,7 @@ import time
 import jax
 import numpy as np
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_with_grid
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import metric_log

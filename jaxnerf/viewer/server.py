@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from urllib.parse import urlsplit
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.viewer.frame_renderer import FrameRenderer
 from jaxnerf.viewer.page import Page

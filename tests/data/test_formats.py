@@ -15,7 +15,7 @@ import pytest
 import captures
 from jaxnerf import Rays, render_rays
 from jaxnerf.configs import capture
-from jaxnerf.core.types import pixel_colors
+from jaxnerf.core.views import pixel_colors
 from jaxnerf.data import dataset
 from jaxnerf.data.active_pixels import unmasked_pixels
 from jaxnerf.data.dataset import DataOptions

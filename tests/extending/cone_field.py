@@ -22,7 +22,7 @@ import numpy as np
 from flax import linen
 
 import jaxnerf
-from jaxnerf.core.types import pixel_colors
+from jaxnerf.core.views import pixel_colors
 from jaxnerf.extend import Field, Options, at_least, between, option
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import DEPTH_STRIDE
 
 _MARGIN = 0.15  # of the depth: surfaces curve between points, and points have errors

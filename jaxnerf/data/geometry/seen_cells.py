@@ -15,7 +15,8 @@ from jaxnerf.core.cameras import project, undistort
 from jaxnerf.core.occupancy.grid import cells_along, create_grid, widen
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.sampling import samples_from_edges, uniform_edges
-from jaxnerf.core.types import Rays, Views
+from jaxnerf.core.types import Rays
+from jaxnerf.core.views import Views
 from jaxnerf.data.geometry.free_space import surface_range
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.models.grid_schedule import GridSchedule

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxnerf.core.cameras import project, undistort
-from jaxnerf.core.types import Camera, Vector, Views
+from jaxnerf.core.types import Camera, Vector
+from jaxnerf.core.views import Views
 
 _MARGIN = 1  # px around a box: matter that covers only a pixel's corner may have left no alpha
 _MAX_TANGENT = 3.0  # of the angle from the axis up to which a distorted image is used

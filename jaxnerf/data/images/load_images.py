@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnerf.core.types import Camera, SparsePoints, Views
+from jaxnerf.core.types import Camera, SparsePoints
+from jaxnerf.core.views import Views
 from jaxnerf.data.images.downscaled_copies import choose_copies
 from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_image, read_mask
 from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers

@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from jaxnerf.core.types import Views
+from jaxnerf.core.views import Views
 from jaxnerf.data.images.image_files import image_form
 from jaxnerf.data.images.load_images import load_frames
 from jaxnerf.data.readers.base import Capture, Frame

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.core.types import Camera, Views
+from jaxnerf.core.types import Camera
+from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.geometry.world import poses_in_run

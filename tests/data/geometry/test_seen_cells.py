@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxnerf.core.cameras import project
-from jaxnerf.core.types import Camera, SparsePoints, Views
+from jaxnerf.core.types import Camera, SparsePoints
+from jaxnerf.core.views import Views
 from jaxnerf.data.active_pixels import active_region
 from jaxnerf.data.geometry.free_space import surface_range
 from jaxnerf.data.geometry.seen_cells import clear_radii, likely_empty_cells, seen_cells

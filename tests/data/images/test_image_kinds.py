@@ -25,7 +25,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_the_picture_is_that_of_8_bits(name, tmp_path):
+def test_the_image_is_that_of_8_bits(name, tmp_path):
     KINDS[name]().save(tmp_path / name)
     pixels = read_image(tmp_path / name)
     assert image_form(tmp_path / name) == (pixels.shape, pixels.dtype)
