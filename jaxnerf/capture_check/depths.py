@@ -7,8 +7,8 @@ from jaxtyping import Float
 from jaxnerf.capture_check.findings import Finding, named, percent
 from jaxnerf.capture_check.tracks import Tracks
 from jaxnerf.core.cameras import project
-from jaxnerf.data.dataset import BLENDER_RANGE
-from jaxnerf.data.geometry.bounds import depths, with_bounds
+from jaxnerf.data.geometry.bounds import blender_range, depths, with_bounds
+from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import Capture
 
 _MIN_POINTS = 30  # to judge ranges
@@ -27,7 +27,7 @@ def ranges(capture: Capture, near: float | None, far: float | None) -> tuple[Flo
     """
     stated = None
     if capture.format == "blender":
-        bounds, stated = np.tile(BLENDER_RANGE, (len(capture.frames), 1)), _FIELDS
+        bounds, stated = np.tile(blender_range(_training_poses(capture)), (len(capture.frames), 1)), _FIELDS
     else:
         if all(frame.bounds is not None for frame in capture.frames):
             stated = f"the last two columns of {capture.source}"
@@ -36,6 +36,11 @@ def ranges(capture: Capture, near: float | None, far: float | None) -> tuple[Flo
         if value is not None:
             bounds[:, column], stated = value, _FIELDS
     return bounds, stated
+
+
+def _training_poses(capture):
+    """Returns the poses of the training views, from which training infers near and far."""
+    return poses_of(capture)[list((capture.splits or {}).get("train") or range(len(capture.frames)))]
 
 
 def view_depths(

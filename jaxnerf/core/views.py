@@ -8,7 +8,7 @@ from jaxnerf.core.cameras import pixel_grid, rays_from_pixels
 from jaxnerf.core.types import Camera, Rays, SparsePoints, Vector, pytree
 
 
-@pytree(static=("names", "background"))
+@pytree(static=("names", "background", "file_origin"))
 class Views:
     """Images with their cameras; the pixels of all images are in one array.
 
@@ -26,6 +26,8 @@ class Views:
         free_depth: [V] in t, the depth up to which the dataset states that nothing stands in front of each camera, or
             its points tell; 0 where they do not, None: not known.
         to_file: [4, 4] maps this world to that of the dataset's files; None where they are the same.
+        file_origin: the point of the files' world, in their units, that is 0 in the world that to_file maps to. It is
+            0 unless the cameras are far away from theirs, as in geographic coordinates.
         sparse: points of the dataset's own model and their observations in these views; None without points.
         time: [V] in [0, 1], when each image was taken in a scene that moves; None: not stated.
         image_index: [V] int32, which training image each view counts as for a scene that asks for `image_index`; None:
@@ -44,6 +46,7 @@ class Views:
     box: Float[Array, "2 3"] | None = None
     to_file: Float[Array, "4 4"] | None = None
     free_depth: Float[Array, " V"] | None = None
+    file_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sparse: SparsePoints | None = None
     time: Float[Array, " V"] | None = None
     image_index: Int[Array, " V"] | None = None

@@ -30,7 +30,6 @@ WORLDS = {
 }
 _SYNTHETIC = {"fingerprint": "", "factor": 1, "background": "white", "world": "file", "ndc": False}
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
-BLENDER_RANGE = (2.0, 6.0)  # near and far of the NeRF paper's synthetic scenes, world units
 _HELD_OUT_OFFSET = 3  # not 0, as the first views of a dataset often differ from the others
 
 
@@ -188,6 +187,9 @@ def _resolve(data):
         # Each split has a file of its own, and the world of the cameras is already normalised.
         infer("fingerprint", "")
         infer("world", "file")
+        near, far = bounds.blender_range(blender.training_poses(folder))
+        if (near, far) != bounds.BLENDER_RANGE and not (data.near and not is_auto(data.near) and data.far):
+            lines.append(f"near, far     {near:.4g} and {far:.4g}, as the cameras look at a point {2 * near:.4g} away")
     # Reading the cameras takes a while, so they are only read to infer something from them.
     if any(map(is_auto, (data.factor, data.world, data.background, data.fingerprint))):
         capture = base.read_capture(folder, data.format)
@@ -307,7 +309,8 @@ def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -
     folder = dataset_folder(data.dir)
     reading = {"split": source, "factor": data.factor, "background": background_of(data), "select": select}
     if data.format == "blender":
-        near, far = near or BLENDER_RANGE[0], data.far or BLENDER_RANGE[1]
+        usual = bounds.blender_range(blender.training_poses(folder))
+        near, far = near or usual[0], data.far or usual[1]
         return blender.load_blender(folder, near=near, far=far, **reading)
     capture = base.read_capture(folder, data.format)
     if data.fingerprint not in ("", found := fingerprint(capture)):
@@ -333,7 +336,9 @@ def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -
     box = None if capture.box is None else np.float32(capture.box)
     views = load_images.load_capture(capture, **reading)
     free_depth = np.float32([free_depth[name] for name in views.names])
-    return dataclasses.replace(views, to_file=np.float32(to_file), box=box, free_depth=free_depth)
+    origin = (0.0, 0.0, 0.0) if capture.origin is None else tuple(map(float, capture.origin))
+    found = {"to_file": np.float32(to_file), "file_origin": origin, "box": box, "free_depth": free_depth}
+    return dataclasses.replace(views, **found)
 
 
 def dataset_folder(name: str) -> pathlib.Path:

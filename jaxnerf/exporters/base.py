@@ -1,5 +1,6 @@
 """What an exporter is, and the call that runs one: restore a run, export it, move the finished folder into place."""
 
+import json
 import os
 import pathlib
 import secrets
@@ -124,6 +125,9 @@ def export_run(
     try:
         with atomic_files.naming(partial):
             export(ExportSource(run, step, variables, views, settings, say), partial)
+            if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
+                say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
+                (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
         _move(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

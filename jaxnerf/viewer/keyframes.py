@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxnerf.core.views import Views
 from jaxnerf.data.geometry.path_poses import poses_through
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.runtime import atomic_files
@@ -46,7 +47,7 @@ def cameras_through(
 
 
 def save_path(
-    workdir: str | os.PathLike, name: str, cameras: Sequence[FrameCamera], *, fps: float, to_file: np.ndarray | None
+    workdir: str | os.PathLike, name: str, cameras: Sequence[FrameCamera], *, fps: float, views: Views
 ) -> pathlib.Path:
     """Writes the frames of a path to <workdir>/camera_paths/<name>.json and returns the file's path.
 
@@ -55,7 +56,7 @@ def save_path(
         name: letters, digits, "_", "." and "-".
         cameras: the frames, in the run's world.
         fps: frames per second.
-        to_file: [4, 4] maps the run's world to that of the dataset's file; None where they are the same.
+        views: of the run, which say where its world is in that of the dataset's files.
 
     Raises:
         ValueError: on another name, a size beyond the limit, or a folder that is a link.
@@ -65,7 +66,8 @@ def save_path(
     width, height = cameras[0].width, cameras[0].height
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"the frames have {width} x {height} px, expected sides of 1 to {MAX_SIDE}")
-    poses = poses_in_file(np.stack([camera.to_world for camera in cameras]), to_file)
+    poses = poses_in_file(np.stack([camera.to_world for camera in cameras]), views.to_file)
+    poses[:, :, 3] += views.file_origin
     frames = [
         {"transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]], "fl_x": camera.focal}
         for pose, camera in zip(poses, cameras, strict=True)

@@ -361,7 +361,7 @@ class Page:
     def _save(self):
         frames, fps = self._path()
         views = self._viewer.views
-        path = save_path(self._viewer.workdir, self._path_name.value, frames, fps=fps, to_file=views.to_file)
+        path = save_path(self._viewer.workdir, self._path_name.value, frames, fps=fps, views=views)
         self._path_status.content = f"{len(frames)} frames saved to {path}"
         return path, len(frames)
 

@@ -10,11 +10,13 @@ import captures
 from jaxnerf import turntable
 from jaxnerf.data import dataset
 from jaxnerf.data.dataset import DataOptions
+from jaxnerf.data.synthetic import load_synthetic
 from jaxnerf.evaluation.paths.camera_path import make_path, read_path_file
 from jaxnerf.viewer.frame_renderer import FrameCamera
 from jaxnerf.viewer.keyframes import cameras_through, save_path
 
 POSES = np.asarray(turntable(4, center=(0, 0, 0), radius=3.0, elevation=0.3))
+VIEWS = load_synthetic(size=8)
 KEYFRAMES = [FrameCamera(pose, fov, 64, 48) for pose, fov in zip(POSES, (0.5, 0.7, 0.9, 0.7), strict=True)]
 
 
@@ -35,7 +37,7 @@ def test_render_reads_the_saved_path_in_the_world_of_the_run(tmp_path):
     data = DataOptions(dir=str(tmp_path / "data"), format="transforms", world="file")
     views = dataclasses.replace(dataset.load_split(data, "train"), to_file=to_file)
     frames = KEYFRAMES
-    file = save_path(tmp_path, "my.path-1", frames, fps=10, to_file=to_file)
+    file = save_path(tmp_path, "my.path-1", frames, fps=10, views=views)
     assert file == tmp_path / "camera_paths" / "my.path-1.json"
     path = make_path(str(file), views)
     np.testing.assert_allclose(path.poses, [frame.to_world for frame in frames], atol=1e-5)
@@ -47,7 +49,7 @@ def test_render_reads_the_saved_path_in_the_world_of_the_run(tmp_path):
 @pytest.mark.parametrize("name", ["../up", "/etc/passwd", "", ".hidden", "a/b", "a b", "x" * 65, "a\0b", 5, None])
 def test_a_name_that_is_a_path_is_refused(tmp_path, name):
     with pytest.raises(ValueError, match="expected up to 64 letters"):
-        save_path(tmp_path, name, KEYFRAMES, fps=24, to_file=None)
+        save_path(tmp_path, name, KEYFRAMES, fps=24, views=VIEWS)
     assert not list(tmp_path.iterdir())
 
 
@@ -56,7 +58,7 @@ def test_a_link_out_of_the_workdir_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     os.symlink(tmp_path / "elsewhere", tmp_path / "run" / "camera_paths")
     with pytest.raises(ValueError, match="camera_paths: is a symbolic link"):
-        save_path(tmp_path / "run", "mine", KEYFRAMES, fps=24, to_file=None)
+        save_path(tmp_path / "run", "mine", KEYFRAMES, fps=24, views=VIEWS)
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
@@ -78,4 +80,4 @@ def test_paths_beyond_the_limits_are_refused(count, seconds, fps, message):
 
 def test_a_size_beyond_the_limit_is_refused(tmp_path):
     with pytest.raises(ValueError, match="5000 x 48 px, expected sides of 1 to 4096"):
-        save_path(tmp_path, "mine", [KEYFRAMES[0]._replace(width=5000)], fps=24, to_file=None)
+        save_path(tmp_path, "mine", [KEYFRAMES[0]._replace(width=5000)], fps=24, views=VIEWS)

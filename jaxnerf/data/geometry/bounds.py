@@ -8,6 +8,7 @@ from jaxnerf.data.geometry.poses import gaze_center
 from jaxnerf.data.geometry.world import poses_of, unit_of
 from jaxnerf.data.readers.base import Capture
 
+BLENDER_RANGE = (2.0, 6.0)  # near and far of the NeRF paper's synthetic scenes, world units
 _OUTLIERS = 1.0  # percent of points at each end that may be wrong matches
 _MARGIN = 0.8  # for matter without points: near is multiplied, far divided by it
 _MIN_POINTS = 8  # points that a view must show for bounds
@@ -35,6 +36,22 @@ def with_bounds(capture: Capture) -> Capture:
 def known_bounds(capture: Capture) -> list[bool]:
     """Returns for each frame whether its bounds are stated or follow from the points that it shows."""
     return [frame.bounds is not None or _of_points(capture, frame) is not None for frame in capture.frames]
+
+
+def blender_range(poses: Float[np.ndarray, "V 3 4"]) -> tuple[float, float]:
+    """Returns the near and far of a dataset in Blender's format, from the poses of its training views.
+
+    They are 2 and 6 as in the NeRF paper's scenes, whose cameras look at a point 4 units away. Where cameras look at a
+    point that is not between them, as in a scene of other units, they are one half and three halves of its distance.
+    """
+    near, far = BLENDER_RANGE
+    offset = gaze_center(poses) - poses[:, :, 3]
+    distance = float(np.median(np.linalg.norm(offset, axis=1)))
+    ahead = -np.einsum("vi,vi->v", offset, poses[:, :, 2])
+    looks_there = np.mean(ahead > 0.8 * np.linalg.norm(offset, axis=1)) > 0.8
+    if near < distance < far or not (looks_there and distance > 0):
+        return near, far
+    return float(f"{distance / 2:.3g}"), float(f"{1.5 * distance:.3g}")
 
 
 def override_bounds(capture: Capture, near: float, far: float, to_file: Float[np.ndarray, "4 4"]) -> Capture:

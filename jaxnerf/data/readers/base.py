@@ -1,5 +1,7 @@
 """The result of every reader: posed images in the world of the dataset's files, not yet decoded."""
 
+import dataclasses
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,6 +17,7 @@ from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
+_FAR_AWAY = 100.0  # distance of cameras from an origin over how far they are apart
 _MASK_FOLDERS = ("images_mask", "images_masks", "masks")
 
 
@@ -58,6 +61,7 @@ class Capture(NamedTuple):
         box: (lower [3], upper [3]), outside which the format states that there is no matter; None: not known.
         notes: one line for each part of the dataset that was skipped or found at another place, with the reason.
         choices: one line for each choice of the reader that the files leave open, with the reason.
+        origin: [3] the point of the files' world, in their units, that is the origin of this one; None: theirs is.
     """
 
     format: str
@@ -68,6 +72,7 @@ class Capture(NamedTuple):
     box: tuple[np.ndarray, np.ndarray] | None = None
     notes: tuple[str, ...] = ()
     choices: tuple[str, ...] = ()
+    origin: Float[np.ndarray, "3"] | None = None
 
 
 def fingerprint(capture: Capture) -> str:
@@ -112,11 +117,55 @@ def detect_formats(folder: str | os.PathLike) -> list[str]:
 def read_capture(folder: str | os.PathLike, format: str = "auto") -> Capture:
     """Reads the Capture in a folder, in a given format or in the first that is detected.
 
+    If the cameras are far from the origin of the files' world, as in geographic coordinates, the Capture has another
+    origin near them, see `origin_near`: float32, in which Views are, does not hold such positions.
+
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
     capture = READERS.get(detect_formats(folder)[0] if format == "auto" else format).read(Path(folder))
-    return capture if capture.format == "blender" else _with_masks(capture, Path(folder))
+    return _moved_near(capture if capture.format == "blender" else _with_masks(capture, Path(folder)))
+
+
+def origin_near(positions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"] | None:
+    """Returns a round point near cameras at positions, or None if these are near 0.
+
+    They are far if their distance from 0 is more than 100 times how far they are apart. The point depends only on the
+    positions, so all splits of a dataset have one origin if it is computed from the training views.
+    """
+    middle = np.median(positions, axis=0)
+    spread, distance = np.linalg.norm(positions - middle, axis=1).max(), np.linalg.norm(middle)
+    if not distance > _FAR_AWAY * spread > 0:
+        return None
+    unit = 10.0 ** math.floor(math.log10(spread))
+    return np.round(middle / unit) * unit
+
+
+def moved(frame: Frame, origin: Float[np.ndarray, "3"] | None) -> Frame:
+    """Returns a frame whose camera's position is relative to an origin; None: 0."""
+    if origin is None:
+        return frame
+    pose = np.array(frame.camera.to_world, np.float64)
+    pose[:, 3] -= origin
+    return frame._replace(camera=dataclasses.replace(frame.camera, to_world=pose))
+
+
+def _moved_near(capture):
+    """Returns the Capture with an origin near its training cameras, if that of the files is far away."""
+    frames, splits = capture.frames, capture.splits or {}
+    train = [frames[index] for index in splits.get("train") or range(len(frames))]
+    origin = origin_near(np.stack([np.asarray(frame.camera.to_world, np.float64)[:, 3] for frame in train]))
+    if origin is None:
+        return capture
+    place = ", ".join(f"{value:.10g}" for value in origin)
+    line = f"positions are relative to ({place}): the cameras are far from the files' origin"
+    return capture._replace(
+        frames=tuple(moved(frame, origin) for frame in frames),
+        points=None if capture.points is None else capture.points - origin,
+        box=None if capture.box is None else tuple(corner - origin for corner in capture.box),
+        choices=(*capture.choices, line),
+        origin=origin,
+    )
 
 
 def _with_masks(capture, folder):

@@ -4,14 +4,19 @@ Files that state more of their cameras than these are detected as the format "tr
 for them, it reads their cameras all the same, in a world where near is 2 and far 6.
 """
 
+import dataclasses
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from jaxnerf.core.views import Views
 from jaxnerf.data.images.image_files import image_form
 from jaxnerf.data.images.load_images import load_frames
+from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.data.readers.image_paths import ImageFinder, nearly
 from jaxnerf.data.readers.json_frames import read_cameras, read_poses, read_splits, split_ranges
@@ -65,8 +70,22 @@ def load_blender(
             raise ValueError(
                 f"{frame.image}: is {size}, expected {expected} as {frames[0].image.name}; render all alike"
             )
-    frames = [frame._replace(bounds=(near, far)) for frame in frames]
-    return load_frames(frames, factor, background=background, source=source)
+    origin = base.origin_near(training_poses(folder)[:, :, 3])
+    frames = [base.moved(frame, origin)._replace(bounds=(near, far)) for frame in frames]
+    views = load_frames(frames, factor, background=background, source=source)
+    return views if origin is None else dataclasses.replace(views, file_origin=tuple(map(float, origin)))
+
+
+def training_poses(folder: str | os.PathLike) -> Float[np.ndarray, "V 3 4"]:
+    """Returns the poses of the split "train", or of the first without one, without looking for its images.
+
+    Raises:
+        ValueError: as `load_blender`.
+    """
+    splits = split_files(Path(folder))
+    split = "train" if "train" in splits or not splits else next(iter(splits))
+    source, content = _read_transforms(folder, split)
+    return np.stack(read_poses(source, _listed(content, source))[0])
 
 
 def read_capture(folder: Path) -> Capture:
@@ -118,13 +137,10 @@ def _check_angle(content, source):
 def _frames(content, source, select=None):
     """Returns the Frames that a file lists, or those that are selected, the `image_form` of each, and notes."""
     _check_angle(content, source)
-    listed = required(content, "frames", source)
-    if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
-        found = "an empty list" if listed == [] else f"{str(listed)[:40]!r}"
-        raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
-    times = read_times([(f"{source}, frame {index}", frame) for index, frame in enumerate(listed)])
+    listed = _listed(content, source)
+    times = read_times(listed)
     chosen = [int(index) for index in (range(len(listed)) if select is None else select(len(listed)))]
-    entries, finder = [(f"{source}, frame {index}", listed[index]) for index in chosen], ImageFinder(source.parent)
+    entries, finder = [listed[index] for index in chosen], ImageFinder(source.parent)
     images = [_image_path(finder, frame, where) for where, frame in entries]
     poses, notes = read_poses(source, entries)
     forms = [image_form(path) for path in images]
@@ -138,6 +154,15 @@ def _frames(content, source, select=None):
         for index, image, camera in zip(chosen, images, cameras, strict=True)
     ]
     return frames, forms, [*finder.notes(source), *notes, *camera_notes]
+
+
+def _listed(content, source):
+    """Returns (where, entries) of each frame of a file."""
+    listed = required(content, "frames", source)
+    if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
+        found = "an empty list" if listed == [] else f"{str(listed)[:40]!r}"
+        raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
+    return [(f"{source}, frame {index}", frame) for index, frame in enumerate(listed)]
 
 
 def _with_size(frame, content, form):

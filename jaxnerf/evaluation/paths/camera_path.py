@@ -156,13 +156,18 @@ def path_pixels(posed: Views, path: CameraPath, index: int, *, offset: float = 0
     return np.float32(points * posed.cameras.focal[index] + posed.cameras.center[index])
 
 
+def _relative(poses, origin):
+    """Returns poses of files relative to the origin of the run's files, see `Views.file_origin`; float64."""
+    return np.concatenate([poses[:, :, :3], (poses[:, :, 3] - origin)[:, :, None]], axis=-1)
+
+
 def _from_file(file, views):
     found = read_path_file(file)
     height, width = (int(side) for side in views.size[0])
     same = CameraPath(
         name=file.stem,
         source=fingerprint(read_bytes(file)),
-        poses=poses_in_run(found.poses, views.to_file),
+        poses=poses_in_run(_relative(found.poses, views.file_origin), views.to_file),
         focal=np.tile(np.float64(views.cameras.focal)[:1], (len(found.poses), 1)),
         center=np.tile(np.float64(views.cameras.center)[:1], (len(found.poses), 1)),
         width=width,

@@ -1,0 +1,129 @@
+"""Worlds far from the origin, or in other units, give what the same cameras near the origin in usual units give."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import captures
+import jaxnerf
+from jaxnerf.capture_check import report
+from jaxnerf.data.readers.base import origin_near, read_capture
+from jaxnerf.evaluation.paths.camera_path import make_path
+from jaxnerf.viewer.frame_renderer import FrameCamera
+from jaxnerf.viewer.keyframes import save_path
+
+SHIFTS = {
+    "UTM": (500_000.0, 5_000_000.0, 120.0),
+    "one axis": (0.0, 3e6, 0.0),
+    "earth-centred": (4.2e6, 1.7e5, 4.78e6),
+    "very far": (1e7, -2e7, 3.0),
+}
+
+
+def moved(shots, shift, scale=1.0):
+    """Returns the shots with positions, in float64, times a scale and moved."""
+    found = []
+    for shot in shots:
+        pose = np.array(shot.camera.to_world, np.float64)
+        left, _, right = np.linalg.svd(pose[:, :3])
+        pose[:, :3] = left @ right  # a rotation in float64, as COLMAP's positions are turned by it
+        pose[:, 3] = scale * pose[:, 3] + shift
+        found.append(shot._replace(camera=dataclasses.replace(shot.camera, to_world=pose)))
+    return found
+
+
+WRITERS = {
+    "transforms": captures.write_transforms,
+    "colmap": captures.write_colmap,
+    "llff": captures.write_llff,
+    "blender": captures.write_blender,
+}
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    return captures.shoot(captures.orbit(6))
+
+
+@pytest.fixture(scope="module")
+def points(photographs):
+    return captures.surface_points(photographs)
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("name", SHIFTS)
+def test_views_are_those_near_the_origin(photographs, points, tmp_path, writer, name):
+    for folder, shift in (("near", (0, 0, 0)), ("far", SHIFTS[name])):
+        given = {"points": points._replace(xyz=points.xyz + shift)} if writer in ("colmap", "llff") else {}
+        WRITERS[writer](tmp_path / folder, moved(photographs, shift), **given)
+    near, far = (jaxnerf.load_dataset(tmp_path / folder, split="train") for folder in ("near", "far"))
+    assert near.file_origin == (0, 0, 0)
+    np.testing.assert_allclose(far.file_origin, SHIFTS[name], atol=5)
+    np.testing.assert_allclose(far.near, near.near, rtol=1e-4)
+    np.testing.assert_allclose(far.far, near.far, rtol=1e-4)
+    poses = [np.asarray(views.cameras.to_world, np.float64) for views in (near, far)]
+    rotations = [each[:, :, :3] for each in poses]
+    np.testing.assert_allclose(rotations[1], rotations[0], atol=1e-5)
+    apart = [each[:, :, 3] - each[0, :, 3] for each in poses]
+    np.testing.assert_allclose(apart[1], apart[0], atol=1e-5)
+
+
+def test_an_ordinary_world_stays_as_it_is():
+    rng = np.random.default_rng(0)
+    for distance in (0, 1, 20, 80):
+        assert origin_near(rng.uniform(-1, 1, (20, 3)) + [distance, 0, 0]) is None
+    assert origin_near(np.full((5, 3), 1e6)) is None  # one position: nothing says what is far
+    found = origin_near(rng.uniform(-30, 30, (20, 3)) + [512_345.6, 0, 0])
+    assert found[0] % 10 == 0 and abs(found[0] - 512_345.6) < 30 and (found[1:] % 10 == 0).all()
+
+
+def test_the_check_finds_the_same(photographs, tmp_path):
+    for folder, shift in (("near", (0, 0, 0)), ("far", SHIFTS["UTM"])):
+        captures.write_transforms(tmp_path / folder, moved(photographs, shift))
+    near, far = (report.inspect(tmp_path / folder) for folder in ("near", "far"))
+    assert [finding.kind for finding in far.findings] == [finding.kind for finding in near.findings]
+    assert read_capture(tmp_path / "far").choices[-1].startswith("positions are relative to (5000")
+
+
+def test_camera_paths_are_in_the_files_own_coordinates(photographs, tmp_path):
+    """A path that the viewer saves has the positions of the files in float64, and is read again without loss."""
+    captures.write_transforms(tmp_path / "far", moved(photographs, SHIFTS["UTM"]))
+    views = jaxnerf.load_dataset(tmp_path / "far", split="train")
+    cameras = [FrameCamera(np.asarray(pose), 0.7, 32, 24) for pose in views.cameras.to_world[:2]]
+    file = save_path(tmp_path, "mine", cameras, fps=10, views=views)
+    stated = [frame["transform_matrix"] for frame in json.loads(file.read_text())["frames"]]
+    whole = json.loads((tmp_path / "far" / "transforms.json").read_text())["frames"]
+    by_name = {frame["file_path"].rsplit("/")[-1].split(".")[0]: frame["transform_matrix"] for frame in whole}
+    np.testing.assert_allclose(stated, [by_name[name] for name in views.names[:2]], atol=1e-5)
+    path = make_path(str(file), views)
+    np.testing.assert_allclose(path.poses, np.asarray(views.cameras.to_world[:2]), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1000.0, 0.05, 0.3])
+def test_blender_scenes_in_other_units_have_another_near_and_far(photographs, tmp_path, scale):
+    for split in ("train", "test"):
+        captures.write_blender(tmp_path, moved(photographs, (0, 0, 0), scale), split=split)
+    views = jaxnerf.load_dataset(tmp_path, split="test")
+    np.testing.assert_allclose([views.near[0], views.far[0]], scale * np.array([2, 6]), rtol=0.02)
+    stated = jaxnerf.load_dataset(tmp_path, split="test", near=1.0, far=9.0)
+    assert (stated.near[0], stated.far[0]) == (1, 9)
+
+
+def test_blender_scenes_of_the_paper_keep_2_and_6(photographs, tmp_path):
+    for index, scale in enumerate((1.0, 0.6, 1.4)):
+        captures.write_blender(tmp_path / str(index), moved(photographs, (0, 0, 0), scale))
+        views = jaxnerf.load_dataset(tmp_path / str(index), split="train")
+        assert (views.near[0], views.far[0]) == (2, 6)
+
+
+def test_cameras_that_look_outwards_keep_2_and_6(tmp_path):
+    turned = []
+    for shot in captures.shoot(captures.orbit(6, distance=0.5)):
+        pose = np.array(shot.camera.to_world, np.float64)
+        pose[:, [0, 2]] *= -1  # half a turn
+        turned.append(shot._replace(camera=dataclasses.replace(shot.camera, to_world=pose)))
+    captures.write_blender(tmp_path, turned)
+    views = jaxnerf.load_dataset(tmp_path, split="train")
+    assert (views.near[0], views.far[0]) == (2, 6)
