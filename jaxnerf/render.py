@@ -33,10 +33,17 @@ _FRAMES = flags.DEFINE_integer(
     "frames",
     None,
     "The number of frames. When it is not given, a turntable has 48, an arc 96, a spiral or ellipse 120, interpolate "
-    "6 for each view.",
+    "6 for each view, but at most 240.",
     lower_bound=1,
 )
 _CLOSED = flags.DEFINE_bool("closed", False, "Whether --path=interpolate returns to the first view.")
+_UP = flags.DEFINE_enum(
+    "up",
+    None,
+    ["+x", "-x", "+y", "-y", "+z", "-z"],
+    "The axis of the dataset's files that is up in a turntable, arc or ellipse. When it is not given, up follows from "
+    "how the cameras are held; jaxnerf-check prints it.",
+)
 _WIDTH = flags.DEFINE_integer(
     "width", None, "The width in px. When it is not given, it follows --height, or the first view.", **_SIDE
 )
@@ -77,6 +84,7 @@ def main(argv):
         size=(_WIDTH.value, _HEIGHT.value),
         num_frames=_FRAMES.value,
         closed=_CLOSED.value,
+        up=_UP.value,
         fps=_FPS.value,
         name=_NAME.value,
         rgba=_RGBA.value,

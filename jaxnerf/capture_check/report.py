@@ -13,12 +13,13 @@ from jaxnerf.capture_check.findings import Finding, percent
 from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.path_poses import coverage
-from jaxnerf.data.geometry.poses import gaze_center, up_of
+from jaxnerf.data.geometry.poses import gaze_center, sideways, up_of
 from jaxnerf.data.geometry.world import looks_forward, poses_of
 from jaxnerf.data.images.load_images import split_indices
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 
+_TILTED = 15.0  # degrees, in the median, by which images of a capture with a known up are not level
 _MAX_IMAGES = 500  # that are read, at a fifth of a second each on two cores
 
 
@@ -150,7 +151,6 @@ def _camera_facts(capture, evidence):
         lenses += f"; {len(each)} different cameras, with focal lengths of {each[0]:.5g} to {each[-1]:.5g} px"
     middle = gaze_center(poses)
     distance = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
-    up, tilt = _up_axis(poses)
     cover = coverage(poses)
     low, high = cover.elevation.min(), cover.elevation.max()
     shown = evidence.tracks.shown
@@ -162,7 +162,7 @@ def _camera_facts(capture, evidence):
             f"focal length {focal[0]:.5g}, {focal[1]:.5g} px; field of view {angle[0]:.1f} x {angle[1]:.1f} degrees; "
             f"principal point {off[0]:+.1f}, {off[1]:+.1f} px from the image's centre; {lenses}",
         ),
-        ("poses", f"{handed}; up is {up} within {tilt:.0f} degrees"),
+        ("poses", f"{handed}; {_up_axis(poses)}"),
         (
             "direction",
             f"{_view_direction(capture)}; {distance.min():.4g} to {distance.max():.4g} from "
@@ -206,11 +206,18 @@ def _view_direction(capture):
 
 
 def _up_axis(poses):
-    """Returns (the world axis nearest to up, by which jaxnerf-render turns its paths; degrees between the two)."""
-    up = up_of(poses)
+    """Returns how up was found: the world axis nearest to it, by which jaxnerf-render turns its paths."""
+    up, turned = up_of(poses), sideways(poses)
     axis = int(np.abs(up).argmax())
     angle = np.degrees(np.arccos(np.clip(abs(up[axis]), 0, 1)))
-    return f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}", float(angle)
+    line = f"up is {'-' if up[axis] < 0 else '+'}{'xyz'[axis]} within {angle:.0f} degrees"
+    level = np.where(turned, np.abs(poses[:, :, 1] @ up), np.abs(poses[:, :, 0] @ up))
+    tilt = np.degrees(np.arcsin(np.clip(np.median(level), 0, 1)))
+    if turned.any():
+        line += f"; {turned.sum()} of {len(poses)} images are stored sideways"
+    if tilt > _TILTED:
+        line += f", not sure: the images are tilted by {tilt:.0f} degrees in the median; jaxnerf-render --up sets it"
+    return line
 
 
 def _path(capture):

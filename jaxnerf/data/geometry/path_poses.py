@@ -27,6 +27,7 @@ KINDS = (*_FRAMES, "interpolate")
 _look_at = jax.jit(jax.vmap(core_poses.look_at, in_axes=(0, None, None)))
 _mean_pose = jax.jit(core_poses.mean_pose)
 _llff_spiral = jax.jit(core_poses.spiral, static_argnums=0)
+_MOST_FRAMES = 240  # unless more are asked for
 _interpolate = jax.jit(core_poses.interpolate, static_argnames=("num_frames", "closed"))
 
 
@@ -35,7 +36,7 @@ class Coverage(NamedTuple):
 
     Attributes:
         center: [3] `gaze_center`.
-        up: [3] `up_of`.
+        up: [3] `up_of`, or as given.
         azimuth: [V] around up, from any fixed direction.
         elevation: [V] above the plane through the center that is perpendicular to up.
         distance: [V] from the center, world units.
@@ -53,10 +54,15 @@ class Coverage(NamedTuple):
     arc: tuple[float, float]
 
 
-def coverage(poses: Float[Array | np.ndarray, "V 3 4"]) -> Coverage:
-    """Computes the Coverage of cameras. Those nearly above or below the center close no gap."""
+def coverage(poses: Float[Array | np.ndarray, "V 3 4"], up: Float[np.ndarray, "3"] | None = None) -> Coverage:
+    """Computes the Coverage of cameras. Those nearly above or below the center close no gap.
+
+    Args:
+        poses: of the cameras.
+        up: unit vector; None: `up_of`.
+    """
     poses = np.asarray(poses, np.float64)
-    center, up = gaze_center(poses), up_of(poses)
+    center, up = gaze_center(poses), up_of(poses) if up is None else up
     right, ahead = _level_axes(up)
     offset = poses[:, :, 3] - center
     distance = np.linalg.norm(offset, axis=1)
@@ -139,7 +145,10 @@ def check_kind(kind: str, poses: Float[np.ndarray, "V 3 4"]) -> None:
 
 
 def make_poses(
-    kind: str, poses: Float[Array | np.ndarray, "V 3 4"], num_frames: int | None = None
+    kind: str,
+    poses: Float[Array | np.ndarray, "V 3 4"],
+    num_frames: int | None = None,
+    up: Float[np.ndarray, "3"] | None = None,
 ) -> Float[np.ndarray, "N 3 4"]:
     """Makes the poses of a path, with a level horizon.
 
@@ -153,14 +162,17 @@ def make_poses(
         kind: one of KINDS but "interpolate", see `poses_through`.
         poses: of the cameras.
         num_frames: N; None: 48 for a turntable, 96 for an arc, 120 for a spiral or ellipse.
+        up: unit vector; None: `up_of`. A spiral keeps the mean camera's.
 
     Raises:
         ValueError: if the cameras define no such path, see `check_kind`.
     """
     poses = np.asarray(poses, np.float64)
     check_kind(kind, poses)
-    make = {"turntable": _turntable, "arc": _arc, "spiral": _spiral, "ellipse": _ellipse}[kind]
-    return np.asarray(make(poses, num_frames or _FRAMES[kind]))
+    if kind == "spiral":
+        return np.asarray(_spiral(poses, num_frames or _FRAMES[kind]))
+    make = {"turntable": _turntable, "arc": _arc, "ellipse": _ellipse}[kind]
+    return np.asarray(make(poses, num_frames or _FRAMES[kind], up_of(poses) if up is None else up))
 
 
 def poses_through(
@@ -170,7 +182,7 @@ def poses_through(
 
     Args:
         poses: of the cameras.
-        num_frames: N; None: 6 from camera to camera.
+        num_frames: N; None: 6 from camera to camera, but at most 240, for which people wait.
         closed: whether the path returns from the last camera to the first.
 
     Returns:
@@ -181,7 +193,7 @@ def poses_through(
     """
     count = len(poses)
     check_kind("interpolate", np.asarray(poses, np.float64))
-    num_frames = num_frames or (6 * count if closed else 6 * (count - 1) + 1)
+    num_frames = num_frames or min(6 * count if closed else 6 * (count - 1) + 1, _MOST_FRAMES)
     times = core_poses.path_times(num_frames, count, closed=closed)
     return np.asarray(_interpolate(num_frames, poses=np.asarray(poses), closed=closed)), np.asarray(times)
 
@@ -195,13 +207,13 @@ def natural_order(names: Sequence[str]) -> Int[np.ndarray, " V"]:
     return np.array(sorted(range(len(names)), key=parts), int)
 
 
-def _turntable(poses, num_frames):
-    cover = coverage(poses)
+def _turntable(poses, num_frames, up):
+    cover = coverage(poses, up)
     return _look_at(_eyes(cover, 2 * np.pi * np.arange(num_frames) / num_frames), cover.center, cover.up)
 
 
-def _arc(poses, num_frames):
-    cover = coverage(poses)
+def _arc(poses, num_frames, up):
+    cover = coverage(poses, up)
     first, last = cover.arc
     angle = 2 * np.pi * np.arange(num_frames) / num_frames
     azimuth = (first + last) / 2 + _ARC_PART * (last - first) / 2 * np.sin(angle)
@@ -238,8 +250,8 @@ def _spiral(poses, num_frames):
     return _llff_spiral(num_frames, pose=pose, radii=radii, focus=focus)
 
 
-def _ellipse(poses, num_frames):
-    positions, up = poses[:, :, 3], up_of(poses)
+def _ellipse(poses, num_frames, up):
+    positions = poses[:, :, 3]
     middle = positions.mean(axis=0)
     across = (positions - middle) @ (np.eye(3) - np.outer(up, up))
     _, spread, axes = np.linalg.svd(across, full_matrices=False)

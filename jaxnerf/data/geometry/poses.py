@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 _ROUNDED = 2e-3  # a matrix of three decimals is off by at most 2 sqrt(3) 0.0005; one scaled by 1.001 by 0.002
 
@@ -73,16 +73,63 @@ def gaze_center(to_world: Float[Array | np.ndarray, "V 3 4"]) -> Float[np.ndarra
 def up_of(poses: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, "3"]:
     """Returns the unit vector that is up for a set of cameras.
 
-    Cameras around a scene usually have a level horizon, so up is normal to their x axes. If all look in one
-    direction, their x axes span no plane; then up is the mean of their y axes, which tilts with their pitch.
+    Cameras around a scene usually have a level horizon, so up is normal to their x axes, or to the y axes of images
+    that are stored sideways. If all look in one direction, these axes span no plane; then up is the mean of their y
+    axes, which tilts with their pitch.
     """
     mean = poses[:, :, 1].mean(axis=0)
     length = np.linalg.norm(mean)
     mean = mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
-    spread, axes = np.linalg.eigh(np.einsum("ni,nj->ij", poses[:, :, 0], poses[:, :, 0]) / len(poses))
-    across = axes[:, 0] if axes[:, 0] @ mean > 0 else -axes[:, 0]
+    across, flatness = _normal(poses[:, :, 0])
+    turned = sideways(poses)
+    if turned.any():
+        up = _normal(_level_axes(poses, turned))[0]
+        return up * _sense(poses, turned, up)
+    if flatness >= 0.25:
+        return mean
+    return across if across @ mean > 0 else -across
+
+
+def sideways(poses: Float[np.ndarray, "V 3 4"]) -> Bool[np.ndarray, " V"]:
+    """Returns which cameras' images are stored sideways: with y axes that are level in place of x axes.
+
+    The plane of the level axes is searched from the main directions of all x axes and of all y axes: in turn, each
+    camera's axis that is closer to it is level, and the plane is that of these axes. Without a plane, or if the x axes
+    are in one, no camera is sideways.
+    """
+    upright = _normal(poses[:, :, 0])[1]
+    best, turned = np.inf, np.zeros(len(poses), bool)
+    if upright < 0.01:
+        return turned
+    for normal in np.concatenate([np.linalg.eigh(np.cov(poses[:, :, axis].T))[1].T for axis in (0, 1)]):
+        for _ in range(8):
+            chosen = np.abs(poses[:, :, 1] @ normal) < np.abs(poses[:, :, 0] @ normal)
+            normal, flatness = _normal(_level_axes(poses, chosen))
+        if flatness < best:
+            best, turned = flatness, chosen
+    return turned if best < min(0.25, 0.3 * upright) else np.zeros(len(poses), bool)
+
+
+def _level_axes(poses, turned):
+    return np.where(turned[:, None], poses[:, :, 1], poses[:, :, 0])
+
+
+def _normal(axes):
+    """Returns the normal of the plane of axes, and how flat they are: 0 in a plane, inf if they span none."""
+    spread, normals = np.linalg.eigh(np.einsum("ni,nj->ij", axes, axes) / len(axes))
     # The spreads sum to 1; cameras on an arc of +-25 degrees have a second spread of 0.05.
-    return across if spread[1] > 0.05 and spread[0] < 0.25 * spread[1] else mean
+    return normals[:, 0], spread[0] / spread[1] if spread[1] > 0.05 else np.inf
+
+
+def _sense(poses, turned, up):
+    """Returns 1 or -1: by the upright images, or else as cameras look down on a scene, or as telephones turn images."""
+    upright = (poses[~turned, :, 1] @ up).sum()
+    if turned.mean() < 0.8 and abs(upright) > 0.1 * len(poses):
+        return np.sign(upright)
+    pitch = (poses[:, :, 2] @ up).mean()  # the back of a camera that looks down points up
+    if abs(pitch) > 0.1:
+        return np.sign(pitch)
+    return -np.sign((poses[turned, :, 0] @ up).sum()) or 1.0
 
 
 def look_one_way(poses: Float[np.ndarray, "V 3 4"], *, cosine: float = 0.85) -> bool:

@@ -14,11 +14,12 @@ from jaxnerf.core.types import Camera
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.geometry.world import poses_in_run
+from jaxnerf.data.geometry.world import poses_in_file, poses_in_run
 from jaxnerf.data.readers.validation import is_number, read_json
 from jaxnerf.runtime.atomic_files import read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
 
+AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
 _MAX_FRAMES, _MAX_PIXELS = 100_000, 16_384
 _FPS = {"above": 0.01, "below": 1000}
@@ -49,7 +50,12 @@ class CameraPath(NamedTuple):
 
 
 def make_path(
-    kind: str | pathlib.Path, views: Views, *, num_frames: int | None = None, closed: bool = False
+    kind: str | pathlib.Path,
+    views: Views,
+    *,
+    num_frames: int | None = None,
+    closed: bool = False,
+    up: str | None = None,
 ) -> CameraPath:
     """Makes a CameraPath with the lens and the size of the first view.
 
@@ -57,8 +63,11 @@ def make_path(
         kind: "turntable", "arc", "spiral" or "ellipse", see `path_poses.make_poses`; "interpolate", through the
             views in the natural order of their names; or a file, see `read_path_file`.
         views: Views, for their cameras.
-        num_frames: N; when None 48 for a turntable, 96 for an arc, 120 for a spiral or ellipse, 6 from view to view.
+        num_frames: N; when None 48 for a turntable, 96 for an arc, 120 for a spiral or ellipse, 6 from view to view
+            but at most 240.
         closed: whether "interpolate" returns from the last view to the first.
+        up: the axis of the dataset's files that is up in a turntable, an arc or an ellipse, such as "+z"; None: as the
+            cameras are held.
 
     Raises:
         ValueError: if there is no such kind or file, the file is wrong, or the cameras define no such path.
@@ -73,7 +82,7 @@ def make_path(
     if kind == "interpolate":
         poses, focal = _through_views(views, num_frames, closed)
     else:
-        poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames)
+        poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames, _direction(up, views))
         focal = np.tile(np.float64(views.cameras.focal)[:1], (len(poses), 1))
     height, width = (int(side) for side in views.size[0])
     center = np.tile(np.float64(views.cameras.center)[:1], (len(poses), 1))
@@ -154,6 +163,16 @@ def path_pixels(posed: Views, path: CameraPath, index: int, *, offset: float = 0
     pixels = np.asarray(pixel_grid(path.height, path.width, offset=offset), np.float64)
     points = (pixels - path.center[index]) / path.focal[index]
     return np.float32(points * posed.cameras.focal[index] + posed.cameras.center[index])
+
+
+def _direction(up, views):
+    """Returns the unit vector of an axis of the dataset's files, "+x" to "-z", in the run's world; None of None."""
+    if up is None:
+        return None
+    if up not in AXES:
+        raise ValueError(f"up is {up!r}, expected one of {', '.join(AXES)}; correct --up")
+    axis = (1 if up[0] == "+" else -1) * np.eye(3)["xyz".index(up[1])]
+    return axis @ poses_in_file(np.eye(3, 4)[None], views.to_file)[0, :, :3]
 
 
 def _relative(poses, origin):

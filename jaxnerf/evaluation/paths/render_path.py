@@ -35,6 +35,7 @@ def render_path(
     size: tuple[int | None, int | None] = (None, None),
     num_frames: int | None = None,
     closed: bool = False,
+    up: str | None = None,
     fps: float | None = None,
     name: str | None = None,
     rgba: bool = False,
@@ -56,7 +57,7 @@ def render_path(
         step: of the checkpoint; the newest when None.
         data_dir, settings: see `restore_run`.
         size: (width, height) px, see `camera_path.resize`.
-        num_frames, closed: see `camera_path.make_path`.
+        num_frames, closed, up: see `camera_path.make_path`.
         fps: frames per second; when None the path file's, or 24.
         name: in place of the path's in the names of folder and video.
         rgba: whether rgba/0000.png is written, too: straight alpha, without the background.
@@ -79,7 +80,7 @@ def render_path(
     step = newest_step(run, workdir, step)
     variables = run.variables(step)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
-    path = camera_path.make_path(_select_kind(path, views), views, num_frames=num_frames, closed=closed)
+    path = camera_path.make_path(_select_kind(path, views), views, num_frames=num_frames, closed=closed, up=up)
     path = camera_path.resize(path, *size)
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
     atomic_files.check_tree(target.parent)
