@@ -74,10 +74,9 @@ def test_level_cameras_that_look_neither_up_nor_down_are_taken_as_telephones_tur
 @pytest.mark.scenes
 @pytest.mark.parametrize("name", ["lego", "fox", "fern", "can"])
 def test_known_scenes_keep_their_up(scenes_dir, name):
-    poses = np.asarray(
-        load_dataset(scenes_dir / name, split="train", **({"factor": 8} if name == "lego" else {})).cameras.to_world
-    )
-    assert not sideways(poses).any()
+    options = {"factor": 8} if name in ("lego", "fern") else {}
+    views = load_dataset(scenes_dir / name, split="train", **options)
+    assert not sideways(np.asarray(views.cameras.to_world)).any()
 
 
 def test_the_check_says_that_images_are_stored_sideways(tmp_path):
