@@ -105,7 +105,9 @@ def sideways(poses: Float[np.ndarray, "V 3 4"]) -> Bool[np.ndarray, " V"]:
         for _ in range(8):
             chosen = np.abs(poses[:, :, 1] @ normal) < np.abs(poses[:, :, 0] @ normal)
             normal, flatness = _normal(_level_axes(poses, chosen))
-        if flatness < best:
+        # The axes of all cameras that look one way are in the plane of the image, too.
+        upright_axes = np.abs(_level_axes(poses, ~chosen) @ normal)
+        if flatness < best and np.median(upright_axes) > 0.3:
             best, turned = flatness, chosen
     return turned if best < min(0.25, 0.3 * upright) else np.zeros(len(poses), bool)
 
