@@ -204,8 +204,11 @@ def _resolve(data):
             infer("factor", factor, f"factor        {factor}, of images {width} px wide")
         if is_auto(data.world):
             forward = data.ndc is True or world.looks_forward(capture)
-            kind = "forward" if forward else "around"
-            infer("world", kind, f"world         {kind}: {WORLDS[kind]}")
+            why, survey = "", forward and data.ndc is not True and bounds.is_survey(capture)
+            if survey:
+                why = "; the cameras look one way, but at a layer that is thin beside how far they are apart"
+            kind = "forward" if forward and not survey else "around"
+            infer("world", kind, f"world         {kind}: {WORLDS[kind]}{why}")
         if is_auto(data.background):
             color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
             infer("background", color, f"background    {color}")

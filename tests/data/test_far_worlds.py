@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import pytest
 import captures
 import jaxnerf
 from jaxnerf.capture_check import report
-from jaxnerf.data.readers.base import origin_near, read_capture
+from jaxnerf.data.geometry.bounds import is_survey
+from jaxnerf.data.readers.base import Capture, Frame, origin_near, read_capture
 from jaxnerf.evaluation.paths.camera_path import make_path
 from jaxnerf.viewer.frame_renderer import FrameCamera
 from jaxnerf.viewer.keyframes import save_path
@@ -127,3 +129,20 @@ def test_cameras_that_look_outwards_keep_2_and_6(tmp_path):
     captures.write_blender(tmp_path, turned)
     views = jaxnerf.load_dataset(tmp_path, split="train")
     assert (views.near[0], views.far[0]) == (2, 6)
+
+
+@pytest.mark.parametrize(
+    "apart, near, far, survey",
+    [
+        (30.0, 20.0, 24.0, True),  # a flight over ground, 7 x 7 images
+        (30.0, 20.0, 90.0, False),  # deep
+        (4.0, 20.0, 24.0, False),  # from nearly one place, as in LLFF's scenes
+    ],
+)
+def test_cameras_far_apart_over_a_thin_layer_are_a_survey(apart, near, far, survey):
+    frames = []
+    for x, y in np.stack(np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 7)]), axis=-1).reshape(-1, 2) * apart:
+        pose = np.column_stack([np.eye(3), [x, y, 0.0]])
+        camera = jaxnerf.Camera(to_world=pose, focal=np.full(2, 20.0), center=np.full(2, 10.0), height=20, width=20)
+        frames.append(Frame(f"{len(frames)}", pathlib.Path("a.png"), camera, bounds=(near, far)))
+    assert is_survey(Capture("colmap", pathlib.Path("a"), tuple(frames))) == survey

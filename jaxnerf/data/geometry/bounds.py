@@ -38,6 +38,19 @@ def known_bounds(capture: Capture) -> list[bool]:
     return [frame.bounds is not None or _of_points(capture, frame) is not None for frame in capture.frames]
 
 
+def is_survey(capture: Capture) -> bool:
+    """Returns whether cameras that look one way are a survey, as from above the ground, that NDC do not suit.
+
+    NDC spread depths between near and infinity, and suit scenes that are deep beside how far their cameras are apart.
+    In a survey the farthest matter is less than twice as far as the nearest, and the cameras are farther apart than
+    half of that distance.
+    """
+    ranges = np.median([frame.bounds for frame in with_bounds(capture).frames], axis=0)
+    positions = poses_of(capture)[:, :, 3]
+    apart = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max() * 2
+    return bool(0 < ranges[1] < 2 * ranges[0] and apart > ranges[0] / 2)
+
+
 def blender_range(poses: Float[np.ndarray, "V 3 4"]) -> tuple[float, float]:
     """Returns the near and far of a dataset in Blender's format, from the poses of its training views.
 
