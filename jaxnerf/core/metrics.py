@@ -40,6 +40,11 @@ def _mean_squared_error(function, a, b, mask):
     if mask is None:
         return ((a - b) ** 2).mean(axis=axes)
     check_shapes(function, a=(a, f"{pixels} C"), mask=(mask, pixels))
+    mask = jnp.asarray(mask)
+    if mask.dtype != bool:
+        raise ValueError(
+            f"{function}: mask has type {mask.dtype}, expected bool; compare it with a threshold: mask > 0"
+        )
     kept = jnp.where(mask[..., None], a - b, 0)  # before the square, so that excluded pixels get gradient 0
     return (kept**2).sum(axis=axes) / (mask.sum(axis=axes[1:]) * a.shape[-1])
 

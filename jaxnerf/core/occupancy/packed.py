@@ -266,12 +266,8 @@ def _rendering(sums, num_dropped, far, shape, background, samples):
     """Returns the Rendering [*shape], with PackedSamples or None."""
     rgb = sums.rgb
     if background is not None:
-        behind, channels = jnp.asarray(background, rgb.dtype), rgb.shape[-1:]
-        if behind.shape not in (channels, (*shape, *channels)):
-            raise ValueError(
-                f"render_packed: background has shape {behind.shape}, expected {channels} or {(*shape, *channels)}"
-            )
-        behind = jnp.broadcast_to(behind, (*shape, *channels)).reshape(-1, *channels)
+        color = rgb[: math.prod(shape)].reshape(*shape, -1) if math.prod(shape) else jnp.zeros((*shape, rgb.shape[-1]))
+        behind = volume_rendering.broadcast_background("render_packed", background, color).reshape(-1, rgb.shape[-1])
         rgb = rgb + sums.transmittance[:, None] * _at_least_one(behind)
     flat = Rendering(
         rgb=rgb,
