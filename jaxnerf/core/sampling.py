@@ -357,7 +357,7 @@ def _draw_between(key, lower, upper):
     # The edges are rounded, so a draw this close to an edge may lie in the neighbouring bin of exact edges.
     finite_upper = jnp.where(jnp.isinf(upper), lower, upper)
     rounding = 2 * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(finite_upper))
-    margin = jnp.minimum(rounding, 0.25 * (finite_upper - lower))
+    margin = jnp.minimum(rounding, 0.25 * _width(lower, finite_upper))
     below = jnp.nextafter(*jax.lax.stop_gradient((upper, lower)))
     return clamp(draw, lower + margin, jnp.minimum(upper - margin, below))
 
@@ -367,12 +367,13 @@ def _interpolate(lower, upper, fraction):
     infinite = jnp.isinf(upper)
     at_end = infinite & (fraction == 1)  # where the gradient is infinite, too
     reciprocal = lower / (1 - jnp.where(infinite & ~at_end, fraction, 0))
-    finite = lower + fraction * (jnp.where(infinite, lower, upper) - lower)
-    return jnp.where(at_end, upper, jnp.where(infinite, reciprocal, finite))
+    start, end = jnp.where(infinite, 0, lower), jnp.where(infinite, 0, upper)  # both ends may be infinite
+    return jnp.where(at_end, upper, jnp.where(infinite, reciprocal, start + fraction * (end - start)))
 
 
 def _width(lower, upper):
-    return jnp.where(upper == lower, 0, upper - lower)  # inf - inf would be NaN
+    equal = upper == lower
+    return jnp.where(equal, 0, jnp.where(equal, 0, upper) - jnp.where(equal, 0, lower))  # inf - inf would be NaN
 
 
 def _count_below(sums, target):

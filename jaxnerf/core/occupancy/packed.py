@@ -537,7 +537,8 @@ def _longest_first(count, most):
 
 def _made_opaque(sums, rows):
     """Returns the sums [C + 4 or 5, L] of terminated rays, whose remaining light looks like the rest of the ray."""
-    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:rows] / sums[1:2], sums[rows:]])
+    opacity = jnp.where(sums[1:2] > 0, sums[1:2], 1)
+    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:rows] / opacity, sums[rows:]])
 
 
 def _nth_samples(rays, samples, words, up_to, ray, n, used):
