@@ -86,7 +86,9 @@ def psnr(
     """Computes the peak signal-to-noise ratio in dB of images, or of a batch of rays, with colours in [0, 1].
 
     Args:
-        a, b, mask: see mse.
+        a: [..., H, W, C], or [B, C].
+        b: as a.
+        mask: see mse.
 
     Returns:
         [...] dB: inf for identical images, with gradient 0; NaN if a colour that counts is NaN.
