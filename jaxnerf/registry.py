@@ -147,9 +147,9 @@ def register_field(name: str, make: Callable[..., Any], *, options: type[Options
 
     Args:
         name: of the field, and of the config's section that holds its options.
-        make: (options, box) -> Field, see `jaxnerf.fields.base.Field`. `box` is the scene's box (lower [3],
+        make: (options, box) -> Field, see `jaxnerf.extend.Field`. `box` is the scene's box (lower [3],
             upper [3]) in world units, or None if the run has none.
-        options: the class of the options, see `jaxnerf.options.Options`: it gives them flags, checks and help. None:
+        options: the class of the options, see `jaxnerf.extend.Options`: it gives them flags, checks and help. None:
             `make` gets the section as a dict, without checks.
 
     Raises:
@@ -163,7 +163,7 @@ def register_sampler(name: str, make: Callable[..., Any], *, options: type[Optio
 
     Args:
         name: of the sampler, and of the config's section that holds its options.
-        make: (context) -> Model, see `jaxnerf.models.base.SamplerContext` and `Model`.
+        make: (context) -> Model, see `jaxnerf.extend.SamplerContext` and `Model`.
         options: the class of `context.options`, as of `register_field`.
 
     Raises:
@@ -210,7 +210,7 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
 
     Args:
         name: of the format.
-        read: (folder: Path) -> Capture, see `jaxnerf.data.readers.base.Capture`.
+        read: (folder: Path) -> Capture, see `jaxnerf.extend.Capture`.
         detect: (folder: Path) -> whether the folder holds this format, for `data.format` "auto"; None: never.
 
     Raises:
@@ -224,7 +224,7 @@ def register_exporter(name: str, export: Callable[..., Any]) -> None:
 
     Args:
         name: of the exporter.
-        export: (source: ExportSource, folder: Path) -> None, see `jaxnerf.exporters.base.ExportSource`. It writes files
+        export: (source: ExportSource, folder: Path) -> None, see `jaxnerf.extend.ExportSource`. It writes files
             into the folder, which is moved into place when it returns.
 
     Raises:

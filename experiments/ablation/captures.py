@@ -24,7 +24,6 @@ import common
 from jaxnerf.core.cameras import pixel_grid, project
 from jaxnerf.core.metrics import mse
 from jaxnerf.evaluation import evaluate, restore
-from jaxnerf.evaluation.metrics import reference
 from jaxnerf.runtime import cli
 from jaxnerf.training import metric_log
 
@@ -107,7 +106,7 @@ def _psnr(run, variables, views):
         height, width = (int(value) for value in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)[::_STRIDE, ::_STRIDE]
         image = run.render_image(variables, run.experiment.view_rays(views, index, pixels))
-        error = mse(jnp.clip(image.rgb, 0, 1), reference(views, index)[::_STRIDE, ::_STRIDE])
+        error = mse(jnp.clip(image.rgb, 0, 1), views.image(index)[::_STRIDE, ::_STRIDE])
         values.append(-10 * np.log10(float(error)))
     return float(np.mean(values))
 

@@ -366,7 +366,7 @@ def _scored(config, folder):
         for index in (0, len(views.names) // 2):
             pixels = pixel_grid(*views.size[index].tolist(), offset=run.experiment.config.data.pixel_offset)
             rgb = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
-            errors.append(float(np.mean((np.asarray(rgb) - evaluate.reference(views, index)) ** 2)))
+            errors.append(float(np.mean((np.asarray(rgb) - views.image(index)) ** 2)))
         psnr = float(np.mean([-10 * math.log10(error) for error in errors]))
         row = logged[step]
         rows.append({"step": step, "seconds": row["seconds"], "rays": row["rays"], "PSNR of 2 views": psnr})

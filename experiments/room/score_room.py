@@ -33,7 +33,6 @@ from jaxnerf.core import contraction
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Rays, SceneFn
 from jaxnerf.core.views import Views
-from jaxnerf.evaluation.evaluate import reference
 from jaxnerf.evaluation.metrics import image_metrics
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, restore_run
 from jaxnerf.models.grid_schedule import GridSchedule
@@ -131,7 +130,7 @@ def _score_view(run, variables, optical_depths, views, index, truth, num_rays):
     rays = run.experiment.view_rays(views, index, pixel_grid(height, width))
     image = run.render_image(variables, rays)
     seen = truth.num_seen[known] >= _MIN_SEEN
-    target = reference(views, index)
+    target = views.image(index)
     metrics = image_metrics(image.rgb, target)
     unit = unit_of(views)  # of the run's world, in the capture's
     true_t = depth / unit

@@ -23,7 +23,6 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf import pixel_grid, psnr
-from jaxnerf.evaluation.evaluate import reference
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.runtime import cli
 
@@ -106,7 +105,7 @@ def _measure(run, views, chosen, renderers):
     for place, index in enumerate(chosen):
         pixels = pixel_grid(*np.asarray(views.size[index]).tolist(), offset=run.experiment.config.data.pixel_offset)
         rays = jax.block_until_ready(run.experiment.view_rays(views, index, pixels.astype(jnp.float32)))
-        truth = np.asarray(reference(views, index))
+        truth = np.asarray(views.image(index))
         for number, render in enumerate(renderers):
             scores[number, place] = psnr(render(rays), truth)  # compiles, too
             taken = common.times(functools.partial(render, rays), _REPEATS.value)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf import pixel_grid, psnr
-from jaxnerf.evaluation.evaluate import reference
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.training import workdir
 from jaxnerf.training.config import to_config_dict
@@ -49,7 +48,7 @@ def measure(kept: dict[str, Any], save: Callable[[dict], None], folder, num_view
     kept["gflops"].append(common.matrix_gflops())
     views = run.experiment.load_split(run.experiment.config.eval.split)
     chosen = np.unique(np.linspace(0, len(views.offset) - 1, num_views).astype(int))
-    truths = [np.asarray(reference(views, index)) for index in chosen]
+    truths = [np.asarray(views.image(index)) for index in chosen]
     exact_frame = _renderer(folder, config, _EXACT, step, views)
     exact_frames = [exact_frame(index) for index in chosen]
     for setting in missing:

@@ -32,7 +32,6 @@ import common
 
 from jaxnerf import Views, pixel_grid, psnr
 from jaxnerf.data import synthetic
-from jaxnerf.evaluation.evaluate import reference
 from jaxnerf.fields import hash_grid
 from jaxnerf.runtime import cli
 from jaxnerf.training import auto_config, build, dead_networks
@@ -135,7 +134,7 @@ class Study:
         values = []
         for index, (height, width) in enumerate(np.asarray(self._views.size)):
             rays = self._experiment.view_rays(self._views, index, pixel_grid(height, width))
-            values.append(float(psnr(self._render(params, rays), reference(self._views, index))))
+            values.append(float(psnr(self._render(params, rays), self._views.image(index))))
         return statistics.mean(values)
 
 

@@ -52,7 +52,8 @@ def undistort(
         ValueError: on other shapes or an unknown lens.
     """
     pixels = jnp.asarray(pixels)
-    check_shapes("undistort", pixels=(pixels, "... 2"), focal=(camera.focal, "2"), center=(camera.center, "2"))
+    check_shapes("undistort", pixels=(pixels, "... 2"))
+    _check_one("undistort", camera, "focal", "center")
     lead = (1,) * (pixels.ndim - 1)
     focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
     target = (pixels - center) / focal
@@ -76,15 +77,16 @@ def rays_from_pixels(
     camera: Camera,
     pixels: Num[ArrayLike, "*batch 2"],
     *,
-    near: Num[ArrayLike, "*#batch"],
-    far: Num[ArrayLike, "*#batch"],
+    near: Num[ArrayLike, "*#batch"] | Num[ArrayLike, "*views"],
+    far: Num[ArrayLike, "*#batch"] | Num[ArrayLike, "*views"],
 ) -> Rays:
     """Computes the rays from a camera through pixels.
 
     Args:
-        camera: one Camera, or several, whose poses are [V, 3, 4] and whose other arrays may be common to all.
+        camera: one Camera, or several, whose poses are [V, 3, 4], or have more leading axes, and whose other arrays
+            may be common to all.
         pixels: [..., 2] px, as from pixel_grid.
-        near: scalar or [...] in t, which here is the distance along the camera's axis.
+        near: scalar or [...] in t, which here is the distance along the camera's axis; or [V], one for each camera.
         far: as near.
 
     Returns:
@@ -95,9 +97,10 @@ def rays_from_pixels(
         ValueError: on other shapes or an unknown lens.
     """
     pixels = jnp.asarray(pixels)
-    if jnp.ndim(camera.to_world) == 3:
+    check_shapes("rays_from_pixels", pixels=(pixels, "... 2"))
+    if jnp.ndim(camera.to_world) > 2:
         return _rays_of_cameras(camera, pixels, near, far)
-    check_shapes("rays_from_pixels", pixels=(pixels, "... 2"), to_world=(camera.to_world, "3 4"))
+    _check_one("rays_from_pixels", camera, "to_world", "focal", "center")
     points, converged = undistort(camera, pixels)
     to_world = jnp.asarray(camera.to_world)
     lead = (1,) * (pixels.ndim - 1)
@@ -116,18 +119,44 @@ def rays_from_pixels(
 
 
 def _rays_of_cameras(cameras, pixels, near, far):
-    """Computes the Rays [V, ...] of V cameras."""
-    count = len(cameras.to_world)
-    common = {
-        name: jnp.broadcast_to(value, (count, jnp.shape(value)[-1]))
-        for name in ("focal", "center", "distortion")
-        if (value := getattr(cameras, name)) is not None
-    }
-    cameras = dataclasses.replace(cameras, to_world=jnp.asarray(cameras.to_world), **common)
-    rays = jax.vmap(lambda camera: rays_from_pixels(camera, pixels, near=0.0, far=1.0))(cameras)
+    """Computes the Rays [V, ...] of cameras whose poses are [V, 3, 4], where V may be several axes."""
+    count = jnp.shape(cameras.to_world)[:-2]
+    flat = {}
+    for name in ("to_world", "focal", "center", "distortion"):
+        value = getattr(cameras, name)
+        if value is not None:
+            one = jnp.shape(value)[-2 if name == "to_world" else -1 :]
+            if jnp.shape(value) not in (one, (*count, *one)):
+                raise ValueError(
+                    f"rays_from_pixels: {name} has shape {jnp.shape(value)}, expected {one} or {(*count, *one)} beside "
+                    f"to_world {jnp.shape(cameras.to_world)}; give one for all cameras, or one for each"
+                )
+            flat[name] = jnp.broadcast_to(value, (*count, *one)).reshape(-1, *one)
+    rays = jax.vmap(lambda camera: rays_from_pixels(camera, pixels, near=0.0, far=1.0))(
+        dataclasses.replace(cameras, **flat)
+    )
+    rays = jax.tree.map(lambda leaf: leaf.reshape(*count, *leaf.shape[1:]), rays)
     has_preimage, shape = rays.far > rays.near, rays.near.shape
-    near, far = (jnp.broadcast_to(jnp.asarray(value, rays.near.dtype), shape) for value in (near, far))
+
+    def of_rays(bound):
+        bound = jnp.asarray(bound, rays.near.dtype)
+        if bound.shape == count:
+            bound = bound.reshape(*count, *(1,) * (pixels.ndim - 1))
+        return jnp.broadcast_to(bound, shape)
+
+    near, far = of_rays(near), of_rays(far)
     return dataclasses.replace(rays, near=near, far=jnp.where(has_preimage, far, near))
+
+
+def _check_one(function, camera, *names, call="lambda camera: {}(camera, ...)", arguments="cameras"):
+    """Raises a ValueError, which says how several cameras are computed, unless a Camera's arrays are those of one."""
+    for name in names:
+        found, expected = jnp.shape(getattr(camera, name)), (3, 4) if name == "to_world" else (2,)
+        if found != expected:
+            raise ValueError(
+                f"{function}: the camera's {name} has shape {found}, expected {expected}, of one camera; for several, "
+                f"each array of which has a leading axis, call jax.vmap({call.format(function)})({arguments})"
+            )
 
 
 def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Array, "*batch"]:
@@ -147,7 +176,8 @@ def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Ar
         ValueError: on other shapes or an unknown lens.
     """
     (pixels,) = at_least_float32(pixels)
-    check_shapes("pixel_radius", pixels=(pixels, "... 2"), focal=(camera.focal, "2"))
+    check_shapes("pixel_radius", pixels=(pixels, "... 2"))
+    _check_one("pixel_radius", camera, "focal", "center")
     steps = [jnp.broadcast_to(jnp.eye(2, dtype=pixels.dtype)[axis], pixels.shape) for axis in range(2)]
     right, down = (jax.jvp(lambda at: undistort(camera, at)[0], (pixels,), (step,))[1] for step in steps)
     area = jnp.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
@@ -170,7 +200,8 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
         ValueError: on other shapes or an unknown lens.
     """
     x = jnp.asarray(x)
-    check_shapes("project", x=(x, "... 3"), to_world=(camera.to_world, "3 4"))
+    check_shapes("project", x=(x, "... 3"))
+    _check_one("project", camera, "to_world", "focal", "center")
     to_world, lead = jnp.asarray(camera.to_world), (1,) * (x.ndim - 1)
     focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
     offset = x - to_world[:, 3].reshape(*lead, 3)
@@ -214,10 +245,11 @@ def ndc_rays(rays: Rays, camera: Camera, *, near_plane: Num[ArrayLike, ""] = 1.0
         nearly perpendicular to it that its position or gradient overflows, misses the box: near = far = 0.
 
     Raises:
-        ValueError: if the camera's size is unknown.
+        ValueError: if the camera's size is unknown, or on several cameras.
     """
     if camera.height is None or camera.width is None:
         raise ValueError("ndc_rays: the camera has no height and width, expected both in px; NDC depends on them")
+    _check_one("ndc_rays", camera, "focal", call="{}", arguments="rays, cameras")
     focal = jnp.asarray(camera.focal)
     scale = 2 * focal / jnp.array([camera.width, camera.height], focal.dtype) / near_plane
     scale = scale.reshape(*(1,) * rays.near.ndim, 2)

@@ -40,6 +40,11 @@ def _mean_squared_error(function, a, b, mask):
     if mask is None:
         return ((a - b) ** 2).mean(axis=axes)
     check_shapes(function, a=(a, f"{pixels} C"), mask=(mask, pixels))
+    mask = jnp.asarray(mask)
+    if mask.dtype != bool:
+        raise ValueError(
+            f"{function}: mask has type {mask.dtype}, expected bool; compare it with a threshold: mask > 0"
+        )
     kept = jnp.where(mask[..., None], a - b, 0)  # before the square, so that excluded pixels get gradient 0
     return (kept**2).sum(axis=axes) / (mask.sum(axis=axes[1:]) * a.shape[-1])
 
@@ -81,7 +86,9 @@ def psnr(
     """Computes the peak signal-to-noise ratio in dB of images, or of a batch of rays, with colours in [0, 1].
 
     Args:
-        a, b, mask: see mse.
+        a: [..., H, W, C], or [B, C].
+        b: as a.
+        mask: see mse.
 
     Returns:
         [...] dB: inf for identical images, with gradient 0; NaN if a colour that counts is NaN.

@@ -289,7 +289,7 @@ def split_key(key: Keys | None, num: int) -> tuple[Key[Array, "..."] | None, ...
     """Splits a key, or one key per ray, into num independent ones; None gives as many None."""
     if key is None:
         return (None,) * num
-    key = _typed(key)
+    key = typed_key(key)
     keys = jax.random.split(key, num) if key.ndim == 0 else _per_ray(lambda k: jax.random.split(k, num), key)
     return tuple(keys[..., i] for i in range(num))
 
@@ -305,7 +305,7 @@ def normal(key: Keys, shape: Sequence[int]) -> Float[Array, "..."]:
 
 
 def _draw(distribution, key, shape):
-    key = _typed(key)
+    key = typed_key(key)
     if key.ndim == 0:
         return distribution(key, shape)
     if key.shape != tuple(shape[:-1]):
@@ -313,12 +313,18 @@ def _draw(distribution, key, shape):
     return _per_ray(lambda k: distribution(k, shape[-1:]), key)
 
 
-def _typed(key):
+ONE_KEY = "a key such as jax.random.key(0)"
+
+
+def typed_key(
+    key: Keys, expected: str = "a key such as jax.random.key(0), one key per ray, or None"
+) -> Key[Array, "..."]:
+    """Returns a typed key, or keys, from what a function is given; ValueError, with what is expected, on all else."""
     kind = getattr(key, "dtype", type(key).__name__)
     if hasattr(key, "dtype") and jnp.issubdtype(kind, jax.dtypes.prng_key):
         return key
     if kind != jnp.uint32 or not jnp.ndim(key):
-        raise ValueError(f"key is {key!r} ({kind}), expected a key such as jax.random.key(0), one key per ray, or None")
+        raise ValueError(f"key is {key!r} ({kind}), expected {expected}")
     return jax.random.wrap_key_data(key)
 
 
@@ -351,7 +357,7 @@ def _draw_between(key, lower, upper):
     # The edges are rounded, so a draw this close to an edge may lie in the neighbouring bin of exact edges.
     finite_upper = jnp.where(jnp.isinf(upper), lower, upper)
     rounding = 2 * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(finite_upper))
-    margin = jnp.minimum(rounding, 0.25 * (finite_upper - lower))
+    margin = jnp.minimum(rounding, 0.25 * _width(lower, finite_upper))
     below = jnp.nextafter(*jax.lax.stop_gradient((upper, lower)))
     return clamp(draw, lower + margin, jnp.minimum(upper - margin, below))
 
@@ -361,12 +367,13 @@ def _interpolate(lower, upper, fraction):
     infinite = jnp.isinf(upper)
     at_end = infinite & (fraction == 1)  # where the gradient is infinite, too
     reciprocal = lower / (1 - jnp.where(infinite & ~at_end, fraction, 0))
-    finite = lower + fraction * (jnp.where(infinite, lower, upper) - lower)
-    return jnp.where(at_end, upper, jnp.where(infinite, reciprocal, finite))
+    start, end = jnp.where(infinite, 0, lower), jnp.where(infinite, 0, upper)  # both ends may be infinite
+    return jnp.where(at_end, upper, jnp.where(infinite, reciprocal, start + fraction * (end - start)))
 
 
 def _width(lower, upper):
-    return jnp.where(upper == lower, 0, upper - lower)  # inf - inf would be NaN
+    equal = upper == lower
+    return jnp.where(equal, 0, jnp.where(equal, 0, upper) - jnp.where(equal, 0, lower))  # inf - inf would be NaN
 
 
 def _count_below(sums, target):

@@ -1,5 +1,7 @@
 """Views: images with their cameras, as datasets are read."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt
@@ -53,6 +55,7 @@ class Views:
 
     def image(self, index: int) -> Float[Array, "H W 3"]:
         """Returns a view's colours [H, W, 3] in [0, 1]; alpha is composited over the background, or over black."""
+        _check_index(self, index)
         height, width = (int(side) for side in self.size[index])
         first = int(self.offset[index])
         pixels = jnp.asarray(self.pixels[first : first + height * width])
@@ -60,13 +63,24 @@ class Views:
 
     def camera(self, index: Int[ArrayLike, ""]) -> Camera:
         """Returns a view's Camera; it has a height and a width if all views have the same."""
+        _check_index(self, index)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.cameras)
 
     def rays(self, index: int) -> Rays:
-        """Returns the Rays [H, W] through the centres of a view's pixels, between its near and its far."""
+        """Returns the Rays [H, W] through the centres of a view's pixels, between its near and its far, at its time."""
+        _check_index(self, index)
         height, width = (int(side) for side in self.size[index])
         near, far = (jnp.asarray(bound)[index] for bound in (self.near, self.far))
-        return rays_from_pixels(self.camera(index), pixel_grid(height, width), near=near, far=far)
+        rays = rays_from_pixels(self.camera(index), pixel_grid(height, width), near=near, far=far)
+        time = None if self.time is None else jnp.full_like(rays.near, self.time[index])
+        return dataclasses.replace(rays, time=time)
+
+
+def _check_index(views, index):
+    """Raises an IndexError on the index of no view; JAX would return the last one."""
+    count = len(views.offset)
+    if not isinstance(index, jax.core.Tracer) and not -count <= int(index) < count:
+        raise IndexError(f"Views: the index is {index}, expected one of 0 to {count - 1}, as there are {count} views")
 
 
 def pixel_colors(pixels: UInt[ArrayLike, "*batch C"], background: Vector | None) -> Float[ArrayLike, "*batch 3"]:

@@ -94,7 +94,7 @@ def composite(
     weights: Num[ArrayLike, "*batch samples"],
     values: Num[ArrayLike, "*batch samples channels"],
     *,
-    background: Num[ArrayLike, "*#batch channels"] | Sequence[float] | None = None,
+    background: Num[ArrayLike, "*#batch #channels"] | Sequence[float] | None = None,
     transmittance: Num[ArrayLike, "*batch"] | None = None,
 ) -> Float[Array, "*batch channels"]:
     """Computes the weighted sum of values along each ray, over a background.
@@ -104,7 +104,8 @@ def composite(
     Args:
         weights: [..., S].
         values: [..., S, C], colours or other values; they must be finite even where the weight is 0.
-        background: None for black (nothing is added), [C], or [..., C], one per ray.
+        background: None for black (nothing is added), [C], or [..., C], one per ray; [1] or [..., 1] has the same value
+            in all channels.
         transmittance: [...] weight of the background; None for 1 - sum of weights.
 
     Returns:
@@ -118,14 +119,22 @@ def composite(
     color = _sum_over_samples(weights, values)
     if background is None:
         return color
-    background = jnp.asarray(background, color.dtype)
-    if background.shape not in (color.shape, color.shape[-1:]):
-        raise ValueError(
-            f"composite: background has shape {background.shape}, expected {color.shape[-1:]} or {color.shape}"
-        )
+    background = broadcast_background("composite", background, color)
     behind = 1 - weights.sum(axis=-1) if transmittance is None else jnp.asarray(transmittance)
     check_shapes("composite", transmittance=(behind, "..."), color=(color, "... C"))
-    return color + behind[..., None] * jnp.broadcast_to(background, color.shape)
+    return color + behind[..., None] * background
+
+
+def broadcast_background(
+    function: str, background: Num[ArrayLike, "..."] | Sequence[float], color: Float[ArrayLike, "*batch channels"]
+) -> Float[Array, "*batch channels"]:
+    """Broadcasts a background, one value or C, for all rays or one per ray, to colours [..., C]; or ValueError."""
+    background = jnp.asarray(background, color.dtype)
+    if background.shape[:-1] not in ((), color.shape[:-1]) or background.shape[-1:] not in ((1,), color.shape[-1:]):
+        raise ValueError(
+            f"{function}: background has shape {background.shape}, expected {color.shape[-1:]} or {color.shape}"
+        )
+    return jnp.broadcast_to(background, color.shape)
 
 
 def expected_depth(

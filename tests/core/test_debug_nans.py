@@ -289,6 +289,9 @@ def cases():
             for kind, ends in (("", edges), (" infinite", infinite), (" empty", 0 * edges + 1)):
                 function = functools.partial(jaxnerf.samples_from_edges, key, rule=rule)
                 found[f"samples_from_edges {rule}{name}{kind}"] = function, (ends,)
+    twice = jnp.array([[1.0, 3.0, jnp.inf, jnp.inf]])
+    found["samples_from_edges twice infinite"] = functools.partial(jaxnerf.samples_from_edges, None), (twice,)
+    found["samples_from_edges drawn twice infinite"] = functools.partial(jaxnerf.samples_from_edges, KEY), (twice,)
     for name, key in (("", None), (" drawn", KEY)):
         for kind, ends in (("", edges), (" infinite", infinite), (" empty", 0 * edges + 1)):
             for what, values in (("", weights), (" dark", nothing), (" sparse", weights.at[:, 1:3].set(0))):

@@ -60,6 +60,45 @@ def test_a_stack_of_cameras_has_the_rays_of_each(lens):
             jax.tree.map(lambda a, b, i=index: np.testing.assert_allclose(a[i], b, atol=1e-6), several, alone)
 
 
+def test_a_stack_of_cameras_has_any_leading_axes_and_a_near_of_each():
+    poses = jnp.stack([jaxnerf.look_at((x, -4.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for x in range(6)])
+    one, pixels = camera(), jaxnerf.pixel_grid(5, 6)  # as many columns as cameras
+    near = jnp.linspace(1, 2, 6)
+    flat = jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=poses), pixels, near=near, far=9.0)
+    np.testing.assert_array_equal(flat.near, jnp.broadcast_to(near[:, None, None], (6, 5, 6)))
+    nested = dataclasses.replace(one, to_world=poses.reshape(2, 3, 3, 4), center=jnp.full((2, 3, 2), 3.0))
+    nested = jaxnerf.rays_from_pixels(nested, pixels, near=near.reshape(2, 3), far=9.0)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a.reshape(b.shape), b, atol=1e-6), nested, flat)
+    with pytest.raises(ValueError, match=r"focal has shape \(2, 2\), expected \(2,\) or \(6, 2\) beside to_world"):
+        wrong = dataclasses.replace(one, to_world=poses, focal=jnp.ones((2, 2)))
+        jaxnerf.rays_from_pixels(wrong, pixels, near=near, far=9.0)
+
+
+def test_what_takes_one_camera_says_how_several_are_computed():
+    """Runs the advice of the message."""
+    poses = jnp.stack([jaxnerf.look_at((x, -4.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for x in range(3)])
+    pixels, one = jaxnerf.pixel_grid(6, 6), camera(height=6, width=6)
+    cameras = dataclasses.replace(one, to_world=poses, focal=jnp.full((3, 2), 6.0), center=jnp.full((3, 2), 3.0))
+    rays = jaxnerf.rays_from_pixels(cameras, pixels, near=1.0, far=6.0)
+    for function, values in {
+        jaxnerf.project: jnp.zeros((5, 3)),
+        jaxnerf.undistort: pixels,
+        jaxnerf.pixel_radius: pixels,
+        jaxnerf.ndc_rays: None,
+    }.items():
+        arguments = (cameras, values) if values is not None else (rays, cameras)
+        with pytest.raises(
+            ValueError, match=f"^{function.__name__}: the camera's .* has shape .*, of one camera"
+        ) as raised:
+            function(*arguments)
+        advice = str(raised.value).partition("; for several, each array of which has a leading axis, call ")[2]
+        names = {"jax": jax, function.__name__: function, "cameras": cameras, "rays": rays, "values": values}
+        found = eval(advice.replace("...", "values"), names)
+        assert all(len(leaf) == 3 for leaf in jax.tree.leaves(found))
+    with pytest.raises(ValueError, match=r"to_world has shape \(4, 4\), expected \(3, 4\)"):
+        jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=jnp.eye(4)), pixels, near=1.0, far=6.0)
+
+
 @pytest.mark.parametrize("channels", [1, 8])
 def test_scenes_of_any_number_of_channels(channels):
     """All renderers agree with three channels at a time, over a background of as many channels."""
@@ -88,7 +127,13 @@ def test_scenes_of_any_number_of_channels(channels):
     early = jaxnerf.render_packed(scene, None, rays(), samples, early_stop_eps=1e-6, median_depth=True, **options)
     np.testing.assert_allclose(early.rgb, whole.rgb, atol=1e-5)
     np.testing.assert_allclose(early.median_depth, whole.median_depth, rtol=1e-5)
-    for wrong in (jnp.ones(channels + 1), jnp.ones((5, channels))):
+    for render in (
+        lambda **options: render_samples(scene, rays(), samples, **options),
+        lambda **options: jaxnerf.render_packed(scene, grid, rays(), samples, max_samples=36 * 24, **options),
+    ):
+        for background in (jnp.ones(1), jnp.ones((6, 6, 1)), jnp.ones((6, 6, channels))):
+            np.testing.assert_array_equal(render(background=background).rgb, render(background=jnp.ones(channels)).rgb)
+    for wrong in (jnp.ones(channels + 1), jnp.ones((5, channels)), jnp.ones(())):
         for render in (render_samples, jaxnerf.render_packed):
             more = {"max_samples": 864} if render is jaxnerf.render_packed else {}
             arguments = (None,) if more else ()
@@ -114,6 +159,29 @@ def test_wrong_outputs_and_errors_of_a_scene_name_the_shapes():
 def test_what_is_no_key_is_refused(key):
     with pytest.raises(ValueError, match=r"expected a key such as jax.random.key\(0\)"):
         jaxnerf.render_rays(key, features, rays(), num_samples=4)
+
+
+@pytest.mark.parametrize("key", [0, None, np.int64(3)])
+def test_what_needs_one_key_refuses_all_else(key):
+    bounds = jnp.full(3, -1.0), jnp.ones(3)
+    grid = jaxnerf.create_grid(*bounds, jnp.ones((2, 2, 2), bool), initial_density=1.0)
+    for call in (
+        lambda: jaxnerf.update_grid(key, grid, features, jnp.arange(8), threshold=0.1),
+        lambda: jaxnerf.grid_from_scene(key, features, *bounds, (2, 2, 2), threshold=0.1),
+        lambda: jaxnerf.mlp_field(depth=2, width=8).init(key),
+        lambda: jaxnerf.hash_grid_field(lower=(0, 0, 0), upper=(1, 1, 1)).init(key),
+    ):
+        with pytest.raises(ValueError, match=r"key is .*, expected a key such as jax.random.key\(0\)$"):
+            call()
+
+
+@pytest.mark.parametrize("metric", [jaxnerf.mse, jaxnerf.psnr])
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_metrics_refuse_masks_of_numbers(metric, kind):
+    """Their sum would be taken for the number of pixels."""
+    image = np.ones((16, 16, 3), np.float32)
+    with pytest.raises(ValueError, match="mask has type .*, expected bool; compare it with a threshold"):
+        metric(image, image / 2, mask=np.full((16, 16), 255, kind))
 
 
 def test_old_keys_are_accepted():

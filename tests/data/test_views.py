@@ -33,3 +33,22 @@ def test_the_scene_looks_like_its_image_along_a_views_rays():
     np.testing.assert_array_equal(rays.directions, expected.directions)
     image = jaxnerf.render_rays(None, jaxnerf.still_life, rays, num_samples=256, background=jnp.ones(3))
     assert jaxnerf.psnr(image.rgb, views.image(2)) > 30
+
+
+def test_the_cameras_of_all_views_have_the_rays_of_each():
+    views = jaxnerf.load_dataset("", split="test", format="synthetic", size=8)  # as many views as pixels in a row
+    views = dataclasses.replace(views, near=views.near + np.arange(8, dtype=np.float32) / 8, time=np.linspace(0, 1, 8))
+    rays = jaxnerf.rays_from_pixels(views.cameras, jaxnerf.pixel_grid(8, 8), near=views.near, far=views.far)
+    for index in (0, 5, -1):
+        alone = views.rays(index)
+        assert (alone.time == np.float32(views.time[index])).all() and rays.time is None
+        for name in ("origins", "directions", "near", "far"):
+            np.testing.assert_allclose(getattr(rays, name)[index], getattr(alone, name), atol=1e-6)
+
+
+@pytest.mark.parametrize("index", [8, -9, 99])
+def test_there_is_nothing_behind_the_last_view(index):
+    views = jaxnerf.load_dataset("", split="test", format="synthetic", size=20)
+    for of_view in (views.image, views.camera, views.rays):
+        with pytest.raises(IndexError, match=f"the index is {index}, expected one of 0 to 7, as there are 8 views"):
+            of_view(index)

@@ -162,6 +162,17 @@ def test_predictions_are_paired_by_name_or_number_or_in_natural_order(tmp_path, 
     assert len(warned) == (how != "name")
 
 
+@pytest.mark.parametrize(
+    "size, hint", [((12, 15), "factor=2 reads a dataset at that size$"), ((12, 14), "give both one size$")]
+)
+def test_predictions_of_another_size_are_refused(tmp_path, size, hint):
+    for folder, shape in ((tmp_path / "color", size), (tmp_path / "gt-color", (25, 30))):
+        folder.mkdir()
+        iio.imwrite(folder / "0.png", np.zeros((*shape, 3), np.uint8))
+    with pytest.raises(ValueError, match=f"0.png: has shape .*, its reference .*; .*{hint}"):
+        external.score_folder(tmp_path)
+
+
 @pytest.mark.slow
 def test_a_flat_folder_is_scored_against_a_dataset(tmp_path):
     """--data_dir alone names the dataset; without it the message says what to give."""

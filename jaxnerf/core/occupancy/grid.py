@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from jaxnerf.core import contraction, volume_rendering
 from jaxnerf.core.safe_math import at_least_float32
+from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.scene import inputs_of, needs_of
 from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, check_shapes, pytree
 from jaxnerf.core.varying import vary_like
@@ -129,9 +130,11 @@ def update_grid(
         OccupancyGrid. Cells that are not valid stay empty. The update is not meant to be differentiated.
 
     Raises:
-        ValueError: on other shapes.
+        ValueError: on other shapes, if the grid's cells are not bool, or if key is no key.
     """
     check_shapes("update_grid", cells=(cells, "M"))
+    _check_bool("update_grid", valid=grid.valid)
+    key = typed_key(key, ONE_KEY)
     corner = jnp.stack(jnp.unravel_index(cells, grid.occupied.shape), axis=-1)
     place = (corner + jax.random.uniform(key, corner.shape)) / jnp.array([grid.occupied.shape])
     if grid.contracted:
@@ -196,6 +199,7 @@ def grid_from_scene(
     Returns:
         OccupancyGrid.
     """
+    key = typed_key(key, ONE_KEY)
     grid = create_grid(lower, upper, jnp.ones(shape, bool), initial_density=0.0, contracted=contracted)
     cells = jnp.arange(grid.valid.size)
 

@@ -266,12 +266,8 @@ def _rendering(sums, num_dropped, far, shape, background, samples):
     """Returns the Rendering [*shape], with PackedSamples or None."""
     rgb = sums.rgb
     if background is not None:
-        behind, channels = jnp.asarray(background, rgb.dtype), rgb.shape[-1:]
-        if behind.shape not in (channels, (*shape, *channels)):
-            raise ValueError(
-                f"render_packed: background has shape {behind.shape}, expected {channels} or {(*shape, *channels)}"
-            )
-        behind = jnp.broadcast_to(behind, (*shape, *channels)).reshape(-1, *channels)
+        color = rgb[: math.prod(shape)].reshape(*shape, -1) if math.prod(shape) else jnp.zeros((*shape, rgb.shape[-1]))
+        behind = volume_rendering.broadcast_background("render_packed", background, color).reshape(-1, rgb.shape[-1])
         rgb = rgb + sums.transmittance[:, None] * _at_least_one(behind)
     flat = Rendering(
         rgb=rgb,
@@ -541,7 +537,8 @@ def _longest_first(count, most):
 
 def _made_opaque(sums, rows):
     """Returns the sums [C + 4 or 5, L] of terminated rays, whose remaining light looks like the rest of the ray."""
-    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:rows] / sums[1:2], sums[rows:]])
+    opacity = jnp.where(sums[1:2] > 0, sums[1:2], 1)
+    return jnp.concatenate([jnp.zeros_like(sums[:1]), sums[1:rows] / opacity, sums[rows:]])
 
 
 def _nth_samples(rays, samples, words, up_to, ray, n, used):

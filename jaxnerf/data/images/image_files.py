@@ -20,7 +20,11 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _GREY_MODES = ("I;16", "I;16B", "I;16L", "I", "F")  # Pillow's, of more than 8 bits
 _ROUNDING = 1e-4  # by which floats may leave [0, 1]
+_DARK = 16  # up to this brightest value, a mask of 8 bits with several levels holds class numbers or noise
 _ORIENTATION = 0x0112  # the EXIF tag
+_WRITE_MASK = "write 0 where pixels are ignored and 255 elsewhere"
+# Tags of a TIFF.
+_BITS, _PHOTOMETRIC, _PLANAR, _SAMPLE_FORMAT = 258, 262, 284, 339
 _UPRIGHT = {  # value of the tag -> function that makes the image upright
     2: np.fliplr,
     3: lambda pixels: np.rot90(pixels, 2),
@@ -33,7 +37,10 @@ _UPRIGHT = {  # value of the tag -> function that makes the image upright
 
 
 class _WrongRangeError(ValueError):
-    """An image's numbers are no colours."""
+    """An image's numbers are no colours, or a mask's numbers are none of a mask."""
+
+    def __init__(self, found: str, remedy: str = "convert it to 8 or 16 bits"):
+        super().__init__(f"{found}; {remedy}")
 
 
 def is_hidden(name: str) -> bool:
@@ -48,7 +55,7 @@ def read_image(
 
     Args:
         path: of one of the FORMATS: 8 bits, 16 bits in a PNG or grey, or in a grey TIFF floats in [0, 1] or whole
-            numbers of 32 bits up to 65535.
+            numbers of 32 bits up to 65535. Of several pages the first is read.
         camera_size: (height, width) that the camera's intrinsics refer to, or a multiple of the image's size.
             If only the stored, unrotated pixels fit it, the EXIF orientation is ignored.
         follow_exif: whether EXIF orientation is followed at all.
@@ -58,12 +65,10 @@ def read_image(
         a palette and a transparent colour key are resolved.
 
     Raises:
-        ValueError: if the file is missing, truncated or not an image.
+        ValueError: if the file is missing, truncated or not an image, or if its numbers have another range.
     """
     pixels, value = _open(path, lambda image: (_decode(path, image), _orientation(image)))
-    if not (follow_exif and _is_rotated(pixels.shape[:2], value, camera_size)):
-        return pixels
-    return np.ascontiguousarray(_UPRIGHT[value](pixels))
+    return _upright(pixels, value, camera_size) if follow_exif else pixels
 
 
 def read_stored(path: str | os.PathLike) -> Shaped[np.ndarray, "H W *C"]:
@@ -95,6 +100,13 @@ def image_form(
     return (height, width, channels), dtype
 
 
+def _upright(pixels, value, camera_size):
+    """Returns an image [H, W, ...] turned by its EXIF orientation, where that is followed."""
+    if not _is_rotated(pixels.shape[:2], value, camera_size):
+        return pixels
+    return np.ascontiguousarray(_UPRIGHT[value](pixels))
+
+
 def _is_rotated(size, value, camera_size):
     """Returns whether the EXIF orientation of an image [H, W] is followed."""
     upright = size[::-1] if value >= 5 else size
@@ -110,10 +122,15 @@ def fits(found: tuple, declared: tuple) -> bool:
 def read_mask(path: str | os.PathLike, *, camera_size: tuple | None = None) -> Bool[np.ndarray, "H W"]:
     """Reads an image as a mask: True where a pixel is brighter than half of the brightest one. See `read_image`.
 
-    The values may be 0 and 1, 0 and 255 or any others, and palettes of any colours; a black image excludes all.
+    The values may be 0 and 1, 0 and 255 or any others, also floats, and palettes of any colours; a black image
+    excludes all. Transparent pixels are dark; where all pixels have one colour, alpha alone is the mask.
+
+    Raises:
+        ValueError: as read_image, on negative values and NaN, and on several levels that are all dark, such as the
+            numbers of classes.
     """
-    values = read_image(path, camera_size=camera_size)[..., :3].max(axis=-1)
-    return values > values.max(initial=0) // 2
+    values, value = _open(path, lambda image: (_brightness(path, image), _orientation(image)))
+    return _upright(values > values.max(initial=0) / 2, value, camera_size)
 
 
 def image_size(path: str | os.PathLike, *, follow_exif: bool = True) -> tuple[int, int]:
@@ -141,7 +158,7 @@ def _use(path, use):
     except FileNotFoundError:
         raise
     except _WrongRangeError as error:
-        raise ValueError(f"{path}: {error}; convert it to 8 or 16 bits") from None
+        raise ValueError(f"{path}: {error}") from None
     except Exception as error:  # Pillow's decoders raise almost any exception on a damaged file
         unknown = isinstance(error, UnidentifiedImageError)
         reason = " ".join(f"{type(error).__name__}: {error}".split())
@@ -178,34 +195,76 @@ def _raw(image):
 
 def _depth(image):
     """Returns the number of channels and the dtype of _decode's result."""
-    raw = _raw(image)
-    if raw in ("RGB;16B", "RGBA;16B"):
-        return (4 if raw.startswith("RGBA") else 3), np.dtype(np.uint16)
-    if image.mode in _GREY_MODES:
-        return 3, np.dtype(np.uint16)
-    return (4 if image.has_transparency_data else 3), np.dtype(np.uint8)
+    deep = _raw(image) in ("RGB;16B", "RGBA;16B") or image.mode in _GREY_MODES
+    return (4 if image.has_transparency_data else 3), np.dtype(np.uint16 if deep else np.uint8)
 
 
 def _decode(path, image):
+    _check_numbers(image)
     raw = _raw(image)
     if raw in ("RGB;16B", "RGBA;16B"):
         # Pillow keeps only the first byte of each 16 bit value. With the opposite byte order it keeps the second,
         # so two passes give all sixteen bits.
         high, low = np.asarray(image), _second_bytes(path, raw)
-        return high.astype(np.uint16) * 256 + low
+        return _with_color_key(image, high.astype(np.uint16) * 256 + low)
     if image.mode in _GREY_MODES:
-        return np.repeat(_sixteen_bits(np.asarray(image))[..., None], 3, axis=-1)
+        values = _sixteen_bits(np.asarray(image), image.format)
+        values = 65535 - values if _tag(image, _PHOTOMETRIC) == 0 else values
+        return np.repeat(_with_color_key(image, values[..., None]), (3, 1)[: 1 + image.has_transparency_data], axis=-1)
     mode = "RGBA" if image.has_transparency_data else "RGB"
     return np.asarray(image if image.mode == mode else image.convert(mode))
 
 
-def _sixteen_bits(values):
+def _tag(image, number, default=None):
+    return image.tag_v2.get(number, default) if image.format == "TIFF" else default
+
+
+def _check_numbers(image):
+    """Raises a _WrongRangeError where Pillow returns other colours than those of a TIFF."""
+    bits = max(np.atleast_1d(_tag(image, _BITS, 1)))
+    if bits > 8 and _tag(image, _PLANAR) == 2:
+        raise _WrongRangeError(f"its channels of {bits} bits are stored one after the other, expected them interleaved")
+    if bits < 32 and 2 in np.atleast_1d(_tag(image, _SAMPLE_FORMAT, 1)):
+        raise _WrongRangeError(f"its values are signed numbers of {bits} bits, expected unsigned ones")
+
+
+def _with_color_key(image, pixels):
+    """Returns pixels [H, W, C] of 16 bits, with alpha if a PNG states a transparent colour."""
+    key = image.info.get("transparency")
+    if key is None:
+        return pixels
+    opaque = (pixels != np.reshape(key, -1)).any(axis=-1, keepdims=True)
+    return np.concatenate([pixels, np.where(opaque, np.uint16(65535), np.uint16(0))], axis=-1)
+
+
+def _brightness(path, image):
+    """Returns the brightness [H, W] of a mask's pixels, in any unit."""
+    if image.mode in _GREY_MODES and not image.has_transparency_data:
+        values = np.asarray(image)
+        if not values.min(initial=0) >= 0:
+            low, high = values.min(), values.max()
+            raise _WrongRangeError(f"its values are from {low:g} to {high:g}, expected a mask's", _WRITE_MASK)
+        return values.max(initial=0) - values if _tag(image, _PHOTOMETRIC) == 0 else values
+    pixels = _decode(path, image)
+    values, alpha = pixels[..., :3].max(axis=-1), pixels[..., 3:]
+    levels = np.unique(values)
+    if len(levels) == 1 and alpha.size and alpha.min() < alpha.max():
+        return alpha[..., 0]
+    if values.dtype == np.uint8 and len(levels) > 2 and levels[-1] <= _DARK:
+        some = ", ".join(map(str, levels[:4]))
+        raise _WrongRangeError(f"it holds the values {some} ..., expected those of a mask", _WRITE_MASK)
+    return values.astype(np.float32) * alpha[..., 0] if alpha.size else values
+
+
+def _sixteen_bits(values, format):
     """Returns floats in [0, 1] or whole numbers up to 65535 as uint16; ValueError on any other range."""
     low, high = values.min(initial=0), values.max(initial=0)
     if values.dtype.kind == "f":
         if not (low >= -_ROUNDING and high <= 1 + _ROUNDING):  # not NaN either
             raise _WrongRangeError(f"its values are from {low:g} to {high:g}, expected floats from 0 to 1")
         values = np.rint(65535 * np.clip(values, 0, 1))
+    elif format == "TIFF" and values.itemsize == 4 and 0 < high <= 255:
+        raise _WrongRangeError(f"its values are from {low} to {high} in 32 bits, expected a range up to 65535")
     elif not 0 <= low <= high <= 65535:
         raise _WrongRangeError(f"its values are from {low} to {high}, expected whole numbers from 0 to 65535")
     return values.astype(np.uint16)

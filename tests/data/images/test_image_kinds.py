@@ -1,8 +1,12 @@
-"""Images of every kind that Pillow reads are the same picture as in 8 bits, or are refused with what was found."""
+"""Images of every kind that Pillow reads are the same image as in 8 bits, or are refused with what was found."""
+
+import struct
+import zlib
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 from jaxnerf.data.images.image_files import image_form, read_image, read_mask
@@ -22,6 +26,71 @@ KINDS = {
     "colour.tif": lambda: Image.fromarray(GREY).convert("RGB"),
     "print colours.tif": lambda: Image.fromarray(GREY).convert("RGB").convert("CMYK"),
 }
+
+
+COLORS = np.stack([GREY, 255 - GREY, GREY // 2], axis=-1)
+DEEP = COLORS.astype(np.uint16) * 257
+OPAQUE = np.full((6, 8, 1), 65535, np.uint16)
+TIFFS = {
+    "16 bits": (COLORS, DEEP, {"photometric": "rgb"}),
+    "16 bits, big endian": (COLORS, DEEP, {"photometric": "rgb", "byteorder": ">"}),
+    "with alpha": (COLORS, np.concatenate([DEEP, OPAQUE], axis=-1), {"photometric": "rgb", "extrasamples": [2]}),
+    "planes": (COLORS, np.moveaxis(COLORS, -1, 0), {"photometric": "rgb", "planarconfig": "separate"}),
+    "0 is white": (255 - GREY, GREY, {"photometric": "miniswhite"}),
+    "0 is white, 16 bits": (255 - GREY, DEEP[..., 0], {"photometric": "miniswhite"}),
+    "unsigned 32 bits": (GREY, DEEP[..., 0].astype(np.uint32), {}),
+    "big endian floats": (GREY, GREY.astype(np.float32) / 255, {"byteorder": ">"}),
+    "compressed": (GREY, DEEP[..., 0], {"compression": "zlib"}),
+    "two pages": (GREY, np.stack([DEEP[..., 0], DEEP[..., 1]]), {"photometric": "minisblack"}),
+}
+
+
+@pytest.mark.parametrize("name", TIFFS)
+def test_tiffs_of_other_programs(name, tmp_path):
+    image, numbers, options = TIFFS[name]
+    tifffile.imwrite(tmp_path / "a.tif", numbers, **options)
+    pixels = read_image(tmp_path / "a.tif")
+    assert image_form(tmp_path / "a.tif") == (pixels.shape, pixels.dtype)
+    colors = pixels[..., :3] / np.iinfo(pixels.dtype).max
+    np.testing.assert_allclose(colors, np.broadcast_to(image.reshape(6, 8, -1), (6, 8, 3)) / 255, atol=1.5 / 255)
+
+
+@pytest.mark.parametrize(
+    "numbers, words, options",
+    [
+        (np.moveaxis(DEEP, -1, 0), "channels of 16 bits are stored one after", {"planarconfig": "separate"}),
+        (GREY.astype(np.int16) * 128, "its values are signed numbers of 16 bits, expected unsigned ones", {}),
+        ((GREY // 2).astype(np.int8), "its values are signed numbers of 8 bits", {}),
+        (GREY.astype(np.int32), "its values are from 0 to 2.. in 32 bits, expected a range up to 65535", {}),
+        (GREY.astype(np.uint32) * 16843009, "expected whole numbers from 0 to 65535", {}),
+        (GREY / 255, "of a kind that Pillow does not read", {}),
+    ],
+)
+def test_tiffs_that_are_refused(numbers, words, options, tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", numbers, photometric="rgb" if options else "minisblack", **options)
+    with pytest.raises(ValueError, match=f"a.tif: .*{words}.*convert it"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("numbers, key", [(DEEP, (514, 65535 - 514, 257)), (DEEP[..., :1], (514,))])
+def test_a_transparent_colour_of_16_bits_is_resolved(numbers, key, tmp_path):
+    numbers = numbers.copy()
+    numbers[2, 3] = key
+
+    def chunk(kind, content):
+        whole = kind + content
+        return struct.pack(">I", len(content)) + whole + struct.pack(">I", zlib.crc32(whole))
+
+    header = struct.pack(">IIBBBBB", 8, 6, 16, 2 if numbers.shape[-1] == 3 else 0, 0, 0, 0)
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in numbers)
+    chunks = [(b"IHDR", header), (b"tRNS", np.asarray(key, ">u2").tobytes()), (b"IDAT", zlib.compress(rows))]
+    (tmp_path / "a.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*each) for each in (*chunks, (b"IEND", b"")))
+    )
+    pixels = read_image(tmp_path / "a.png")
+    assert image_form(tmp_path / "a.png") == ((6, 8, 4), np.uint16) == (pixels.shape, pixels.dtype)
+    np.testing.assert_array_equal(pixels[..., :3], np.broadcast_to(numbers, (6, 8, 3)))
+    np.testing.assert_array_equal(pixels[..., 3] == 0, (numbers == key).all(axis=-1))
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -75,6 +144,13 @@ MASKS = {
     "0 and 65535.tif": lambda: Image.fromarray(65535 * KEPT.astype(np.uint16)),
     "floats.tif": lambda: Image.fromarray(KEPT.astype(np.float32)),
     "colours.png": lambda: Image.fromarray(KEPT[..., None] * np.uint8([0, 128, 0])),
+    "floats of 0 and 255.tif": lambda: Image.fromarray(255 * KEPT.astype(np.float32)),
+    "0 and 100000.tif": lambda: Image.fromarray(100000 * KEPT.astype(np.int32)),
+    "black with alpha.png": lambda: Image.fromarray(KEPT[..., None] * np.uint8([0, 0, 0, 255])),
+    "white with alpha.png": lambda: Image.fromarray(
+        np.uint8([255, 255, 255, 0]) + KEPT[..., None] * np.uint8([0, 0, 0, 255])
+    ),
+    "grey and opaque.png": lambda: Image.fromarray(255 * KEPT.astype(np.uint8)).convert("LA"),
     "soft.png": lambda: Image.fromarray(np.where(KEPT, 200, 40).astype(np.uint8)),
 }
 
@@ -83,6 +159,20 @@ MASKS = {
 def test_a_mask_is_true_where_it_is_bright(name, tmp_path):
     MASKS[name]().save(tmp_path / name)
     assert (read_mask(tmp_path / name) == KEPT).all()
+
+
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        (GREY % 4, "it holds the values 0, 1, 2, 3 ..., expected those of a mask; write 0 where pixels are ignored"),
+        (np.where(KEPT, 1, np.nan).astype(np.float32), "from nan to nan, expected a mask's"),
+        (KEPT.astype(np.float32) - 1, "from -1 to 0, expected a mask's"),
+    ],
+)
+def test_what_is_no_mask_is_refused(values, words, tmp_path):
+    Image.fromarray(values).save(tmp_path / "mask.tif")
+    with pytest.raises(ValueError, match=f"mask.tif: .*{words}"):
+        read_mask(tmp_path / "mask.tif")
 
 
 @pytest.mark.parametrize("value, kept", [(0, False), (1, True), (255, True)])
