@@ -1,0 +1,27 @@
+"""The built-in losses of renderings by name: their functions are in `core.losses`."""
+
+from jaxnerf.core.losses import depth_loss, distortion_loss, mse_loss, opaque_loss
+from jaxnerf.registry import Loss
+
+_MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
+_DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
+
+
+def _weight_of_depth(facts):
+    if facts.num_observations < _MIN_OBSERVATIONS:
+        return 0.0, ""
+    line = f"depth         {facts.num_observations:,} observations of sparse points guide the start of training"
+    return _DEPTH_WEIGHT, line
+
+
+MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over all renderings")
+DISTORTION = Loss(distortion_loss, help="distortion of the weights (arXiv:2111.12077, Eq. 15)")
+DEPTH = Loss(
+    depth_loss,
+    needs=("depth", "depth_weight"),
+    weight="auto",
+    infer=_weight_of_depth,
+    help="distance of the weights from the dataset's sparse points, and from depths interpolated between them (after "
+    "arXiv:2107.02791); auto: at the start of training where space is contracted and there are such points",
+)
+OPAQUE = Loss(opaque_loss, needs=("alpha",), help="squared transmittance of rays where the image is opaque")
