@@ -188,6 +188,10 @@ def round_to_8_bits(image: Num[ArrayLike, "*shape"]) -> Float[Array, "*shape"]:
         image: [...] colours.
 
     Returns:
-        [...] float.
+        [...], at least float32.
+
+    Raises:
+        ValueError: on integers, such as the bytes of an image.
     """
-    return jnp.round(jnp.clip(jnp.asarray(image), 0, 1) * 255) / 255
+    (image,) = _colors("round_to_8_bits", image=image)
+    return jnp.round(jnp.clip(image, 0, 1) * 255) / 255

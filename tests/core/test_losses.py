@@ -52,8 +52,10 @@ def double_sum(weights, t, delta, near, far, rule="segments"):
     if rule == "points":
         delta = np.minimum(delta, np.maximum(far - t, 0))
     lower = t if rule == "points" else t - delta / 2
-    if np.isinf(far):
-        s, lengths = 1 - near / t, near / np.maximum(lower, near) - near / (lower + delta)
+    if np.isinf(far):  # from near on, or from t = 1 where that is not positive
+        start = near if near > 0 else 1.0
+        s = 1 - start / np.maximum(t, start)
+        lengths = start / np.maximum(lower, start) - start / np.maximum(lower + delta, start)
     else:
         s, lengths = (t - near) / (far - near), delta / (far - near)
     pairs = weights[:, None] * weights[None] * np.abs(s[:, None] - s[None])
@@ -96,6 +98,22 @@ def test_a_peak_costs_less_the_narrower_it_is(count):
     weights[count // 3] = 1
     t, delta = np.float32((np.arange(count) + 0.5) / count), np.full(count, 1 / count, np.float32)
     np.testing.assert_allclose(compiled_distortion(weights, t, delta), 1 / (3 * count), rtol=1e-5)
+
+
+@pytest.mark.parametrize("rule", ["segments", "points"])
+@pytest.mark.parametrize("near, start", [(0.0, 1.0), (-2.0, 1.0), (1.5, 1.5)])
+def test_a_segment_is_clipped_where_disparity_begins(near, start, rule):
+    """One segment in front of the start, around it or behind it, with its sample on either side, dense and packed."""
+    for t in np.float32([0.2, 0.8, 0.999, 1.0, 1.1, 2.0]) * np.float32(start):
+        for delta in np.float32([0.3, 1.0, 1.5]) * np.float32(start):
+            given = np.float32([0.7]), t[None], delta[None]
+            want = double_sum(*given, near, np.inf, rule)
+            np.testing.assert_allclose(compiled_distortion(*given, near, np.inf, rule=rule), want, rtol=3e-6, atol=1e-7)
+            slot = {"ray_index": np.zeros(1, np.int32), "used": np.ones(1, bool), "rule": rule}
+            slot = jaxnerf.PackedSamples(**dict(zip(("weights", "t", "delta"), given, strict=True)), **slot)
+            packed = dataclasses.replace(make_rendering(*[np.zeros((1, 1), np.float32)] * 3), samples=slot)
+            got = jaxnerf.distortion_loss([packed], make_batch(np.full(1, near), np.inf))[0]
+            np.testing.assert_allclose(got, want, rtol=3e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("near, far", [FINITE_FAR, INFINITE_FAR])

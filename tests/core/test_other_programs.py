@@ -45,6 +45,12 @@ def test_metrics_refuse_integers(metric, kind):
         metric(image, image)
 
 
+def test_rounding_refuses_bytes():
+    """Clipped to [0, 1], all but 0 would be white."""
+    with pytest.raises(ValueError, match="round_to_8_bits: image has type uint8, expected floats in .*divide 8 bit"):
+        jaxnerf.round_to_8_bits(np.full((2, 2, 3), 200, np.uint8))
+
+
 @pytest.mark.parametrize("lens", [None, "opencv", "fisheye"])
 def test_a_stack_of_cameras_has_the_rays_of_each(lens):
     poses = jnp.stack([jaxnerf.look_at((x, -4.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for x in (0.0, 1.0, 2.0)])
