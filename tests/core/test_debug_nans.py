@@ -4,6 +4,7 @@ JAX then checks the result of every operation, so that a NaN in the branch of a 
 too. Someone who looks for a NaN of their own must not be stopped here.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -181,6 +182,15 @@ def undistorted(focal, center, pixels, *, lens):
     return jaxnerf.undistort(view, pixels)
 
 
+def radius_of(focal, center, pixels, *, lens):
+    view = dataclasses.replace(camera(lens), focal=focal, center=center)
+    return jaxnerf.pixel_radius(view, pixels)
+
+
+def projected(pose, places, *, lens):
+    return jaxnerf.project(dataclasses.replace(camera(lens), to_world=pose), places)
+
+
 def in_ndc(origins, directions, *, camera):
     made = jaxnerf.Rays(
         origins=origins, directions=directions, viewdirs=directions, near=origins[..., 0], far=origins[..., 0]
@@ -221,6 +231,7 @@ def cases():
         "ndc_to_t at infinity": (to_world_t, (jnp.ones(12),)),
         "ndc_rays": (functools.partial(in_ndc, camera=forward_rays()[0]), (
             forward_rays()[1].origins, forward_rays()[1].directions)),
+        "se3_exponential": (jaxnerf.se3_exponential, (jnp.stack([jnp.zeros(6), jnp.full(6, 1e-20), jnp.ones(6)]),)),
         "uniform_edges": (functools.partial(jaxnerf.uniform_edges, num_segments=4), (jnp.zeros(2), jnp.ones(2))),
         "uniform_edges disparity": (
             functools.partial(jaxnerf.uniform_edges, num_segments=4, in_disparity=True),
@@ -283,6 +294,10 @@ def cases():
             (*arguments[:3], wide, *arguments[4:]),
         )  # noqa: E501
         at = pixels.at[0, 0].set(view.center)
+        found[f"pixel_radius {lens}"] = functools.partial(radius_of, lens=lens), (view.focal, view.center, wide)
+        # In front, at the position of the camera, behind it, and far beside its axis.
+        places = jnp.array([[0.0, 0.0, 0.0], [0.1, -4.0, 0.2], [0.0, -9.0, 0.0], [1e4, -3.9, 0.0]])
+        found[f"project {lens}"] = functools.partial(projected, lens=lens), (view.to_world, places)
         found[f"undistort {lens}"] = functools.partial(undistorted, lens=lens), (view.focal, view.center, at)
     for rule in ("segments", "gauss"):
         for name, key in (("", None), (" drawn", KEY)):
