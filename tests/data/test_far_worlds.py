@@ -13,6 +13,7 @@ from jaxnerf.capture_check import report
 from jaxnerf.data.geometry.bounds import is_survey
 from jaxnerf.data.readers.base import Capture, Frame, origin_near, read_capture
 from jaxnerf.evaluation.paths.camera_path import make_path
+from jaxnerf.exporters.base import ExportSettings, relative_to
 from jaxnerf.viewer.frame_renderer import FrameCamera
 from jaxnerf.viewer.keyframes import save_path
 
@@ -45,21 +46,21 @@ WRITERS = {
 
 
 @pytest.fixture(scope="module")
-def photographs():
+def images():
     return captures.shoot(captures.orbit(6))
 
 
 @pytest.fixture(scope="module")
-def points(photographs):
-    return captures.surface_points(photographs)
+def points(images):
+    return captures.surface_points(images)
 
 
 @pytest.mark.parametrize("writer", WRITERS)
 @pytest.mark.parametrize("name", SHIFTS)
-def test_views_are_those_near_the_origin(photographs, points, tmp_path, writer, name):
+def test_views_are_those_near_the_origin(images, points, tmp_path, writer, name):
     for folder, shift in (("near", (0, 0, 0)), ("far", SHIFTS[name])):
         given = {"points": points._replace(xyz=points.xyz + shift)} if writer in ("colmap", "llff") else {}
-        WRITERS[writer](tmp_path / folder, moved(photographs, shift), **given)
+        WRITERS[writer](tmp_path / folder, moved(images, shift), **given)
     near, far = (jaxnerf.load_dataset(tmp_path / folder, split="train") for folder in ("near", "far"))
     assert near.file_origin == (0, 0, 0)
     np.testing.assert_allclose(far.file_origin, SHIFTS[name], atol=5)
@@ -77,21 +78,34 @@ def test_an_ordinary_world_stays_as_it_is():
     for distance in (0, 1, 20, 80):
         assert origin_near(rng.uniform(-1, 1, (20, 3)) + [distance, 0, 0]) is None
     assert origin_near(np.full((5, 3), 1e6)) is None  # one position: nothing says what is far
-    found = origin_near(rng.uniform(-30, 30, (20, 3)) + [512_345.6, 0, 0])
+    positions = rng.uniform(-30, 30, (20, 3)) + [512_345.6, 0, 0]
+    found = origin_near(positions)
     assert found[0] % 10 == 0 and abs(found[0] - 512_345.6) < 30 and (found[1:] % 10 == 0).all()
 
 
-def test_the_check_finds_the_same(photographs, tmp_path):
+def test_single_cameras_without_a_position_do_not_keep_a_far_origin():
+    positions = np.random.default_rng(0).uniform(-30, 30, (20, 3)) + SHIFTS["UTM"]
+    positions[[3, 7]] = 0
+    np.testing.assert_allclose(origin_near(positions), SHIFTS["UTM"], atol=30)
+
+
+def test_the_box_of_an_export_is_in_the_files_own_coordinates():
+    given = ExportSettings(box=(499_999.0, 4_999_998.0, 117.0, 500_001.0, 5_000_002.0, 123.0))
+    assert relative_to(given, SHIFTS["UTM"]).box == (-1, -2, -3, 1, 2, 3)
+    assert relative_to(ExportSettings(), SHIFTS["UTM"]).box is None
+
+
+def test_the_check_finds_the_same(images, tmp_path):
     for folder, shift in (("near", (0, 0, 0)), ("far", SHIFTS["UTM"])):
-        captures.write_transforms(tmp_path / folder, moved(photographs, shift))
+        captures.write_transforms(tmp_path / folder, moved(images, shift))
     near, far = (report.inspect(tmp_path / folder) for folder in ("near", "far"))
     assert [finding.kind for finding in far.findings] == [finding.kind for finding in near.findings]
     assert read_capture(tmp_path / "far").choices[-1].startswith("positions are relative to (5000")
 
 
-def test_camera_paths_are_in_the_files_own_coordinates(photographs, tmp_path):
+def test_camera_paths_are_in_the_files_own_coordinates(images, tmp_path):
     """A path that the viewer saves has the positions of the files in float64, and is read again without loss."""
-    captures.write_transforms(tmp_path / "far", moved(photographs, SHIFTS["UTM"]))
+    captures.write_transforms(tmp_path / "far", moved(images, SHIFTS["UTM"]))
     views = jaxnerf.load_dataset(tmp_path / "far", split="train")
     cameras = [FrameCamera(np.asarray(pose), 0.7, 32, 24) for pose in views.cameras.to_world[:2]]
     file = save_path(tmp_path, "mine", cameras, fps=10, views=views)
@@ -104,18 +118,18 @@ def test_camera_paths_are_in_the_files_own_coordinates(photographs, tmp_path):
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.05, 0.3])
-def test_blender_scenes_in_other_units_have_another_near_and_far(photographs, tmp_path, scale):
+def test_blender_scenes_in_other_units_have_another_near_and_far(images, tmp_path, scale):
     for split in ("train", "test"):
-        captures.write_blender(tmp_path, moved(photographs, (0, 0, 0), scale), split=split)
+        captures.write_blender(tmp_path, moved(images, (0, 0, 0), scale), split=split)
     views = jaxnerf.load_dataset(tmp_path, split="test")
     np.testing.assert_allclose([views.near[0], views.far[0]], scale * np.array([2, 6]), rtol=0.02)
     stated = jaxnerf.load_dataset(tmp_path, split="test", near=1.0, far=9.0)
     assert (stated.near[0], stated.far[0]) == (1, 9)
 
 
-def test_blender_scenes_of_the_paper_keep_2_and_6(photographs, tmp_path):
+def test_blender_scenes_of_the_paper_keep_2_and_6(images, tmp_path):
     for index, scale in enumerate((1.0, 0.6, 1.4)):
-        captures.write_blender(tmp_path / str(index), moved(photographs, (0, 0, 0), scale))
+        captures.write_blender(tmp_path / str(index), moved(images, (0, 0, 0), scale))
         views = jaxnerf.load_dataset(tmp_path / str(index), split="train")
         assert (views.near[0], views.far[0]) == (2, 6)
 
