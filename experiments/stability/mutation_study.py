@@ -51,6 +51,7 @@ TESTS = {
     "varying": "core/occupancy/test_special_values",
     "sampling": "core/test_sampling core/test_stepped_edges",
     "cameras": "core/test_cameras core/test_lens_and_ndc",
+    "views": "data/test_views",
     "volume_rendering": "core/test_volume_rendering core/test_quadrature core/occupancy/test_packed",
     "rendering": "core/test_rendering core/test_quadrature core/occupancy/test_special_values",
     "contraction": "core/test_contraction",

@@ -78,7 +78,7 @@ class Views:
 
 def _check_index(views, index):
     """Raises an IndexError on the index of no view; JAX would return the last one."""
-    count = len(views.offset)
+    count = len(views.near)
     if not isinstance(index, jax.core.Tracer) and not -count <= int(index) < count:
         raise IndexError(f"Views: the index is {index}, expected one of 0 to {count - 1}, as there are {count} views")
 

@@ -5,7 +5,7 @@ import os
 import pathlib
 import secrets
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +28,8 @@ class ExportSettings(NamedTuple):
     Attributes:
         resolution: voxels along the longest side of the box.
         box: [6] the lower and the upper corner of what is exported, in units of the dataset's files; None: all of a
-            bounded scene, and of an unbounded one what is between the cameras.
+            bounded scene, and of an unbounded one what is between the cameras. An exporter receives it relative to
+            `Views.file_origin`.
         size: px, the longer side of the depth images that are rendered; None: it follows the resolution.
         num_views: the largest number of training views whose poses are rendered, spread evenly over all.
         num_points: the largest number of points or Gaussians.
@@ -124,14 +125,22 @@ def export_run(
     partial.mkdir()
     try:
         with atomic_files.naming(partial):
-            export(ExportSource(run, step, variables, views, settings, say), partial)
             if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
                 say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
+            export(ExportSource(run, step, variables, views, relative_to(settings, views.file_origin), say), partial)
+            if any(views.file_origin):
                 (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
         _move(partial, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return target
+
+
+def relative_to(settings: ExportSettings, origin: Sequence[float]) -> ExportSettings:
+    """Returns settings whose box is relative to an origin, as positions in an export are; see `Views.file_origin`."""
+    if settings.box is None:
+        return settings
+    return settings._replace(box=tuple((np.float64(settings.box).reshape(2, 3) - origin).reshape(-1).tolist()))
 
 
 def check_memory(needed: float, available: float | None, remedy: str) -> None:

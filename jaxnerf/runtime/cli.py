@@ -228,6 +228,7 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         return rest
     except flags.UnrecognizedFlagError as error:
         hint = "; give --config=NAME, which has such fields" if error.flagname.startswith("config.") else ""
+        hint = hint or _option_hint(error.flagname)
         _leave(2, f"{error}{hint}")
     except (AttributeError, KeyError) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -245,6 +246,14 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         NameError,
     ) as error:
         _leave(2, error)
+
+
+def _option_hint(name):
+    """Returns which options of the config have the name of an unknown flag, as the end of a message; "" for none."""
+    if "config" not in flags.FLAGS:
+        return ""
+    found = [flag for flag in flags.FLAGS if flag.startswith("config.") and flag.rpartition(".")[2] == name]
+    return f"; did you mean {' or '.join(f'--{flag}' for flag in sorted(found))}?" if found else ""
 
 
 def _unquoted(error):

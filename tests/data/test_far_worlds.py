@@ -13,6 +13,7 @@ from jaxnerf.capture_check import report
 from jaxnerf.data.geometry.bounds import is_survey
 from jaxnerf.data.readers.base import Capture, Frame, origin_near, read_capture
 from jaxnerf.evaluation.paths.camera_path import make_path
+from jaxnerf.exporters.base import ExportSettings, relative_to
 from jaxnerf.viewer.frame_renderer import FrameCamera
 from jaxnerf.viewer.keyframes import save_path
 
@@ -77,8 +78,21 @@ def test_an_ordinary_world_stays_as_it_is():
     for distance in (0, 1, 20, 80):
         assert origin_near(rng.uniform(-1, 1, (20, 3)) + [distance, 0, 0]) is None
     assert origin_near(np.full((5, 3), 1e6)) is None  # one position: nothing says what is far
-    found = origin_near(rng.uniform(-30, 30, (20, 3)) + [512_345.6, 0, 0])
+    positions = rng.uniform(-30, 30, (20, 3)) + [512_345.6, 0, 0]
+    found = origin_near(positions)
     assert found[0] % 10 == 0 and abs(found[0] - 512_345.6) < 30 and (found[1:] % 10 == 0).all()
+
+
+def test_single_cameras_without_a_position_do_not_keep_a_far_origin():
+    positions = np.random.default_rng(0).uniform(-30, 30, (20, 3)) + SHIFTS["UTM"]
+    positions[[3, 7]] = 0
+    np.testing.assert_allclose(origin_near(positions), SHIFTS["UTM"], atol=30)
+
+
+def test_the_box_of_an_export_is_in_the_files_own_coordinates():
+    given = ExportSettings(box=(499_999.0, 4_999_998.0, 117.0, 500_001.0, 5_000_002.0, 123.0))
+    assert relative_to(given, SHIFTS["UTM"]).box == (-1, -2, -3, 1, 2, 3)
+    assert relative_to(ExportSettings(), SHIFTS["UTM"]).box is None
 
 
 def test_the_check_finds_the_same(images, tmp_path):

@@ -130,11 +130,12 @@ def read_capture(folder: str | os.PathLike, format: str = "auto") -> Capture:
 def origin_near(positions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"] | None:
     """Returns a round point near cameras at positions, or None if these are near 0.
 
-    They are far if their distance from 0 is more than 100 times how far they are apart. The point depends only on the
-    positions, so all splits of a dataset have one origin if it is computed from the training views.
+    They are far if their distance from 0 is more than 100 times how far they are apart, in the median, so that single
+    cameras without a position, at 0, do not count. The point depends only on the positions, so all splits of a
+    dataset have one origin if it is computed from the training views.
     """
     middle = np.median(positions, axis=0)
-    spread, distance = np.linalg.norm(positions - middle, axis=1).max(), np.linalg.norm(middle)
+    spread, distance = np.median(np.linalg.norm(positions - middle, axis=1)), np.linalg.norm(middle)
     if not distance > _FAR_AWAY * spread > 0:
         return None
     unit = 10.0 ** math.floor(math.log10(spread))
