@@ -252,8 +252,11 @@ def _option_hint(name):
     """Returns which options of the config have the name of an unknown flag, as the end of a message; "" for none."""
     if "config" not in flags.FLAGS:
         return ""
-    found = [flag for flag in flags.FLAGS if flag.startswith("config.") and flag.rpartition(".")[2] == name]
-    return f"; did you mean {' or '.join(f'--{flag}' for flag in sorted(found))}?" if found else ""
+    config = importlib.import_module("jaxnerf.configs.default").get_config()  # has all options
+    sections = {section: list(part) for section, part in config.items() if hasattr(part, "keys")}
+    found = [f"--config.{section}.{name}" for section, names in sections.items() if name in names]
+    found += [f"--config.{name}"] if name in config else []
+    return f"; did you mean {' or '.join(found)}?" if found else ""
 
 
 def _unquoted(error):

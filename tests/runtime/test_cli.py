@@ -205,3 +205,17 @@ def test_a_signal_after_the_end_prints_nothing(tmp_path):
     )
     done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "")
+
+
+@pytest.mark.parametrize(
+    "name, hint",
+    [
+        ("max_steps", "; did you mean --config.train.max_steps?"),
+        ("field", "; did you mean --config.field?"),
+        ("chunk", "; did you mean --config.eval.chunk?"),
+        ("nothing", ""),
+    ],
+)
+def test_an_option_without_its_section_gets_a_hint(monkeypatch, name, hint):
+    monkeypatch.setattr(cli.flags, "FLAGS", {"config": None})
+    assert cli._option_hint(name) == hint
