@@ -100,7 +100,7 @@ def inspect(
         for note in whole.notes
     ]
     path, line = _path(whole)
-    facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence)
+    facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence, images)
     facts += [("near, far", _range(bounds, stated, depth)), ("path", line)]
     order = sorted(findings, key=lambda finding: finding.severity != "error")
     return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path)
@@ -138,15 +138,16 @@ def _image_facts(capture, available, images):
     ]
 
 
-def _camera_facts(capture, evidence):
+def _camera_facts(capture, evidence, images):
     stack = [frame.camera for frame in capture.frames]
     first, poses = stack[0], evidence.poses
     focal = np.array([camera.focal for camera in stack]).mean(axis=0)
     size = np.array([first.width or 2 * first.center[0], first.height or 2 * first.center[1]])
     angle = 2 * np.degrees(np.arctan(0.5 * size / focal))
-    off = np.asarray(first.center) - size / 2
+    scale, stated = _scale_to_files(capture, images)
+    off = scale * (np.asarray(first.center) - size / 2)
     lenses = _counted(Counter(camera.lens for camera in stack))
-    each = sorted({float(np.mean(camera.focal)) for camera in stack})
+    each = sorted({scale * float(np.mean(camera.focal)) for camera in stack})
     if len(each) > 1:
         lenses += f"; {len(each)} different cameras, with focal lengths of {each[0]:.5g} to {each[-1]:.5g} px"
     middle = gaze_center(poses)
@@ -159,8 +160,9 @@ def _camera_facts(capture, evidence):
     return [
         (
             "lens",
-            f"focal length {focal[0]:.5g}, {focal[1]:.5g} px; field of view {angle[0]:.1f} x {angle[1]:.1f} degrees; "
-            f"principal point {off[0]:+.1f}, {off[1]:+.1f} px from the image's centre; {lenses}",
+            f"focal length {scale * focal[0]:.5g}, {scale * focal[1]:.5g} px{stated}; field of view "
+            f"{angle[0]:.1f} x {angle[1]:.1f} degrees; principal point {off[0]:+.1f}, {off[1]:+.1f} px from the "
+            f"image's centre; {lenses}",
         ),
         ("poses", f"{handed}; {_up_axis(poses)}"),
         (
@@ -179,6 +181,16 @@ def _camera_facts(capture, evidence):
             f"{percent(evidence.fraction)} fit the cameras within {tracks.INLIER:.0f} px",
         ),
     ]
+
+
+def _scale_to_files(capture, images):
+    """Returns the size of the files over that which their cameras state, and a remark if it is not 1."""
+    for frame, image in zip(capture.frames, images, strict=True):
+        height, width = frame.camera.height, frame.camera.width
+        if image and height and width:
+            scale = max(image.size) / max(height, width)  # an image may be stored sideways
+            return scale, "" if scale == 1 else f" (of the cameras' {width} x {height} px: {1 / scale:.4g} times that)"
+    return 1.0, ""
 
 
 def _range(bounds, stated, depth):

@@ -291,11 +291,12 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
     psnr = [value for name, value in row.items() if name.startswith("psnr_")][-1]  # of the final rendering
     return (
         f"{psnr:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
-        f"{_minutes(row['seconds'])} elapsed, {_minutes(0.0 if out_of_time else left)} left{notes}"
+        f"{minutes(row['seconds'])} elapsed, {minutes(0.0 if out_of_time else left)} left{notes}"
     )
 
 
-def _minutes(seconds):
+def minutes(seconds: float) -> str:
+    """Returns a duration as minutes and seconds, such as 1:05."""
     minutes, seconds = divmod(int(seconds), 60)
     return f"{minutes}:{seconds:02d}"
 

@@ -145,6 +145,23 @@ def test_a_wrong_focal_length_is_found_and_estimated(folders, tmp_path, factor):
     assert float(finding.expected.removeprefix("about ")) == pytest.approx(1.2 * SIZE, rel=0.03)
 
 
+def test_the_focal_length_is_that_of_the_files(folders, tmp_path):
+    """Files of half the size that their cameras state have half the focal length."""
+
+    def shrink(folder):
+        for path in (folder / "images").iterdir():
+            with Image.open(path) as image:
+                half = image.resize((SIZE // 2, SIZE // 2))
+            path.unlink()  # a link
+            half.save(path)
+
+    lens = dict(planted(folders, tmp_path, "colmap", shrink).facts)["lens"]
+    assert lens.startswith(f"focal length {0.6 * SIZE:.5g}, {0.6 * SIZE:.5g} px (of the cameras' 160 x 160 px: 2 times")
+    whole = dict(inspect(folders / "colmap").facts)["lens"]
+    assert whole.startswith(f"focal length {1.2 * SIZE:.5g}, {1.2 * SIZE:.5g} px; field of view")
+    assert lens.split("; ")[1] == whole.split("; ")[1]
+
+
 def test_two_swapped_images_are_named(folders, tmp_path):
     def swap(folder):
         planting.swap(folder / "images" / "003.png", folder / "images" / "008.png")

@@ -73,6 +73,13 @@ def test_frames_show_the_model_and_its_depth_through_the_lens_of_the_path_file(r
     assert (np.diff(shades.ravel()[np.argsort(depth.ravel())].astype(int)) <= 0).all(), "near is bright"
 
 
+def test_the_time_left_is_estimated_after_the_first_frame(run, path_file, capsys):
+    render_path(run, path=str(path_file), name="timed", kind="none", settings={"chunk": 100})
+    first, second = (line for line in capsys.readouterr().err.splitlines() if "frames of" in line)
+    assert first.startswith("1/2") and " left" not in first
+    assert second.startswith("2/2") and second.endswith("timed-20, 0:00 left")
+
+
 def test_rgba_over_the_background_is_the_color(rendered):
     color = iio.imread(rendered[0] / "color" / "0000.png") / 255
     rgba = iio.imread(rendered[0] / "rgba" / "0000.png") / 255
@@ -110,6 +117,7 @@ def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch,
         assert (folder / name).stat().st_mtime_ns == before[folder / name]
     render_path(run, **options)
     assert len(calls) == 1, "all frames exist"
+    assert " left" not in capsys.readouterr().err, "one frame compiles, so it says nothing about others"
     os.truncate(folder / "depth" / "0001.tiff", 40)
     render_path(run, **options)
     assert len(calls) == 2 and f"{folder / 'depth' / '0001.tiff'}: is damaged" in capsys.readouterr().err

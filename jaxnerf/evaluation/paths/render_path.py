@@ -6,6 +6,7 @@ import importlib.util
 import os
 import pathlib
 import sys
+import time
 import warnings
 from collections.abc import Iterable
 from typing import Any
@@ -20,7 +21,7 @@ from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import newest_step, refined_views, render_settings, restore_run
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.training.metric_log import Progress
+from jaxnerf.training.metric_log import Progress, minutes
 
 VIDEO_KINDS = ("auto", "mp4", "gif", "none")
 
@@ -119,6 +120,7 @@ def _write_frames(target, run, variables, views, path, *, rgba, shard):
     if todo:
         render = functools.partial(run.render_image, variables)
         posed, progress = camera_path.posed_views(views, path), Progress(len(frames))
+        compiled = None
         for done, index in enumerate(todo, len(frames) - len(todo) + 1):
             pixels = camera_path.path_pixels(posed, path, index, offset=run.experiment.config.data.pixel_offset)
             rays = run.experiment.view_rays(posed, index, pixels)
@@ -129,7 +131,11 @@ def _write_frames(target, run, variables, views, path, *, rgba, shard):
                 planes.append(output_images.straight_alpha(image.rgb, image.opacity, run.experiment.background))
             for file, plane in zip(files[index], planes, strict=True):
                 output_images.write_image(file, plane)
-            progress.show(done, f"frames of {target}")
+            compiled, left = compiled or (time.monotonic(), done), ""
+            if done > compiled[1]:  # the first frame takes longer
+                seconds = (time.monotonic() - compiled[0]) / (done - compiled[1])
+                left = f", {minutes(seconds * (len(frames) - done))} left"
+            progress.show(done, f"frames of {target}{left}")
         progress.close()
     if not missing():
         _write_depth_images([group[0] for group in files])
