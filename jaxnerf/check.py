@@ -15,6 +15,12 @@ _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder.", requi
 _FORMAT = flags.DEFINE_string("format", "auto", "The dataset's format, or auto, which selects the one training uses.")
 _NEAR = flags.DEFINE_float("near", None, "The t at which rays will begin. When it is not given, training's default.")
 _FAR = flags.DEFINE_float("far", None, "The t at which rays will end. When it is not given, training's default.")
+_UP = flags.DEFINE_enum(
+    "up",
+    None,
+    ["+x", "-x", "+y", "-y", "+z", "-z"],
+    "The axis of the dataset's files that is up. When it is not given, up follows from how the cameras are held.",
+)
 _OUT = flags.DEFINE_string(
     "out", None, "The PNG with the cameras and points. When it is not given, check-FOLDER.png is written here."
 )
@@ -45,7 +51,7 @@ def main(argv):
         camera_plot, plot = None, f"none: matplotlib is unavailable ({error}); install it with `pip install matplotlib`"
     else:
         plot = _plot_path(folder, camera_plot.is_plot_of)
-    report = inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value)
+    report = inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value, up=_UP.value)
     print(report.text())
     if camera_plot:
         camera_plot.save(camera_plot.plot_cameras(report), plot, folder)

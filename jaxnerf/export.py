@@ -34,6 +34,13 @@ _SIZE = flags.DEFINE_integer(
 _NUM_VIEWS = flags.DEFINE_integer("num_views", 100, "The largest number of training views to render.")
 _NUM_POINTS = flags.DEFINE_integer("num_points", 200_000, "points, splats: the largest number of points or Gaussians.")
 _FORMAT = flags.DEFINE_string("format", "ply", "mesh: ply, glb or obj.")
+_UP = flags.DEFINE_enum(
+    "up",
+    None,
+    ["+x", "-x", "+y", "-y", "+z", "-z"],
+    "mesh: the axis of the dataset's files that is up in a glb. When it is not given, up follows from how the cameras "
+    "are held.",
+)
 _MAX_FACES = flags.DEFINE_integer(
     "max_faces", 0, "mesh: the number of triangles to which it is decimated; 0: it is not."
 )
@@ -56,7 +63,7 @@ def main(argv):
     from jaxnerf.exporters.base import ExportSettings, export_run
 
     names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
-    names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED}
+    names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED, "up": _UP}
     try:
         box = None if _BOX.value is None else tuple(map(float, _BOX.value))
     except ValueError:

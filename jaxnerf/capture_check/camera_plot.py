@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from jaxnerf.capture_check.report import Report
 from jaxnerf.core.types import Camera
-from jaxnerf.data.geometry.poses import up_of
 from jaxnerf.data.images.image_files import open_image
 from jaxnerf.runtime.atomic_files import partial_file
 
@@ -37,7 +36,7 @@ def plot_cameras(report: Report) -> Figure:
     points = points[:: max(1, len(points) // 6000)]
     colors = [FLAGGED if index in flagged else CAMERA for index in range(len(poses))]
     figure = Figure(figsize=(13, 6.7), dpi=100, layout="constrained")
-    right, deep, up = _axes(poses)
+    right, deep, up = _axes(report.up)
     for plot, vertical, title in zip(figure.subplots(1, 2), (deep, up), ("from above", "from a side"), strict=True):
         view = np.stack([right, vertical], axis=-1)
         plot.scatter(*(points @ view).T, s=2, color=POINT, linewidths=0)
@@ -71,9 +70,8 @@ def is_plot_of(path: str | os.PathLike, folder: str | os.PathLike) -> bool:
     return found == (_SOFTWARE, str(pathlib.Path(folder).resolve()))
 
 
-def _axes(poses: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the signed world axes that point right, away and up in the plots, as rows."""
-    mean = up_of(poses)
+def _axes(mean: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Returns the signed world axes that point right, away and up in the plots, as rows; near an up direction."""
     up = int(np.abs(mean).argmax())
     right, deep, up = np.roll(np.eye(3), -1 - up, axis=0)
     sign = -1.0 if mean @ up < 0 else 1.0

@@ -13,12 +13,13 @@ from jaxnerf.capture_check.findings import Finding, percent
 from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.path_poses import coverage
-from jaxnerf.data.geometry.poses import gaze_center, sideways, up_of
+from jaxnerf.data.geometry.poses import axis_of, gaze_center, sideways, up_of
 from jaxnerf.data.geometry.world import looks_forward, poses_of
 from jaxnerf.data.images.load_images import split_indices
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 
+_LOOKS_UP = 5.0  # degrees in the mean, above which images may be upside down; -34 to 0 in lego, mic, fox, fern, can
 _TILTED = 15.0  # degrees, in the median, by which images of a capture with a known up are not level
 _MAX_IMAGES = 500  # that are read, at a fifth of a second each on two cores
 
@@ -33,6 +34,7 @@ class Report(NamedTuple):
         poses: [V, 3, 4], corrected where the axes are wrong.
         points: [N, 3], on which the images agree.
         path: [M, 3, 4], the poses that jaxnerf-render selects; None: the cameras define no path.
+        up: [3] unit vector, given or else as the cameras are held.
     """
 
     capture: Capture
@@ -40,7 +42,8 @@ class Report(NamedTuple):
     findings: tuple[Finding, ...]
     poses: Float[np.ndarray, "V 3 4"]
     points: Float[np.ndarray, "N 3"]
-    path: Float[np.ndarray, "M 3 4"] | None = None
+    path: Float[np.ndarray, "M 3 4"] | None
+    up: Float[np.ndarray, "3"]
 
     @property
     def num_errors(self) -> int:
@@ -58,18 +61,25 @@ class Report(NamedTuple):
 
 
 def inspect(
-    folder: str | os.PathLike, *, format: str = "auto", near: float | None = None, far: float | None = None
+    folder: str | os.PathLike,
+    *,
+    format: str = "auto",
+    near: float | None = None,
+    far: float | None = None,
+    up: str | None = None,
 ) -> Report:
     """Checks the dataset in a folder.
 
     Args:
         folder, format: see `read_capture`.
         near, far: as training will use them, in t; None: training's defaults, or what the dataset states.
+        up: the axis of the dataset's files that is up, such as "+z"; None: as the cameras are held.
 
     Raises:
         ValueError: if the cameras cannot be read; names the file, what was found, what is expected and what
             to do.
     """
+    given = None if up is None else axis_of(up)
     available = base.detect_formats(folder)
     whole = base.read_capture(folder, format)
     capture = subset(whole)
@@ -99,11 +109,12 @@ def inspect(
         Finding("warning", "skipped", note, "nothing skipped", "the files named, if this is not intended")
         for note in whole.notes
     ]
-    path, line = _path(whole)
-    facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence, images)
+    path, line = _path(whole, given)
+    facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence, images, given)
     facts += [("near, far", _range(bounds, stated, depth)), ("path", line)]
     order = sorted(findings, key=lambda finding: finding.severity != "error")
-    return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path)
+    direction = up_of(evidence.poses) if given is None else given
+    return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path, direction)
 
 
 def _judge_splits(capture):
@@ -138,7 +149,7 @@ def _image_facts(capture, available, images):
     ]
 
 
-def _camera_facts(capture, evidence, images):
+def _camera_facts(capture, evidence, images, up):
     stack = [frame.camera for frame in capture.frames]
     first, poses = stack[0], evidence.poses
     focal = np.array([camera.focal for camera in stack]).mean(axis=0)
@@ -152,7 +163,7 @@ def _camera_facts(capture, evidence, images):
         lenses += f"; {len(each)} different cameras, with focal lengths of {each[0]:.5g} to {each[-1]:.5g} px"
     middle = gaze_center(poses)
     distance = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
-    cover = coverage(poses)
+    cover = coverage(poses, up)
     low, high = cover.elevation.min(), cover.elevation.max()
     shown = evidence.tracks.shown
     seen = shown.sum() / max(len(shown), 1)
@@ -164,7 +175,7 @@ def _camera_facts(capture, evidence, images):
             f"{angle[0]:.1f} x {angle[1]:.1f} degrees; principal point {off[0]:+.1f}, {off[1]:+.1f} px from the "
             f"image's centre; {lenses}",
         ),
-        ("poses", f"{handed}; {_up_axis(poses)}"),
+        ("poses", f"{handed}; {_up_axis(poses, up)}"),
         (
             "direction",
             f"{_view_direction(capture)}; {distance.min():.4g} to {distance.max():.4g} from "
@@ -217,8 +228,10 @@ def _view_direction(capture):
     return "inwards" if inwards > 0.9 else "outwards" if inwards < 0.1 else "along a path"
 
 
-def _up_axis(poses):
+def _up_axis(poses, given):
     """Returns how up was found: the world axis nearest to it, by which jaxnerf-render turns its paths."""
+    if given is not None:
+        return f"up is {'-' if given.sum() < 0 else '+'}{'xyz'[int(np.abs(given).argmax())]}, as --up gives it"
     up, turned = up_of(poses), sideways(poses)
     axis = int(np.abs(up).argmax())
     angle = np.degrees(np.arccos(np.clip(abs(up[axis]), 0, 1)))
@@ -228,11 +241,15 @@ def _up_axis(poses):
     if turned.any():
         line += f"; {turned.sum()} of {len(poses)} images are stored sideways"
     if tilt > _TILTED:
-        line += f", not sure: the images are tilted by {tilt:.0f} degrees in the median; jaxnerf-render --up sets it"
+        line += f", not sure: the images are tilted by {tilt:.0f} degrees in the median; --up sets it"
+    looks_up = np.degrees(np.arcsin(np.clip(-(poses[:, :, 2] @ up).mean(), -1, 1)))
+    if looks_up > _LOOKS_UP:
+        line += f", not sure: the cameras look up by {looks_up:.0f} degrees in the mean, as they seem to if the images "
+        line += "are stored upside down; --up sets it"
     return line
 
 
-def _path(capture):
+def _path(capture, up):
     """Returns the poses of the path that jaxnerf-render selects by the views of the split "train", and a line."""
     frames = [capture.frames[index] for index in split_indices(capture, "train")]
     poses = np.stack([frame.camera.to_world for frame in frames])
@@ -242,5 +259,5 @@ def _path(capture):
         return None, str(error)
     line = f"jaxnerf-render selects {kind}, as {reason}"
     if kind != "interpolate":
-        return path_poses.make_poses(kind, poses), line
+        return path_poses.make_poses(kind, poses, up=up), line
     return path_poses.poses_through(poses[path_poses.natural_order([frame.name for frame in frames])])[0], line

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxnerf.core.views import Views
+from jaxnerf.data.geometry.poses import axis_of
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
 from jaxnerf.registry import EXPORTERS
 from jaxnerf.runtime import atomic_files
@@ -34,6 +35,7 @@ class ExportSettings(NamedTuple):
         num_views: the largest number of training views whose poses are rendered, spread evenly over all.
         num_points: the largest number of points or Gaussians.
         format: of a mesh, "ply", "glb" or "obj".
+        up: the axis of the dataset's files that is up in a GLB, such as "+z"; None: as the cameras are held.
         closed: whether a mesh has no holes: where no training view looks, it has the surfaces of the field, which was
             not trained there, and what nothing shows to be free is solid.
         max_faces: the number of triangles to which a mesh is decimated; 0: it is not.
@@ -46,6 +48,7 @@ class ExportSettings(NamedTuple):
     num_views: int = 100
     num_points: int = 200_000
     format: str = "ply"
+    up: str | None = None
     closed: bool = False
     max_faces: int = 0
     min_piece: float = 0.005
@@ -160,6 +163,8 @@ def _check_settings(settings):
             raise ValueError(f"{field} is {value}, expected {least} to {most:,}; correct --{field}")
     if settings.format not in FORMATS:
         raise ValueError(f"format is {settings.format!r}, expected one of {', '.join(FORMATS)}; correct --format")
+    if settings.up is not None:
+        axis_of(settings.up)
     box = settings.box
     if box is not None and not (len(box) == 6 and np.isfinite(box).all() and (np.subtract(box[3:], box[:3]) > 0).all()):
         found = ", ".join(map(str, box))

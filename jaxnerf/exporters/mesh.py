@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from skimage import measure
 
 from jaxnerf.core.cameras import project
-from jaxnerf.data.geometry.poses import up_of
+from jaxnerf.data.geometry.poses import axis_of, up_of
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.exporters.base import ExportSource, check_memory
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
@@ -57,7 +57,7 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     with atomic_files.naming(path):
         if settings.format == "glb":
             poses = poses_in_file(np.asarray(source.views.cameras.to_world), source.views.to_file)
-            write_glb(mesh, path, up=up_of(poses))
+            write_glb(mesh, path, up=axis_of(settings.up) if settings.up else up_of(poses))
         else:
             mesh.export(path)
     sides = " x ".join(f"{side:.4g}" for side in mesh.extents)

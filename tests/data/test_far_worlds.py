@@ -6,10 +6,13 @@ import pathlib
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import captures
 import jaxnerf
 from jaxnerf.capture_check import report
+from jaxnerf.core.cameras import project
+from jaxnerf.data import dataset
 from jaxnerf.data.geometry.bounds import is_survey
 from jaxnerf.data.readers.base import Capture, Frame, origin_near, read_capture
 from jaxnerf.evaluation.paths.camera_path import make_path
@@ -149,7 +152,9 @@ def test_cameras_that_look_outwards_keep_2_and_6(tmp_path):
     "apart, near, far, survey",
     [
         (30.0, 20.0, 24.0, True),  # a flight over ground, 7 x 7 images
+        (30.0, 12.0, 28.0, True),  # the same over hills, with the margins of bounds from points
         (30.0, 20.0, 90.0, False),  # deep
+        (10.0, 20.0, 70.0, False),  # deep beside how far the cameras are apart
         (4.0, 20.0, 24.0, False),  # from nearly one place, as in LLFF's scenes
     ],
 )
@@ -160,3 +165,41 @@ def test_cameras_far_apart_over_a_thin_layer_are_a_survey(apart, near, far, surv
         camera = jaxnerf.Camera(to_world=pose, focal=np.full(2, 20.0), center=np.full(2, 10.0), height=20, width=20)
         frames.append(Frame(f"{len(frames)}", pathlib.Path("a.png"), camera, bounds=(near, far)))
     assert is_survey(Capture("colmap", pathlib.Path("a"), tuple(frames))) == survey
+
+
+def flight(relief, *, apart=30.0, height=20.0, size=24):
+    """Returns the Shots of 7 x 7 cameras that look down on hills, tilted by about a degree, and points of these."""
+    rng = np.random.default_rng(0)
+    places = np.stack(np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 7)]), axis=-1).reshape(-1, 2) * apart
+    turns = Rotation.from_euler("xyz", rng.normal(0, 0.02, (len(places), 3))).as_matrix()
+    poses = np.concatenate([turns, np.column_stack([places, np.full(len(places), height)])[:, :, None]], axis=-1)
+    stack = jaxnerf.Camera(
+        to_world=np.float32(poses),
+        focal=np.full((len(places), 2), 1.2 * size, np.float32),
+        center=np.full((len(places), 2), size / 2, np.float32),
+        height=size,
+        width=size,
+    )
+    shots = captures.noise(stack)
+    ground = rng.uniform(-0.8 * apart, 0.8 * apart, (3000, 2))
+    xyz = np.column_stack([ground, relief / 2 * np.sin(ground / 4).sum(axis=1) / 2])
+    at, depth = map(np.float64, zip(*(project(shot.camera, np.float32(xyz)) for shot in shots), strict=True))
+    seen = (depth > 0) & (at > 0).all(axis=-1) & (at < size).all(axis=-1)
+    return shots, captures.Points(xyz, np.full(xyz.shape, 128, np.uint8), seen, at, depth)
+
+
+@pytest.mark.parametrize("writer", ["colmap", "llff"])
+@pytest.mark.parametrize("relief, shift", [(0.5, (0, 0, 0)), (8.0, (0, 0, 0)), (8.0, SHIFTS["UTM"])])
+def test_a_flight_over_hills_is_trained_around(tmp_path, writer, relief, shift):
+    shots, points = flight(relief)
+    WRITERS[writer](tmp_path, moved(shots, shift), points=points._replace(xyz=points.xyz + shift))
+    data, lines = dataset.resolve(dataset.DataOptions(format="auto", dir=str(tmp_path), world="auto", ndc="auto"))
+    assert (data.world, data.ndc) == ("around", False)
+    assert any("a layer that is thin" in line for line in lines)
+    forward, _ = dataset.resolve(dataset.replaced(data, world="auto", ndc=True))
+    assert forward.world == "forward"  # what is asked for stays
+
+
+@pytest.mark.scenes
+def test_fern_is_no_survey(scenes_dir):
+    assert not is_survey(read_capture(scenes_dir / "fern"))

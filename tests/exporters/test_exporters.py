@@ -117,6 +117,18 @@ def test_a_glb_has_linear_colors_and_normals_and_stands_on_its_feet(tmp_path):
     assert len(trimesh.load(tmp_path / "mesh.glb", force="mesh").faces) > 5000
 
 
+def test_a_glb_has_the_up_that_is_given(tmp_path):
+    vertices = []
+    for name, up in (("plus", "+z"), ("minus", "-z")):
+        (tmp_path / name).mkdir()
+        export_mesh(source_of(format="glb", up=up), tmp_path / name)
+        vertices.append(trimesh.load(tmp_path / name / "mesh.glb", force="mesh").vertices)
+    assert vertices[0][:, 1].mean() == pytest.approx(CENTER[2], abs=0.05)
+    assert vertices[1][:, 1].mean() == pytest.approx(-CENTER[2], abs=0.05)
+    with pytest.raises(ValueError, match="up is 'z', expected one of .*; correct --up"):
+        base._check_settings(ExportSettings(up="z"))
+
+
 def test_a_mesh_is_decimated_on_request(tmp_path):
     export_mesh(source_of(max_faces=500), tmp_path)
     mesh = trimesh.load(tmp_path / "mesh.ply")

@@ -43,12 +43,14 @@ def is_survey(capture: Capture) -> bool:
 
     NDC spread depths between near and infinity, and suit scenes that are deep beside how far their cameras are apart.
     In a survey the farthest matter is less than twice as far as the nearest, and the cameras are farther apart than
-    half of that distance.
+    half of that distance; or less than four times, if the cameras are farther apart than all of it: bounds from points
+    have margins, which alone make far 1.6 times near. Without points or stated bounds nothing is known of depths, and
+    a dataset is no survey.
     """
-    ranges = np.median([frame.bounds for frame in with_bounds(capture).frames], axis=0)
+    near, far = np.median([frame.bounds for frame in with_bounds(capture).frames], axis=0)
     positions = poses_of(capture)[:, :, 3]
     apart = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max() * 2
-    return bool(0 < ranges[1] < 2 * ranges[0] and apart > ranges[0] / 2)
+    return bool(0 < far < (4 if apart > near else 2) * near and apart > near / 2)
 
 
 def blender_range(poses: Float[np.ndarray, "V 3 4"]) -> tuple[float, float]:

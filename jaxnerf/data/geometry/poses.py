@@ -6,6 +6,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _ROUNDED = 2e-3  # a matrix of three decimals is off by at most 2 sqrt(3) 0.0005; one scaled by 1.001 by 0.002
 
 
@@ -68,6 +69,17 @@ def gaze_center(to_world: Float[Array | np.ndarray, "V 3 4"]) -> Float[np.ndarra
     eyes, axes = poses[:, :, 3], poses[:, :, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projections onto the planes normal to the axes
     return np.linalg.lstsq(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0], rcond=None)[0]
+
+
+def axis_of(name: str) -> Float[np.ndarray, "3"]:
+    """Returns the unit vector of one of the AXES, which a user gives as up.
+
+    Raises:
+        ValueError: if it is none of them.
+    """
+    if name not in AXES:
+        raise ValueError(f"up is {name!r}, expected one of {', '.join(AXES)}; correct --up")
+    return (1 if name[0] == "+" else -1) * np.eye(3)["xyz".index(name[1])]
 
 
 def up_of(poses: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, "3"]:

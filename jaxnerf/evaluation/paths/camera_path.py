@@ -13,13 +13,12 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Camera
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import path_poses
-from jaxnerf.data.geometry.poses import check_pose
+from jaxnerf.data.geometry.poses import axis_of, check_pose
 from jaxnerf.data.geometry.world import poses_in_file, poses_in_run
 from jaxnerf.data.readers.validation import is_number, read_json
 from jaxnerf.runtime.atomic_files import read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
 
-AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
 _MAX_FRAMES, _MAX_PIXELS = 100_000, 16_384
 _FPS = {"above": 0.01, "below": 1000}
@@ -169,10 +168,7 @@ def _direction(up, views):
     """Returns the unit vector of an axis of the dataset's files, "+x" to "-z", in the run's world; None of None."""
     if up is None:
         return None
-    if up not in AXES:
-        raise ValueError(f"up is {up!r}, expected one of {', '.join(AXES)}; correct --up")
-    axis = (1 if up[0] == "+" else -1) * np.eye(3)["xyz".index(up[1])]
-    return axis @ poses_in_file(np.eye(3, 4)[None], views.to_file)[0, :, :3]
+    return axis_of(up) @ poses_in_file(np.eye(3, 4)[None], views.to_file)[0, :, :3]
 
 
 def _relative(poses, origin):

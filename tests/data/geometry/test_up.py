@@ -8,7 +8,9 @@ import pytest
 import captures
 from jaxnerf import load_dataset
 from jaxnerf.capture_check import report
+from jaxnerf.data.geometry import world
 from jaxnerf.data.geometry.poses import sideways, up_of
+from jaxnerf.data.readers.base import read_capture
 from jaxnerf.data.synthetic import load_synthetic
 from jaxnerf.evaluation.paths.camera_path import make_path
 
@@ -88,6 +90,39 @@ def test_the_check_says_that_images_are_stored_sideways(tmp_path):
     captures.write_transforms(tmp_path, turned)
     facts = dict(report.inspect(tmp_path).facts)
     assert "8 of 8 images are stored sideways" in facts["poses"]
+
+
+def test_mixtures_with_images_upside_down_have_the_same_up():
+    for turns in ([0, 2] * 30, [0, 1, 2, 3] * 15, [2] * 25 + [0] * 35):
+        assert angle(stored(held(0), turns)) < 3
+
+
+@pytest.mark.parametrize("turn", [0, 2])
+def test_the_check_is_not_sure_of_images_that_may_be_upside_down_and_takes_what_is_given(tmp_path, turn):
+    """Nothing in the poses tells a capture stored upside down from one that looks up at a ceiling."""
+    shots = []
+    for shot in captures.shoot(captures.orbit(8)):
+        pose = stored(np.asarray(shot.camera.to_world, np.float64)[None], turn)[0]
+        shots.append(shot._replace(camera=dataclasses.replace(shot.camera, to_world=pose)))
+    captures.write_transforms(tmp_path, shots)
+    found, given = report.inspect(tmp_path), report.inspect(tmp_path, up="+z")
+    line = dict(found.facts)["poses"]
+    assert line.startswith(f"right-handed; up is {'-' if turn else '+'}z")
+    assert ("not sure: the cameras look up" in line and "--up sets it" in line) == bool(turn)
+    assert dict(given.facts)["poses"] == "right-handed; up is +z, as --up gives it"
+    np.testing.assert_array_equal(given.up, [0, 0, 1])
+    assert given.path[:, 2, 1].mean() > 0.5
+    low, high = (int(word) for word in dict(given.facts)["arcs"].split("elevations of ")[1].split()[:3:2])
+    assert (low, high) == (-11, 30)
+    with pytest.raises(ValueError, match="up is 'z', expected one of"):
+        report.inspect(tmp_path, up="z")
+
+
+@pytest.mark.scenes
+@pytest.mark.parametrize("name", ["lego", "fox", "fern", "can"])
+def test_the_check_is_sure_of_known_scenes(scenes_dir, name):
+    poses = world.poses_of(read_capture(scenes_dir / name))
+    assert "not sure" not in report._up_axis(poses, None)
 
 
 @pytest.mark.parametrize("up, sign", [("+z", 1), ("-z", -1)])
