@@ -104,4 +104,4 @@ def test_up_is_that_of_the_paths_that_render_selects():
     found = evidence().poses
     found[:, :, :3] = found[:, :, :3] @ np.array([[1, 0, 0], [0, 0.6, -0.8], [0, 0.8, 0.6]])  # all look far down
     degrees = np.degrees(np.arccos(path_poses.coverage(found).up[2]))
-    assert report._up_axis(found).startswith(f"up is +z within {degrees:.0f} degrees")
+    assert report._up_axis(found, None).startswith(f"up is +z within {degrees:.0f} degrees")
