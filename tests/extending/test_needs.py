@@ -48,7 +48,7 @@ def test_a_cone_field_learns(tmp_path):
     assert quarter > 20.5
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_a_cone_field_is_better_at_lower_resolution_than_the_papers_network(tmp_path):
     """Both see three resolutions. The exact scene has 23.8 dB at a quarter with one ray through each pixel."""
     scores = {}
