@@ -23,7 +23,7 @@ demo: $(BIN)/.installed
 	$(BIN)/jaxnerf-train --config=quickstart --workdir=$(DEMO)
 	$(BIN)/jaxnerf-eval --workdir=$(DEMO) --overwrite
 	$(BIN)/jaxnerf-render --workdir=$(DEMO) --overwrite
-	$(BIN)/python experiments/results/table.py $(DEMO)
+	$(BIN)/jaxnerf-report $(DEMO)
 	@echo "make view shows the scene in a browser; its image is in $(DEMO)/eval, a video in $(DEMO)/renders"
 
 view: $(BIN)/.installed

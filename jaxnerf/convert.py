@@ -14,7 +14,19 @@ _WEIGHTS = flags.DEFINE_list(
     "A .tar of nerf-pytorch, a checkpoint of JaxNeRF, or model_N.npy,model_fine_N.npy of the original code.",
     required=True,
 )
-_CONFIG = cli.define_config("The config of the networks and the dataset: a name, or the path of a file.", required=True)
+
+
+def _option_names():
+    from jaxnerf.training.config import option_names
+
+    return option_names()
+
+
+_CONFIG = cli.define_config(
+    "The config of the networks and the dataset: a name, or the path of a file.",
+    required=True,
+    option_names=_option_names,
+)
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder, which the program creates.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _LEGACY = flags.DEFINE_bool(

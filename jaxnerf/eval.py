@@ -7,7 +7,16 @@ from absl import flags
 
 from jaxnerf.runtime import cli
 
-_CONFIG = cli.define_config("A config that replaces the workdir's: a name, or the path of a file.")
+
+def _option_names():
+    from jaxnerf.training.config import option_names
+
+    return option_names()
+
+
+_CONFIG = cli.define_config(
+    "A config that replaces the workdir's: a name, or the path of a file.", option_names=_option_names
+)
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.")
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _SPLIT = flags.DEFINE_string("split", None, "The split of the dataset. It overrides config.eval.split.")

@@ -27,10 +27,17 @@ def _describe_options():
     return options_page()
 
 
+def _option_names():
+    from jaxnerf.training.config import option_names
+
+    return option_names()
+
+
 _CONFIG = cli.define_config(
     "The config of the run: a name, or the path of a file. When it is not given, the workdir's.",
     load_saved=_load_saved,
     describe_options=_describe_options,
+    option_names=_option_names,
 )
 _WORKDIR = flags.DEFINE_string(
     "workdir", None, "The run's folder. Training resumes if the folder holds a run.", required=True

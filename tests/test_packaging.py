@@ -67,7 +67,7 @@ def test_programs_of_the_wheel_find_the_configs(installed):
     assert {line.split()[0] for line in listed.splitlines()} == {
         path.stem for path in (ROOT / "jaxnerf" / "configs").glob("[!_]*.py")
     }
-    for name in ("eval", "render", "view", "cameras", "check", "convert"):
+    for name in ("eval", "render", "view", "cameras", "check", "convert", "export", "report"):
         assert "--plugins: " in program(f"jaxnerf-{name}", "--help")
 
 

@@ -75,6 +75,11 @@ def is_finished(content: Any) -> bool:
 def read(target: pathlib.Path, provenance: Mapping[str, Any], remedy: str) -> dict[str, Any]:
     """Reads the results.json of a finished evaluation; raises ValueError if it is damaged or has another provenance."""
     shards.check_provenance(target, provenance, file=PROVENANCE, remedy=remedy)
+    return read_results(target, remedy)
+
+
+def read_results(target: pathlib.Path, remedy: str) -> dict[str, Any]:
+    """Reads the results.json in a folder, of whatever provenance; raises ValueError if it is damaged."""
     results = atomic_files.read_json(target / "results.json", remedy)
     if not isinstance(results, dict) or not all(type(results.get(key)) in (int, float) for key in (*_MEANS, "views")):
         raise ValueError(f"{target / 'results.json'}: lacks metrics, expected the result of an evaluation; {remedy}")

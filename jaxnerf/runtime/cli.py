@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import ctypes
+import difflib
 import gc
 import importlib
 import logging as std_logging
@@ -91,6 +92,7 @@ def define_config(
     required: bool = False,
     load_saved: Callable[[str], Any] | None = None,
     describe_options: Callable[[], str] | None = None,
+    option_names: Callable[[], Sequence[str]] | None = None,
 ) -> flags.FlagHolder:
     """Defines --config, which takes the name or the path of a config file, followed by `:argument` or not.
 
@@ -99,6 +101,8 @@ def define_config(
         required: whether the flag must be given.
         load_saved: path -> the ConfigDict in a config.json that a run has saved; None: such paths are not accepted.
         describe_options: returns what --config=help:options prints.
+        option_names: returns the names "section.option" of all options, from which the error of an unknown flag names
+            those that may be meant.
     """
     lists = f"--config=help lists the names{', --config=help:options all options' if describe_options else ''}."
     config = config_flags.DEFINE_config_file("config", None, f"{help} {lists}")
@@ -113,7 +117,7 @@ def define_config(
             sys.exit(0)
         return load(_list_configs() if value == "help" else config_path(value))
 
-    parser.parse = parse
+    parser.parse, parser.option_names = parse, option_names
     if required:
         flags.mark_flag_as_required("config")
     return config
@@ -227,9 +231,11 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
             std_logging.getLogger("jaxnerf").setLevel(std_logging.WARNING)
         return rest
     except flags.UnrecognizedFlagError as error:
-        hint = "; give --config=NAME, which has such fields" if error.flagname.startswith("config.") else ""
-        hint = hint or _option_hint(error.flagname)
-        _leave(2, f"{error}{hint}")
+        if error.flagname.startswith("config."):
+            _leave(2, f"{error}; give --config=NAME, which has such fields")
+        meant = _options_meant(error.flagname)
+        hint = f"--{error.flagname}: no such flag; did you mean {' or '.join(meant)}?"
+        _leave(2, hint if meant else error)
     except (AttributeError, KeyError) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         if "ml_collections" in pathlib.Path(place.filename).parts:
@@ -248,15 +254,20 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         _leave(2, error)
 
 
-def _option_hint(name):
-    """Returns which options of the config have the name of an unknown flag, as the end of a message; "" for none."""
-    if "config" not in flags.FLAGS:
-        return ""
-    config = importlib.import_module("jaxnerf.configs.default").get_config()  # has all options
-    sections = {section: list(part) for section, part in config.items() if hasattr(part, "keys")}
-    found = [f"--config.{section}.{name}" for section, names in sections.items() if name in names]
-    found += [f"--config.{name}"] if name in config else []
-    return f"; did you mean {' or '.join(found)}?" if found else ""
+def _options_meant(name):
+    """Returns the flags --config.SECTION.OPTION of the options that an unknown flag may mean, the nearest ones."""
+    parser = flags.FLAGS["config"].parser if "config" in flags.FLAGS else None
+    known = (getattr(parser, "option_names", None) or list)()
+    name = name.replace("-", "_")
+    for wanted in (name, name.removeprefix("no")):  # --nomuon sets a boolean
+        found = [option for option in known if wanted in (option, option.rpartition(".")[2])]
+        if found:
+            break
+    else:
+        words = {option if "." in name else option.rpartition(".")[2] for option in known}
+        near = difflib.get_close_matches(name, sorted(words), n=1, cutoff=0.8)
+        found = [option for option in known if near and near[0] in (option, option.rpartition(".")[2])]
+    return [f"--config.{option}" for option in found]
 
 
 def _unquoted(error):

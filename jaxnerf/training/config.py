@@ -195,6 +195,11 @@ def declared(config: RunConfig) -> Iterator[tuple[str, Option, Any, Any]]:
         yield f"losses.{name}", weight_option(name), Schedule, weight
 
 
+def option_names() -> list[str]:
+    """Returns the dotted names of all options, those of registered parts, too."""
+    return [name for name, _, _, _ in declared(RunConfig())]
+
+
 def weight_option(name: str) -> Option:
     """Returns the declaration of the weight of a loss."""
     loss = LOSSES.get(name) if name in LOSSES.names() else None

@@ -288,11 +288,15 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
         notes += f"  {fraction:.0%} of rays dropped"
     notes += "".join(f"  {name} network dead" for name in dead_networks(row))
     notes += f"  {row['num_reinits']} networks reinitialized" if row["num_reinits"] else ""
-    psnr = [value for name, value in row.items() if name.startswith("psnr_")][-1]  # of the final rendering
     return (
-        f"{psnr:.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
+        f"{final_psnr(row):.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{minutes(row['seconds'])} elapsed, {minutes(0.0 if out_of_time else left)} left{notes}"
     )
+
+
+def final_psnr(row: dict[str, Any]) -> float | None:
+    """Returns the PSNR of the final rendering, dB, of a row of metrics; None if the row has none."""
+    return next((value for name, value in reversed(row.items()) if name.startswith("psnr_")), None)
 
 
 def minutes(seconds: float) -> str:

@@ -73,9 +73,23 @@ def _check_same_run(workdir, config):
         )
 
 
+def saved_options(workdir: str | os.PathLike) -> dict[str, Any]:
+    """Returns {"section.option": value} of the run in a workdir as JSON has it, without losses of weight 0.
+
+    Unlike `load_config` it needs neither the modules that register the run's parts nor the memory that a run takes.
+
+    Raises:
+        ValueError: if there is no run; names the file.
+    """
+    return _without_unused_losses(flatten(migrate(_content(workdir))[0]))
+
+
 def _as_saved(config):
-    """Returns {"section.option": value} as JSON has it, without losses of weight 0: plug-ins may have added some."""
-    flat = flatten(json.loads(config.to_json()))
+    return _without_unused_losses(flatten(json.loads(config.to_json())))
+
+
+def _without_unused_losses(flat):
+    """Returns {"section.option": value} without losses of weight 0: plug-ins may have added some."""
     return {name: value for name, value in flat.items() if not (name.startswith("losses.") and value == 0)}
 
 

@@ -153,6 +153,38 @@ def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
     assert "--config=help:options lists all fields" in done.stderr and done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "program, flag, expected",
+    [
+        ("train", "--max_steps=3", "--max_steps: no such flag; did you mean --config.train.max_steps?"),
+        ("train", "--train.lr_init=1", "--train.lr_init: no such flag; did you mean --config.train.lr_init?"),
+        ("train", "--max-step=1", "--max-step: no such flag; did you mean --config.train.max_steps?"),
+        ("train", "--field=mlp", "--field: no such flag; did you mean --config.field?"),
+        ("train", "--chunk=3", "--chunk: no such flag; did you mean --config.eval.chunk?"),
+        ("train", "--nomuon", "--nomuon: no such flag; did you mean --config.train.muon?"),
+        ("train", "--seed=1", "--seed: no such flag; did you mean --config.seed?"),
+        ("train", "--distortion=1", "--distortion: no such flag; did you mean --config.losses.distortion?"),
+        ("train", "--skip_layer=1", "did you mean --config.coarse.skip_layer or --config.fine.skip_layer?"),
+        ("train", "--stretch=1", "did you mean --config.testing.stretch?"),  # of a plug-in
+        ("eval", "--early_stop_eps=1", "did you mean --config.eval.early_stop_eps?"),
+        ("train", "--qqq=1", "Unknown command line flag 'qqq'"),
+        ("render", "--max_steps=3", "Unknown command line flag 'max_steps'"),  # it takes no config
+    ],
+)
+def test_an_option_without_its_section_is_named_in_full(tmp_path, program, flag, expected):
+    (tmp_path / "mine.py").write_text(
+        "import dataclasses\nimport jaxnerf\nfrom jaxnerf.options import Options, option\n\n\n"
+        "@dataclasses.dataclass(frozen=True)\nclass Stretched(Options):\n"
+        "    stretch: float = option(1.0, 'how far')\n\n\n"
+        "jaxnerf.register_field('testing', lambda options, box: None, options=Stretched)\n"
+    )
+    command = [sys.executable, "-m", f"jaxnerf.{program}", "--workdir=run", flag, "--plugins=mine"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode == 2 and not done.stdout
+    assert expected in done.stderr and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
 @pytest.mark.parametrize("fault", ['{}["nothing"]', "sys.nothing"])
 def test_a_fault_in_a_config_file_is_not_an_unknown_field(tmp_path, fault):
     file = tmp_path / "mine.py"
@@ -205,17 +237,3 @@ def test_a_signal_after_the_end_prints_nothing(tmp_path):
     )
     done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "")
-
-
-@pytest.mark.parametrize(
-    "name, hint",
-    [
-        ("max_steps", "; did you mean --config.train.max_steps?"),
-        ("field", "; did you mean --config.field?"),
-        ("chunk", "; did you mean --config.eval.chunk?"),
-        ("nothing", ""),
-    ],
-)
-def test_an_option_without_its_section_gets_a_hint(monkeypatch, name, hint):
-    monkeypatch.setattr(cli.flags, "FLAGS", {"config": None})
-    assert cli._option_hint(name) == hint
