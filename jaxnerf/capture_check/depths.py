@@ -7,7 +7,7 @@ from jaxtyping import Float
 from jaxnerf.capture_check.findings import Finding, named, percent
 from jaxnerf.capture_check.tracks import Tracks
 from jaxnerf.core.cameras import project
-from jaxnerf.data.geometry.bounds import blender_range, depths, with_bounds
+from jaxnerf.data.geometry.bounds import BLENDER_RANGE, blender_range, depths, with_bounds
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import Capture
 
@@ -27,7 +27,8 @@ def ranges(capture: Capture, near: float | None, far: float | None) -> tuple[Flo
     """
     stated = None
     if capture.format == "blender":
-        bounds, stated = np.tile(blender_range(_training_poses(capture)), (len(capture.frames), 1)), _FIELDS
+        usual = blender_range(_training_poses(capture))
+        bounds, stated = np.tile(usual, (len(capture.frames), 1)), _FIELDS if usual == BLENDER_RANGE else None
     else:
         if all(frame.bounds is not None for frame in capture.frames):
             stated = f"the last two columns of {capture.source}"

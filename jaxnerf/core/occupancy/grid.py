@@ -379,8 +379,10 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
         A scene, whose density is 0, with gradient 0, in empty cells; its colour there is that of another position.
         The given scene is not evaluated in empty cells unless no position is in an occupied one. NaN is evaluated, so
         that it is visible.
-    """
 
+    Raises:
+        ValueError: if the grid's occupied cells are not bool.
+    """
     _check_bool("mask_scene", occupied=grid.occupied)
 
     @functools.wraps(scene)
