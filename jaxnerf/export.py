@@ -31,7 +31,12 @@ _SIZE = flags.DEFINE_integer(
     "The longer side in px of the depth images from which everything is made. When it is not given, it is 1.25 times "
     "the resolution, and for depth that of the dataset's images.",
 )
-_NUM_VIEWS = flags.DEFINE_integer("num_views", 100, "The largest number of training views to render.")
+_NUM_VIEWS = flags.DEFINE_integer(
+    "num_views",
+    100,
+    "The largest number of training views to render. For a mesh of a bounded scene half as many views from all around "
+    "are added.",
+)
 _NUM_POINTS = flags.DEFINE_integer("num_points", 200_000, "points, splats: the largest number of points or Gaussians.")
 _FORMAT = flags.DEFINE_string("format", "ply", "mesh: ply, glb or obj.")
 _UP = flags.DEFINE_enum(

@@ -16,6 +16,7 @@ from jaxnerf.data.geometry.seen_cells import likely_empty_cells, seen_cells
 from jaxnerf.data.geometry.visual_hull import visual_hull
 from jaxnerf.data.ray_batches import PixelRuns, view_rays
 from jaxnerf.models.grid_schedule import GridSchedule, InitialCells
+from jaxnerf.runtime import stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
@@ -263,7 +264,9 @@ def _hits(views, schedule, valid, view, pixels, *, ndc, chunk):
 
     cameras = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None)
     found, grid = np.zeros(view.size, bool), schedule.create(valid)
-    for start in range(0, view.size, chunk):
-        indices = np.minimum(np.arange(start, start + chunk), view.size - 1)  # a single compiled shape
-        found[indices] = hits(cameras, grid, view[indices], pixels[indices])
+    with stages.stage("testing which pixels show the box") as stage:
+        for start in range(0, view.size, chunk):
+            stage.update(start, view.size)
+            indices = np.minimum(np.arange(start, start + chunk), view.size - 1)  # a single compiled shape
+            found[indices] = hits(cameras, grid, view[indices], pixels[indices])
     return found

@@ -15,6 +15,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import synthetic
 from jaxnerf.data.facts import LookAt, mean_color
 from jaxnerf.data.geometry import bounds, world
+from jaxnerf.data.geometry.poses import AXES, axis_of
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
 from jaxnerf.data.readers import base, blender
 from jaxnerf.data.readers.base import Capture, fingerprint
@@ -110,6 +111,12 @@ class DataOptions(Options):
         choices=tuple(WORLDS),
         auto=True,
     )
+    up: str = option(
+        "",
+        "The axis of the dataset's files that is up, such as `+z`. It becomes z in the world `around`, and paths, the "
+        "viewer and a GLB have it, too. Empty: up follows from how the cameras are held, see `jaxnerf-check`.",
+        choices=("", *AXES),
+    )
     ndc: bool = option(
         False, "whether rays are in normalised device coordinates; requires the world `forward`", auto=True
     )
@@ -204,10 +211,10 @@ def _resolve(data):
             infer("factor", factor, f"factor        {factor}, of images {width} px wide")
         if is_auto(data.world):
             forward = data.ndc is True or world.looks_forward(capture)
-            why, survey = "", forward and data.ndc is not True and bounds.is_survey(capture)
-            if survey:
-                why = "; the cameras look one way, but at a layer that is thin beside how far they are apart"
-            kind = "forward" if forward and not survey else "around"
+            why, unsuited = "", forward and data.ndc is not True and bounds.unsuited_to_ndc(capture)
+            if unsuited:
+                why = f"; the cameras look one way, but {unsuited}"
+            kind = "forward" if forward and not unsuited else "around"
             infer("world", kind, f"world         {kind}: {WORLDS[kind]}{why}")
         if is_auto(data.background):
             color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
@@ -332,7 +339,7 @@ def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -
             )
         capture, to_file = world.recenter(capture)
     elif data.world == "around":
-        capture, to_file = world.center(capture)
+        capture, to_file = world.center(capture, up=axis_of(data.up) if data.up else None)
     nearest = [frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)]
     free_depth = dict(zip((frame.name for frame in capture.frames), nearest, strict=True))
     capture = bounds.override_bounds(capture, near, data.far, to_file)

@@ -3,8 +3,6 @@
 import json
 import os
 import pathlib
-import secrets
-import shutil
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -35,7 +33,8 @@ class ExportSettings(NamedTuple):
         num_views: the largest number of training views whose poses are rendered, spread evenly over all.
         num_points: the largest number of points or Gaussians.
         format: of a mesh, "ply", "glb" or "obj".
-        up: the axis of the dataset's files that is up in a GLB, such as "+z"; None: as the cameras are held.
+        up: the axis of the dataset's files that is up in a GLB, such as "+z"; None: that of the
+            option `data.up`, or as the cameras are held.
         closed: whether a mesh has no holes: where no training view looks, it has the surfaces of the field, which was
             not trained there, and what nothing shows to be free is solid.
         max_faces: the number of triangles to which a mesh is decimated; 0: it is not.
@@ -124,18 +123,12 @@ def export_run(
     variables = run.variables(step)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     target.parent.mkdir(exist_ok=True)
-    partial = target.with_name(f"{target.name}.{secrets.token_hex(8)}.tmp")
-    partial.mkdir()
-    try:
-        with atomic_files.naming(partial):
-            if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
-                say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
-            export(ExportSource(run, step, variables, views, relative_to(settings, views.file_origin), say), partial)
-            if any(views.file_origin):
-                (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
-        _move(partial, target)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with atomic_files.partial_folder(target) as partial:
+        if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
+            say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
+        export(ExportSource(run, step, variables, views, relative_to(settings, views.file_origin), say), partial)
+        if any(views.file_origin):
+            (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
     return target
 
 
@@ -172,12 +165,3 @@ def _check_settings(settings):
             f"box is {found}, expected six numbers X0,Y0,Z0,X1,Y1,Z1 in units of the dataset's files, each lower one "
             "below its upper one; correct --box"
         )
-
-
-def _move(partial, target):
-    """Moves a finished folder into place; one that it replaces is removed afterwards."""
-    replaced = partial.with_name(f"{partial.name}.old")
-    if target.exists():
-        target.rename(replaced)
-    partial.rename(target)
-    shutil.rmtree(replaced, ignore_errors=True)

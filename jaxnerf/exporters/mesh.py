@@ -57,7 +57,8 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     with atomic_files.naming(path):
         if settings.format == "glb":
             poses = poses_in_file(np.asarray(source.views.cameras.to_world), source.views.to_file)
-            write_glb(mesh, path, up=axis_of(settings.up) if settings.up else up_of(poses))
+            up = settings.up or source.run.experiment.config.data.up
+            write_glb(mesh, path, up=axis_of(up) if up else up_of(poses))
         else:
             mesh.export(path)
     sides = " x ".join(f"{side:.4g}" for side in mesh.extents)

@@ -20,7 +20,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from jaxnerf.registry import READERS
-from jaxnerf.runtime import signals
+from jaxnerf.runtime import signals, stages
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 
@@ -49,6 +49,7 @@ def run(
     # collection per 700 objects takes a good part of the tracing time.
     gc.set_threshold(50_000)
     signals.handle(signals.interrupt)
+    stages.show()
     flags.DEFINE_list(
         "plugins", [], "Modules to import first: they register fields, samplers, losses, dataset readers or exporters."
     )
@@ -226,9 +227,11 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         sys.exit(0)
     try:
         rest = flags.FLAGS(argv)
-        if not flags.FLAGS["verbosity"].present:
+        verbosity = flags.FLAGS["verbosity"]
+        if not verbosity.present or verbosity.value in (0, 1):
+            level = std_logging.INFO if verbosity.present else std_logging.WARNING
             logging.set_verbosity(logging.FATAL)  # orbax logs every file that it touches
-            std_logging.getLogger("jaxnerf").setLevel(std_logging.WARNING)
+            std_logging.getLogger("jaxnerf").setLevel(level)
         return rest
     except flags.UnrecognizedFlagError as error:
         if error.flagname.startswith("config."):

@@ -1,5 +1,6 @@
 """Memory: how much is free, whether a program fits, and retrying with smaller parts when it does not."""
 
+import itertools
 import pathlib
 import sys
 from collections.abc import Callable
@@ -10,6 +11,7 @@ import jax
 from jaxnerf.core.occupancy.ray_culling import render_selected
 from jaxnerf.core.rendering import render_image
 from jaxnerf.core.types import Rays, Rendering
+from jaxnerf.runtime import stages
 
 _HOST_FRACTION = 0.8  # of the host's free memory that a program may take; if it takes more, the system kills processes
 _MARGIN = 0.9  # part of what a program needs does not scale with the size of its parts
@@ -163,21 +165,25 @@ def image_renderer(
         key = requested, _shapes(variables)
 
         def attempt(size):
+            done, total = itertools.count(1), -(-rays.near.size // size)
+
             def part(rays):
                 if (size, key) not in checked:
                     # For the arrays themselves, not only their shapes: the call would compile again for arrays that are
                     # bound to a device.
                     check(render.lower(variables, rays).compile())
                     checked.add((size, key))
+                current.update(next(done), total)
                 return render(variables, rays)
 
             if cull is None:
                 return jax.block_until_ready(render_image(part, rays, chunk=size))
             return jax.block_until_ready(render_selected(part, rays, *cull(variables, rays), chunk=size))
 
-        result, fitting[key] = back_off(
-            attempt, fitting.get(key, requested), cause="image", unit="rays per chunk (--chunk)"
-        )
+        with stages.stage("rendering an image") as current:
+            result, fitting[key] = back_off(
+                attempt, fitting.get(key, requested), cause="image", unit="rays per chunk (--chunk)"
+            )
         return result
 
     return image

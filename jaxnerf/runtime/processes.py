@@ -1,6 +1,7 @@
 """The processes of one training run: how they connect, agree, and let the first one write files."""
 
 import contextlib
+import logging
 import math
 import os
 import socket
@@ -15,6 +16,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from jaxnerf.runtime import stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.lost_processes import LostProcesses
 
@@ -78,6 +80,8 @@ def cluster(
     watch = LostProcesses()
     try:
         _join(coordinator, num_processes, process_id, seconds, heartbeat_seconds)
+        if not is_first():
+            stages.show(False)
         yield
         watch.flush()
     except BaseException as error:
@@ -170,10 +174,20 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
+class Detail(str):
+    """A line that `print_once` prints only if the flag --verbosity asks for it."""
+
+
+def prints_details() -> bool:
+    """Returns whether `print_once` prints a Detail."""
+    return logging.getLogger("jaxnerf").isEnabledFor(logging.INFO)
+
+
 def print_once(*lines: str) -> None:
     """Prints lines to stderr, in the first process only."""
-    if lines and is_first():
-        print(*lines, sep="\n", file=sys.stderr)
+    chosen = [line for line in lines if not isinstance(line, Detail) or prints_details()]
+    if chosen and is_first():
+        print(*chosen, sep="\n", file=sys.stderr)
 
 
 def any_of(flag: bool, step: int = 0) -> bool:

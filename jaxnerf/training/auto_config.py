@@ -10,6 +10,7 @@ from jaxnerf.data import dataset
 from jaxnerf.data.facts import dataset_facts
 from jaxnerf.options import Changes, Device, Facts, changing, is_auto, replaced
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
+from jaxnerf.runtime.processes import Detail
 from jaxnerf.training.build import build_model
 from jaxnerf.training.config import (
     Config,
@@ -29,7 +30,7 @@ class Resolved(NamedTuple):
     Attributes:
         config: without "auto", except for options of Changes.SPEED.
         views: of the split "train", which it was resolved against.
-        lines: one per inferred value that the run uses, with its reason.
+        lines: one per inferred value that the run uses, with its reason; a Detail where it is not about the dataset.
     """
 
     config: RunConfig
@@ -162,7 +163,7 @@ def _resolve_sections(
             kept = changing(part, Changes.SPEED)
             resolved = replaced(resolved, **{each: getattr(part, each) for each in kept})
         sections[name] = resolved
-        lines += [line.replace("{section}", name) for line in found if name in used]
+        lines += [Detail(line.replace("{section}", name)) for line in found if name in used]
     return config.with_sections(sections)
 
 
@@ -171,6 +172,6 @@ def _resolve_losses(losses, facts, lines):
     for name, weight in losses.items():
         if is_auto(weight) and name in LOSSES.names() and LOSSES.get(name).infer:
             weight, line = LOSSES.get(name).infer(facts)
-            lines += [line] if line else []
+            lines += [Detail(line)] if line else []
         weights[name] = weight
     return weights

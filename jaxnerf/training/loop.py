@@ -14,12 +14,15 @@ import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import BatchPixels
-from jaxnerf.runtime import devices, memory, processes, signals
+from jaxnerf.options import Changes
+from jaxnerf.runtime import devices, memory, processes, signals, stages, user_cache
+from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import build, metric_log, workdir
 from jaxnerf.training.auto_config import resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.config import Config, changed
+from jaxnerf.training.config import Config, changed, declared
 from jaxnerf.training.dead_networks import make_reinitializer
+from jaxnerf.training.optimizer import DecayData
 from jaxnerf.training.options import host_intervals
 from jaxnerf.training.state import TrainState, create_state
 from jaxnerf.training.step import make_train_step, repeat_step
@@ -54,7 +57,8 @@ def train(
             were not finite.
     """
     started = time.perf_counter()
-    config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves no trace
+    with stages.stage("reading the dataset"):
+        config, views, lines = resolve(config, views)  # before the workdir is made: bad input leaves no trace
     on_device, device_lines = resolve_for_device(config)
     build.check_views(on_device, views)
     experiment = build.build(on_device)
@@ -70,7 +74,13 @@ def train(
             workdir.save_config(folder, config)
 
         processes.run_on_first(claim_workdir, pathlib.Path(folder) / "config.json")
-        processes.print_once(*lines, *device_lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
+        lines += [processes.Detail(line) for line in device_lines]
+        hidden = sum(isinstance(line, processes.Detail) for line in lines)
+        if hidden and not processes.prints_details():
+            lines.append(
+                f"settings      {hidden} more values are inferred; --verbosity=1 prints them with their reasons"
+            )
+        processes.print_once(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
         finished = run_training(experiment, views, folder, preview=preview, observe=observe)
         return finished and (at_end is None or at_end(views))
 
@@ -87,7 +97,8 @@ def run_training(
     options = experiment.config.train
     dispatch, state, data, seconds = _compile(experiment, views)
     checkpoints = Checkpoints(folder, max_to_keep=options.max_to_keep)
-    state, unreadable = checkpoints.load_newest(state)
+    with stages.stage("reading the checkpoint"):
+        state, unreadable = checkpoints.load_newest(state)
     first = int(state.step)
     log = metric_log.MetricLog(folder, first_step=first, write=processes.is_first())
     before = log.rows[-1]["seconds"] if log.rows else 0.0
@@ -181,8 +192,7 @@ def _compile(experiment, views):
     started = time.perf_counter()
     cells, data = experiment.prepare(views)
     prepared = time.perf_counter()
-    if options.max_seconds and jax.process_count() == 1 and options.lr_final != options.lr_init:
-        data = data._replace(lr_scale=np.float32(1))
+    data = data._replace(decay=DecayData(np.float32(options.lr_steps), np.float32(1)))
     pixels, gather = views.pixels, _stay_on_host(views.pixels)
     if gather:
         rows = np.zeros_like(pixels, shape=(options.batch_size, pixels.shape[1]))
@@ -211,9 +221,21 @@ def _compile(experiment, views):
     # Pixels that stay on the host are sent for one step at a time.
     num_steps = 1 if gather else options.steps_per_dispatch
     dispatch = _Dispatch(options, num_steps, compile_steps)
-    placed = dispatch.compile(num_steps)
+    key = _program_name(experiment, views)
+    before = user_cache.last_seconds(key)
+    with stages.stage("compiling the training step", "" if before is None else f", {before:.0f} s the last time"):
+        placed = dispatch.compile(num_steps)
     seconds = {"prepare_seconds": prepared - started, "compile_seconds": time.perf_counter() - prepared}
+    user_cache.keep_seconds(key, seconds["compile_seconds"])
     return dispatch, *placed, seconds
+
+
+def _program_name(experiment, views):
+    """Returns a name for the compiled step: the same for runs that differ in how long they train."""
+    part_of_it = Changes.TRAINING | Changes.SPEED
+    values = {name: value for name, option, _, value in declared(experiment.config) if option.changes & part_of_it}
+    values = {**values, "seed": 0, "train.lr_steps": 0}
+    return fingerprint(repr(values), views.pixels.shape, [device.device_kind for device in jax.devices()])
 
 
 def _stay_on_host(pixels):
@@ -293,18 +315,19 @@ class _Pace:
 
     def data_of(self, step: int) -> Any:
         data, options = self._data, self._options
-        if data.lr_scale is None and data.progress is None or not options.max_seconds or jax.process_count() > 1:
+        if not options.max_seconds or jax.process_count() > 1:
             return data
         by_time = min(self._clock.seconds() / options.max_seconds, 1.0)
         if data.progress is not None:
             passed = devices.place(np.float32(by_time), data.progress.time_fraction.sharding)
             data = data._replace(progress=data.progress._replace(time_fraction=passed))
-        if data.lr_scale is None:
+        if options.lr_final == options.lr_init:
             return data
         by_steps = min((step - 1) / options.lr_steps, 1.0)
         ratio, power = options.lr_final / options.lr_init, options.lr_decay_power
         self.scale = ratio ** (max(by_steps, by_time) ** power - by_steps**power)
-        return data._replace(lr_scale=devices.place(np.float32(self.scale), data.lr_scale.sharding))
+        scale = devices.place(np.float32(self.scale), data.decay.scale.sharding)
+        return data._replace(decay=data.decay._replace(scale=scale))
 
 
 class _PreviewTimes:

@@ -15,6 +15,7 @@ from jaxnerf.core.metrics import decibels
 from jaxnerf.core.views import Views
 from jaxnerf.runtime.atomic_files import naming, open_regular, parse_json, partial_file, read_bytes, write_text
 from jaxnerf.runtime.devices import devices_of
+from jaxnerf.runtime.processes import Detail
 from jaxnerf.training.dead_networks import dead_networks
 from jaxnerf.training.options import UNLIMITED_STEPS
 from jaxnerf.training.state import TrainState
@@ -200,15 +201,15 @@ def header(
     eyes = np.asarray(views.cameras.to_world)[:, :, 3]
     lines = [
         f"device        {len(devices)} x {devices[0].device_kind} ({devices[0].platform}){processes}",
-        f"parameters    {sum(counts.values()):,} {dtype} ({parts})",
+        Detail(f"parameters    {sum(counts.values()):,} {dtype} ({parts})"),
         f"views         {len(views.offset)} with {views.pixels.shape[0]:,} pixels, "
         f"t from {np.min(views.near):g} to {np.max(views.far):g}",
-        f"cameras       from {_point(eyes.min(0))} to {_point(eyes.max(0))}",
+        Detail(f"cameras       from {_point(eyes.min(0))} to {_point(eyes.max(0))}"),
     ]
     if state.grid is not None:
         cells = "x".join(map(str, state.grid.valid.shape))
         fraction = float(state.grid.valid.mean())
-        lines.append(f"grid          {fraction:.1%} of {cells} cells valid, in {prepare_seconds:.1f} s")
+        lines.append(Detail(f"grid          {fraction:.1%} of {cells} cells valid, in {prepare_seconds:.1f} s"))
     lines += [
         f"compiled      in {compile_seconds:.1f} s",
         f"steps         {of_all(int(state.step), options)} done, {options.batch_size} rays per step in "

@@ -70,30 +70,25 @@ def make_optimizer(
         cameras: those of the parameters of images; None where none are trained.
 
     Returns:
-        The optimizer, and the learning rate of the networks: step -> float.
+        The optimizer, whose update takes `decay`, DecayData in place of what the options say; and the learning rate of
+        the networks: step -> float.
     """
-    schedule = learning_rate(train)
     moments = {"b1": train.beta1, "b2": train.beta2, "eps": train.epsilon}
-    if train.muon:
-        optimizer = with_muon(optax.adamw(schedule, **moments, weight_decay=_DECAY), schedule, train.muon)
-    else:
-        optimizer = optax.adam(schedule, **moments)
-    if cameras is not None:
-        optimizer = _with_cameras(optimizer, train, schedule, cameras)
-    optimizer = _with_scale(optimizer)
-    return with_averaging(optimizer, train.averaging_power) if train.averaging_power else optimizer, schedule
 
+    def optimizer_with(schedule):
+        if train.muon:
+            optimizer = with_muon(optax.adamw(schedule, **moments, weight_decay=_DECAY), schedule, train.muon)
+        else:
+            optimizer = optax.adam(schedule, **moments)
+        return optimizer if cameras is None else _with_cameras(optimizer, train, schedule, cameras)
 
-def _with_scale(optimizer):
-    """Returns an optimizer whose update takes lr_scale, a factor of the learning rate; without it nothing changes."""
+    def update(grads, state, params=None, *, decay=None):
+        return optimizer_with(learning_rate(train, decay)).update(grads, state, params)
 
-    def update(grads, state, params=None, *, lr_scale=None):
-        updates, state = optimizer.update(grads, state, params)
-        if lr_scale is not None:
-            updates = jax.tree.map(lambda leaf: leaf * lr_scale, updates)
-        return updates, state
-
-    return optax.GradientTransformationExtraArgs(optimizer.init, update)
+    optimizer = optax.GradientTransformationExtraArgs(optimizer_with(learning_rate(train)).init, update)
+    if train.averaging_power:
+        optimizer = with_averaging(optimizer, train.averaging_power)
+    return optimizer, learning_rate(train)
 
 
 def _with_cameras(optimizer, train, schedule, cameras):
@@ -149,16 +144,30 @@ def _labels(params):
     return jax.tree_util.tree_map_with_path(label, params)
 
 
-def learning_rate(train: OptimizerOptions) -> Callable[[Any], Any]:
-    """Returns the learning rate of the networks, step -> float."""
+class DecayData(NamedTuple):
+    """How fast the learning rate decays; data, so that a run of another length has the same compiled step.
+
+    Attributes:
+        steps: float32 [], in place of `lr_steps`.
+        scale: float32 [], a factor of the learning rate, which changes in a run of limited time.
+    """
+
+    steps: Any
+    scale: Any
+
+
+def learning_rate(train: OptimizerOptions, decay: DecayData | None = None) -> Callable[[Any], Any]:
+    """Returns the learning rate of the networks, step -> float; decay: in place of what the options say."""
     ratio, power = train.lr_final / train.lr_init, train.lr_decay_power
+    steps, scale = (train.lr_steps, 1.0) if decay is None else decay
 
-    def decay(step):
-        return train.lr_init * ratio ** (jnp.minimum(step / train.lr_steps, 1.0) ** power)
+    def rate(step):
+        value = train.lr_init * ratio ** (jnp.minimum(step / steps, 1.0) ** power)
+        if train.warmup_steps:
+            value *= jnp.minimum(1.0, (step + 1) / train.warmup_steps)
+        return value * scale
 
-    if not train.warmup_steps:
-        return decay
-    return lambda step: decay(step) * jnp.minimum(1.0, (step + 1) / train.warmup_steps)
+    return rate
 
 
 class Averaging(NamedTuple):
@@ -191,8 +200,8 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
     def init(params):
         return Averaging(jnp.zeros((), jnp.int32), jax.tree.map(jnp.array, params), optimizer.init(params))
 
-    def update(grads, state, params, **scale):
-        updates, inner = optimizer.update(grads, state.inner, params, **scale)
+    def update(grads, state, params, **options):
+        updates, inner = optimizer.update(grads, state.inner, params, **options)
         count = state.count + 1
         each = count <= _AVERAGE_ALL
         steps = count - jnp.arange(_AVERAGE_EVERY)  # for which these parameters count, only the first if `each`

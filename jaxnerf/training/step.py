@@ -43,7 +43,7 @@ class TrainData(NamedTuple):
         views: of the split "train".
         active_pixels: the pixels to draw from; None: all.
         cells: [M] int32, the cells of the grid that are updated; None without a grid.
-        lr_scale: float32 [], the factor of the learning rate in a run of limited time, which changes; None: 1.
+        decay: DecayData of the learning rate; None: as the optimizer's options say.
         progress: ProgressData; None where the model does not ask for the progress.
     """
 
@@ -51,7 +51,7 @@ class TrainData(NamedTuple):
     views: Views
     active_pixels: PixelRuns | None
     cells: Any
-    lr_scale: Any = None
+    decay: Any = None
     progress: Any = None
 
 
@@ -164,8 +164,8 @@ def make_train_step(
         metrics["grad_norm"] = scale * optax.tree.norm(grads)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
 
-        lr_scale = getattr(data, "lr_scale", None)
-        options = {} if lr_scale is None else {"lr_scale": lr_scale}
+        decay = getattr(data, "decay", None)
+        options = {} if decay is None else {"decay": decay}
 
         def descend():
             # The optimizer's own passes over the gradient scale it: a pass more would take long for a large table.

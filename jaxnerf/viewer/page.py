@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxnerf.core import contraction
 from jaxnerf.data.geometry import path_poses
-from jaxnerf.data.geometry.poses import gaze_center
+from jaxnerf.data.geometry.poses import axis_of, gaze_center
+from jaxnerf.data.geometry.world import direction_in_run
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import newest_step
@@ -244,7 +245,8 @@ class Page:
         return max(ratio, 0.1) if ratio < np.inf else unknown
 
     def _dataset_up(self):
-        return path_poses.up_of(self._poses)
+        views, up = self._viewer.views, self._viewer.run.experiment.config.data.up
+        return path_poses.up_of(self._poses) if not up else direction_in_run(axis_of(up), views.to_file)
 
     def _reset(self):
         """Goes to the first training view, with the dataset's up."""

@@ -13,7 +13,7 @@ import jaxnerf
 from jaxnerf.capture_check import report
 from jaxnerf.core.cameras import project
 from jaxnerf.data import dataset
-from jaxnerf.data.geometry.bounds import is_survey
+from jaxnerf.data.geometry.bounds import unsuited_to_ndc
 from jaxnerf.data.readers.base import Capture, Frame, origin_near, read_capture
 from jaxnerf.evaluation.paths.camera_path import make_path
 from jaxnerf.exporters.base import ExportSettings, relative_to
@@ -164,7 +164,7 @@ def test_cameras_far_apart_over_a_thin_layer_are_a_survey(apart, near, far, surv
         pose = np.column_stack([np.eye(3), [x, y, 0.0]])
         camera = jaxnerf.Camera(to_world=pose, focal=np.full(2, 20.0), center=np.full(2, 10.0), height=20, width=20)
         frames.append(Frame(f"{len(frames)}", pathlib.Path("a.png"), camera, bounds=(near, far)))
-    assert is_survey(Capture("colmap", pathlib.Path("a"), tuple(frames))) == survey
+    assert bool(unsuited_to_ndc(Capture("colmap", pathlib.Path("a"), tuple(frames)))) == survey
 
 
 def flight(relief, *, apart=30.0, height=20.0, size=24):
@@ -202,4 +202,4 @@ def test_a_flight_over_hills_is_trained_around(tmp_path, writer, relief, shift):
 
 @pytest.mark.scenes
 def test_fern_is_no_survey(scenes_dir):
-    assert not is_survey(read_capture(scenes_dir / "fern"))
+    assert not unsuited_to_ndc(read_capture(scenes_dir / "fern"))

@@ -172,6 +172,13 @@ def test_colmap_precedes_llff_and_format_overrides(tmp_path):
     assert data.format == "llff" and not any(line.startswith("format") for line in lines)
 
 
+def test_without_any_depth_forward_facing_datasets_are_trained_around(tmp_path):
+    """In NDC nothing is in front of near, which would be a guess."""
+    captures.write_transforms(tmp_path, captures.noise(captures.front(9)))
+    data, lines = dataset.resolve(a_data(tmp_path))
+    assert (data.world, data.ndc) == ("around", False) and "nothing tells how far" in "".join(lines)
+
+
 @pytest.mark.parametrize("write", [captures.write_llff, captures.write_colmap])
 def test_forward_facing_datasets(tmp_path, write):
     shots = captures.shoot(captures.front(9))

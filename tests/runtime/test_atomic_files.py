@@ -136,3 +136,27 @@ def test_first_writer_wins(tmp_path):
     assert len(content) == 1000 and len(set(content)) == 1
     atomic_files.write_text_once(path, "later")
     assert path.read_text() == content and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_appears_complete_or_not_at_all(tmp_path):
+    target = tmp_path / "mesh-10"
+    with pytest.raises(OSError, match="full.*mesh-10"), atomic_files.partial_folder(target):
+        raise OSError(28, "full")
+    assert not list(tmp_path.iterdir())
+    for content in ("old", "new"):
+        with atomic_files.partial_folder(target) as partial:
+            (partial / "mesh.ply").write_text(content)
+            assert not (target / "mesh.ply").exists() or (target / "mesh.ply").read_text() == "old"
+    assert (target / "mesh.ply").read_text() == "new" and list(tmp_path.iterdir()) == [target]
+
+
+def test_partial_folders_of_killed_processes_are_removed_and_those_of_running_ones_stay(tmp_path):
+    killed = tmp_path / "mesh-10.0123456789abcdef.tmp"
+    killed.mkdir()
+    (killed / "mesh.ply").write_text("half")
+    mine = tmp_path / "my.tmp"
+    mine.mkdir()
+    with atomic_files.partial_folder(tmp_path / "splats-10") as running:
+        assert not killed.exists() and mine.exists()
+        with atomic_files.partial_folder(tmp_path / "mesh-10"):
+            assert running.exists()

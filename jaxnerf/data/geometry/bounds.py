@@ -38,19 +38,22 @@ def known_bounds(capture: Capture) -> list[bool]:
     return [frame.bounds is not None or _of_points(capture, frame) is not None for frame in capture.frames]
 
 
-def is_survey(capture: Capture) -> bool:
-    """Returns whether cameras that look one way are a survey, as from above the ground, that NDC do not suit.
+def unsuited_to_ndc(capture: Capture) -> str:
+    """Returns why NDC do not suit cameras that look one way; empty if they do.
 
-    NDC spread depths between near and infinity, and suit scenes that are deep beside how far their cameras are apart.
-    In a survey the farthest matter is less than twice as far as the nearest, and the cameras are farther apart than
-    half of that distance; or less than four times, if the cameras are farther apart than all of it: bounds from points
-    have margins, which alone make far 1.6 times near. Without points or stated bounds nothing is known of depths, and
-    a dataset is no survey.
+    NDC spread depths between near and infinity, so nothing in front of near exists in them: without points or stated
+    bounds of most views it is unknown. They suit scenes that are deep beside how far their cameras are apart. In a
+    survey, as from above the ground, the farthest matter is less than twice as far as the nearest, and the cameras are
+    farther apart than half of that distance; or less than four times, if the cameras are farther apart than all of it:
+    bounds from points have margins, which alone make far 1.6 times near.
     """
+    if np.mean(known_bounds(capture)) < 0.5:
+        return "nothing tells how far away what they see is, which NDC need"
     near, far = np.median([frame.bounds for frame in with_bounds(capture).frames], axis=0)
     positions = poses_of(capture)[:, :, 3]
     apart = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max() * 2
-    return bool(0 < far < (4 if apart > near else 2) * near and apart > near / 2)
+    survey = 0 < far < (4 if apart > near else 2) * near and apart > near / 2
+    return "at a layer that is thin beside how far they are apart" if survey else ""
 
 
 def blender_range(poses: Float[np.ndarray, "V 3 4"]) -> tuple[float, float]:

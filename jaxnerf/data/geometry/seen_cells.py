@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterator
 
 import jax
@@ -20,9 +21,11 @@ from jaxnerf.core.views import Views
 from jaxnerf.data.geometry.free_space import surface_range
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.models.grid_schedule import GridSchedule
+from jaxnerf.runtime import stages
 
 _CHUNK = 2**13  # rays
-_SLAB = 2**21  # corners of cells that are projected at once
+_CUBE = 8  # cells along each side of a cube, of which all or none are looked at for a view
+_CHUNK_CUBES = 256  # that are looked at at once
 _SLOPES = 128  # directions along each side of an image that are looked up
 _STEEPEST = 10.0  # of these: 84 degrees from the axis
 _FREE_SAMPLES = 16  # between a camera and a surface
@@ -49,12 +52,16 @@ def seen_cells(
     Raises:
         ValueError: if the lens of a view shows no pixel; names the view.
     """
-    size = schedule.shape[0]
-    slabs = -(-size * (schedule.shape[1] + 1) * (schedule.shape[2] + 1) // _SLAB)
-    planes = -(-size // slabs)
-    count = _view_counter(views, schedule, planes)
-    parts = zip(*(map(np.asarray, count(first)) for first in range(0, size, planes)), strict=True)
-    num_seen, num_free, clear = (np.concatenate(part)[:size] for part in parts)
+    cubes = tuple(-(-size // _CUBE) for size in schedule.shape)
+    count, boxes = _view_counter(views, schedule, cubes), _boxes(schedule, cubes)
+    number = len(boxes[0])
+    shape = (number + 1, _CUBE, _CUBE, _CUBE)  # the last cube takes what is only padding
+    counts = np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, bool)
+    with stages.stage("finding the cells that the cameras see, by images") as stage:
+        for view in range(len(views.offset)):
+            stage.update(view, len(views.offset))
+            counts = count(counts, view, boxes)
+    num_seen, num_free, clear = (_joined(np.asarray(each)[:-1], cubes, schedule.shape) for each in counts)
     return num_seen >= min_views, clear | ((num_free > 0) & (num_free >= np.minimum(num_seen, 2)))
 
 
@@ -101,42 +108,98 @@ def likely_empty_cells(
         return cells_along(grid, rays, samples_from_edges(None, edges)), cells_along(grid, rays, samples)
 
     surface, num_in_front = np.zeros(grid.valid.size + 1, bool), np.zeros(grid.valid.size + 1, np.int32)
-    for view in range(len(views.offset)):
-        in_front = np.zeros_like(surface)
-        for pixels, rays in _rays_of(views, view, max(schedule.shape) // 2, pixel_offset):
-            before, between = cells_between(rays, *surface_range(views, view, pixels))
-            in_front[np.asarray(before)] = surface[np.asarray(between)] = True
-        num_in_front += in_front
+    with stages.stage("finding the cells in front of surfaces, by images") as stage:
+        for view in range(len(views.offset)):
+            stage.update(view, len(views.offset))
+            in_front = np.zeros_like(surface)
+            for pixels, rays in _rays_of(views, view, max(schedule.shape) // 2, pixel_offset):
+                before, between = cells_between(rays, *surface_range(views, view, pixels))
+                in_front[np.asarray(before)] = surface[np.asarray(between)] = True
+            num_in_front += in_front
     surface, in_front = (cells[:-1].reshape(schedule.shape) for cells in (surface, num_in_front >= min_views))
     return ~np.asarray(widen(surface)) | in_front
 
 
-def _view_counter(views, schedule, planes):
-    """Returns a function of the first of some planes of cells.
+def _view_counter(views, schedule, cubes):
+    """Returns the function (counts, view, boxes) -> counts that adds a view.
 
-    It returns how many views see each cell, how many of these see it free, and whether it touches a clear sphere.
+    The counts are, for the cells of each cube, how many views see them, how many of these see them free, and whether
+    they touch a clear sphere. Only cubes of cells are looked at whose boxes, see `_boxes`, a view may see.
     """
-    shape, (lower, upper) = schedule.shape, np.float32([schedule.lower, schedule.upper]).reshape(2, 1, 1, 1, 3)
     free_depth = np.zeros(len(views.offset), np.float32) if views.free_depth is None else views.free_depth
     known = views.cameras.to_world, clear_radii(views), views.near, views.far, free_depth
-    stack = *(jnp.asarray(each, jnp.float32) for each in known), *_shown_slopes(views)
+    stack = *(np.asarray(each, np.float32) for each in known), *map(np.asarray, _shown_slopes(views))
+    number = math.prod(cubes)
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def count(counts, seen_by, ids, num_chunks):
+        def add(chunk, counts):
+            chosen = jax.lax.dynamic_slice_in_dim(ids, chunk * _CHUNK_CUBES, _CHUNK_CUBES)
+            seen, behind, clear = map(_any_corner, _sees(*seen_by, _corners(schedule, cubes, chosen)))
+            before = [each[chosen] for each in counts]
+            after = before[0] + seen, before[1] + (seen & ~behind), before[2] | clear
+            return tuple(each.at[chosen].set(new) for each, new in zip(counts, after, strict=True))
+
+        return jax.lax.fori_loop(0, num_chunks, add, counts)
+
+    def count_view(counts, view, boxes):
+        seen_by = tuple(each[view] for each in stack)
+        ids = np.flatnonzero(_may_see(*seen_by[:4], *seen_by[5:7], *boxes))
+        num_chunks = -(-len(ids) // _CHUNK_CUBES)
+        padding = np.full((-number) % _CHUNK_CUBES + number - len(ids), number)
+        return count(counts, seen_by, np.int32(np.append(ids, padding)), num_chunks)
+
+    return count_view
+
+
+def _corners(schedule, cubes, ids):
+    """Returns the positions [3, N, _CUBE + 1, _CUBE + 1, _CUBE + 1] of the corners of the cells of N cubes."""
+    first = jnp.stack(jnp.unravel_index(jnp.minimum(ids, math.prod(cubes) - 1), cubes)) * _CUBE
+    place = first.reshape(3, -1, 1, 1, 1) + jnp.indices((_CUBE + 1,) * 3)[:, None]
+    lower, upper = np.float32([schedule.lower, schedule.upper]).reshape(2, 3, 1, 1, 1, 1)
+    place = place / np.float32(schedule.shape).reshape(3, 1, 1, 1, 1)
+    if schedule.contracted:
+        place = jnp.moveaxis(jnp.clip(4 * place - 2, -_JUST_INSIDE, _JUST_INSIDE), 0, -1)
+        place = (jnp.moveaxis(contraction.expand(place), -1, 0) + 2) / 4
+    return lower + place * (upper - lower)
+
+
+def _boxes(schedule, cubes):
+    """Returns the lower and upper corners [N, 3] of boxes that hold the cells' corners of each cube; float64."""
+    number = math.prod(cubes)
 
     @jax.jit
-    def count(stack, first):
-        along = [jnp.arange(size + 1) + start for size, start in zip((planes, *shape[1:]), (first, 0, 0), strict=True)]
-        place = jnp.stack(jnp.meshgrid(*along, indexing="ij"), axis=-1) / np.reshape(shape, (1, 1, 1, 3))
-        if schedule.contracted:
-            place = (contraction.expand(jnp.clip(4 * place - 2, -_JUST_INSIDE, _JUST_INSIDE)) + 2) / 4
-        corners = jnp.moveaxis(lower + place * (upper - lower), -1, 0)
+    def bounds(ids):
+        corners = _corners(schedule, cubes, ids)
+        return corners.min(axis=(2, 3, 4)), corners.max(axis=(2, 3, 4))
 
-        def add(view, counts):
-            seen, behind, clear = map(_any_corner, _sees(*(leaf[view] for leaf in stack), corners))
-            return counts[0] + seen, counts[1] + (seen & ~behind), counts[2] | clear
+    padded = np.arange(-(-number // _CHUNK_CUBES) * _CHUNK_CUBES).reshape(-1, _CHUNK_CUBES)
+    parts = zip(*(bounds(ids) for ids in padded), strict=True)
+    return tuple(np.concatenate(part, axis=1).T[:number].astype(np.float64) for part in parts)
 
-        none = jnp.zeros((planes, *shape[1:]), jnp.int32)
-        return jax.lax.fori_loop(0, len(free_depth), add, (none, none, none > 0))
 
-    return functools.partial(count, stack)
+def _may_see(to_world, clear_radius, near, far, least, scale, lower, upper):
+    """Returns which boxes [N] a view may see, or has around its camera. No box that it sees is left out."""
+    turn, eye = np.float64(to_world[:, :3]), to_world[:, 3]
+    middle, half = (lower + upper) / 2 - eye, (upper - lower) / 2 * (1 + 1e-5)
+    ahead, beyond = -turn[:, 2], least + _SLOPES / scale
+    inside = np.ones(len(lower), bool)
+    for normal, offset in (
+        (ahead, -near),
+        (-ahead, far),
+        *((turn[:, axis] - least[axis] * ahead, 0) for axis in range(2)),
+        *((beyond[axis] * ahead - turn[:, axis], 0) for axis in range(2)),
+    ):
+        inside &= middle @ normal + half @ np.abs(normal) + offset >= 0
+    nearest = np.maximum(np.abs(middle) - half, 0)
+    return inside | ((nearest**2).sum(axis=1) < clear_radius**2 * (1 + 1e-5))
+
+
+def _joined(parts, cubes, shape):
+    """Returns the cells [X, Y, Z] of cubes [N, _CUBE, _CUBE, _CUBE]."""
+    x, y, z = cubes
+    grid = parts.reshape(x, y, z, _CUBE, _CUBE, _CUBE).transpose(0, 3, 1, 4, 2, 5)
+    return grid.reshape(x * _CUBE, y * _CUBE, z * _CUBE)[: shape[0], : shape[1], : shape[2]]
 
 
 def _sees(to_world, clear_radius, near, far, free_depth, least, scale, shown, x):
@@ -192,7 +255,7 @@ _project = jax.jit(project)
 
 def _any_corner(flags):
     """Returns for each cell whether any of its corners is flagged; flags are one longer along each axis."""
-    for axis in range(3):
+    for axis in range(-3, 0):
         size = flags.shape[axis]
         flags = jax.lax.slice_in_dim(flags, 0, size - 1, axis=axis) | jax.lax.slice_in_dim(flags, 1, size, axis=axis)
     return flags

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from jaxnerf.core.cameras import project, undistort
 from jaxnerf.core.types import Camera, Vector
 from jaxnerf.core.views import Views
+from jaxnerf.runtime import stages
 
 _MARGIN = 1  # px around a box: matter that covers only a pixel's corner may have left no alpha
 _MAX_TANGENT = 3.0  # of the angle from the axis up to which a distorted image is used
@@ -48,12 +49,15 @@ def visual_hull(views: Views, lower: Vector, upper: Vector, *, resolution: int) 
     tree = [np.ones(levels[0] ** 3 * 8**depth, bool) for depth in range(len(levels))]
     roots = np.indices((levels[0],) * 3, np.float32).reshape(3, -1)
     # Consecutive views are similar; a random order empties the coarse cells sooner.
-    for index in np.random.default_rng(0).permutation(len(views.offset))[:_MAX_VIEWS]:
-        view = _silhouette(views, index)
-        projections = [_projection(view, lower, (upper - lower) / level) for level in levels]
-        alive = np.flatnonzero(tree[0])
-        for chosen in np.array_split(alive, alive.size // _CHUNK + 1):
-            _carve(tree, view.table, projections, chosen, roots[:, chosen])
+    order = np.random.default_rng(0).permutation(len(views.offset))[:_MAX_VIEWS]
+    with stages.stage("finding the visual hull, by images") as stage:
+        for done, index in enumerate(order):
+            stage.update(done, len(order))
+            view = _silhouette(views, index)
+            projections = [_projection(view, lower, (upper - lower) / level) for level in levels]
+            alive = np.flatnonzero(tree[0])
+            for chosen in np.array_split(alive, alive.size // _CHUNK + 1):
+                _carve(tree, view.table, projections, chosen, roots[:, chosen])
     for above, below in zip(tree[:-1], tree[1:], strict=True):
         below &= np.repeat(above, 8)
     # The axes are x y z of the roots, then x y z of each halving; all of one direction become adjacent.

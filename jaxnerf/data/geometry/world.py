@@ -46,6 +46,13 @@ def points_in_run(
     return np.linalg.solve(linear, (points - offset).T).T
 
 
+def direction_in_run(
+    direction: Float[np.ndarray, "3"], to_file: Float[Array | np.ndarray, "4 4"] | None
+) -> Float[np.ndarray, "3"]:
+    """Rotates a direction from the axes of the dataset's files to those of a run's world, see `Views.to_file`."""
+    return direction @ poses_in_file(np.eye(3, 4)[None], to_file)[0, :, :3]
+
+
 def _parts(to_file):
     """Returns the linear part of a similarity, its offset, and its rotation."""
     linear, offset = np.float64(to_file)[:3, :3], np.float64(to_file)[:3, 3]
@@ -90,11 +97,15 @@ def recenter(capture: Capture, *, bound_factor: float = 0.75) -> tuple[Capture, 
     return _moved(capture, scale, turn, poses[:, :, 3].mean(0))
 
 
-def center(capture: Capture) -> tuple[Capture, Float[np.ndarray, "4 4"]]:
+def center(capture: Capture, *, up: Float[np.ndarray, "3"] | None = None) -> tuple[Capture, Float[np.ndarray, "4 4"]]:
     """Moves a dataset so that its cameras look at the origin.
 
     The point closest to all cameras' axes becomes the origin, up becomes z, and the cameras' median distance
     becomes 1. The rotation is the smallest that takes up to z.
+
+    Args:
+        capture: any.
+        up: unit vector in the file's axes; None: `up_of` the cameras.
 
     Returns:
         The Capture, and the similarity that maps its world back to the file's.
@@ -110,7 +121,7 @@ def center(capture: Capture) -> tuple[Capture, Float[np.ndarray, "4 4"]]:
             f"{capture.source}: all {len(poses)} cameras are at the point that they look at "
             f"({middle.round(3).tolist()}), expected different positions; correct the poses"
         )
-    return _moved(capture, 1 / distance, _turn_upright(up_of(poses)), middle)
+    return _moved(capture, 1 / distance, _turn_upright(up_of(poses) if up is None else up), middle)
 
 
 def _turn_upright(up):

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import UInt
 
 from jaxnerf.data.images import image_files
+from jaxnerf.runtime import stages
 from jaxnerf.runtime.atomic_files import open_regular, partial_file
 from jaxnerf.runtime.fingerprint import file_sha256, fingerprint
 from jaxnerf.runtime.user_cache import private_folder
@@ -64,9 +65,9 @@ def fill_pixels(
             image = read_one()
             put(offset, image.reshape(-1, image.shape[-1]).astype(dtype, copy=False))
 
-        with ThreadPoolExecutor(num_workers()) as pool:
-            for _ in pool.map(one, zip(offsets, read, strict=True)):
-                pass
+        with ThreadPoolExecutor(num_workers()) as pool, stages.stage("reading images") as stage:
+            for done, _ in enumerate(pool.map(one, zip(offsets, read, strict=True)), 1):
+                stage.update(done, len(read))
 
     mapped = np.dtype(dtype).itemsize * shape[0] * shape[1] >= _LARGE
     path = pixels = None

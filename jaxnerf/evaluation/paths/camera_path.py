@@ -14,7 +14,7 @@ from jaxnerf.core.types import Camera
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import axis_of, check_pose
-from jaxnerf.data.geometry.world import poses_in_file, poses_in_run
+from jaxnerf.data.geometry.world import direction_in_run, poses_in_run
 from jaxnerf.data.readers.validation import is_number, read_json
 from jaxnerf.runtime.atomic_files import read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
@@ -166,9 +166,7 @@ def path_pixels(posed: Views, path: CameraPath, index: int, *, offset: float = 0
 
 def _direction(up, views):
     """Returns the unit vector of an axis of the dataset's files, "+x" to "-z", in the run's world; None of None."""
-    if up is None:
-        return None
-    return axis_of(up) @ poses_in_file(np.eye(3, 4)[None], views.to_file)[0, :, :3]
+    return None if up is None else direction_in_run(axis_of(up), views.to_file)
 
 
 def _relative(poses, origin):

@@ -58,7 +58,7 @@ def render_path(
         step: of the checkpoint; the newest when None.
         data_dir, settings: see `restore_run`.
         size: (width, height) px, see `camera_path.resize`.
-        num_frames, closed, up: see `camera_path.make_path`.
+        num_frames, closed, up: see `camera_path.make_path`; without up, it is that of the run's option `data.up`.
         fps: frames per second; when None the path file's, or 24.
         name: in place of the path's in the names of folder and video.
         rgba: whether rgba/0000.png is written, too: straight alpha, without the background.
@@ -81,6 +81,7 @@ def render_path(
     step = newest_step(run, workdir, step)
     variables = run.variables(step)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    up = up or run.experiment.config.data.up or None
     path = camera_path.make_path(_select_kind(path, views), views, num_frames=num_frames, closed=closed, up=up)
     path = camera_path.resize(path, *size)
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"

@@ -5,13 +5,14 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxnerf.core.cameras import project
 from jaxnerf.core.types import Camera, SparsePoints
 from jaxnerf.core.views import Views
 from jaxnerf.data.active_pixels import active_region
 from jaxnerf.data.geometry.free_space import surface_range
-from jaxnerf.data.geometry.seen_cells import clear_radii, likely_empty_cells, seen_cells
+from jaxnerf.data.geometry.seen_cells import _may_see, clear_radii, likely_empty_cells, seen_cells
 from jaxnerf.models.grid_schedule import make_grid_schedule
 
 SIZE, FOCAL = 48, 48.0  # px: each view covers 53 degrees
@@ -87,6 +88,24 @@ def test_seen_cells_are_those_in_the_frusta(min_views):
     counts = [sum(in_view(x, eye, slack).astype(int) for eye in (-1.0, 1.0)) for slack in (-0.15, 0.3)]
     assert seen[counts[0] >= min_views].all()
     assert not seen[counts[1] < min_views].any()
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_cells_far_from_all_that_a_view_shows_are_skipped(monkeypatch, contracted):
+    poses = some_views((-1.0, 1.0)).cameras.to_world.copy()
+    poses[1, :, :3] = Rotation.from_euler("xyz", (0.4, 2.0, 0.3)).as_matrix()
+    views = some_views((-1.0, 1.0), free_depth=np.float32([0.0, 1.0]))
+    views = dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, to_world=poses))
+    schedule, looked_at = a_schedule(contracted=contracted), []
+    found = seen_cells(views, schedule, min_views=1)
+
+    def every(*arguments):
+        looked_at.append(_may_see(*arguments))
+        return np.ones_like(looked_at[-1])
+
+    monkeypatch.setattr("jaxnerf.data.geometry.seen_cells._may_see", every)
+    np.testing.assert_array_equal(found, seen_cells(views, schedule, min_views=1))
+    assert 0 < np.mean(looked_at) < 0.9
 
 
 def test_a_masked_pixel_sees_nothing():

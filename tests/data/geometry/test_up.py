@@ -8,6 +8,7 @@ import pytest
 import captures
 from jaxnerf import load_dataset
 from jaxnerf.capture_check import report
+from jaxnerf.data import dataset
 from jaxnerf.data.geometry import world
 from jaxnerf.data.geometry.poses import sideways, up_of
 from jaxnerf.data.readers.base import read_capture
@@ -123,6 +124,15 @@ def test_the_check_is_not_sure_of_images_that_may_be_upside_down_and_takes_what_
 def test_the_check_is_sure_of_known_scenes(scenes_dir, name):
     poses = world.poses_of(read_capture(scenes_dir / name))
     assert "not sure" not in report._up_axis(poses, None)
+
+
+@pytest.mark.parametrize("up, row", [("+z", (0, 0, 1)), ("-y", (0, -1, 0))])
+def test_the_up_that_is_given_becomes_z_of_the_world_and_up_of_paths(tmp_path, up, row):
+    captures.write_transforms(tmp_path, captures.noise(captures.orbit(9)))
+    views = dataset.load_dataset(tmp_path, world="around", up=up)
+    np.testing.assert_allclose(world.direction_in_run(np.float64(row), views.to_file), (0, 0, 1), atol=1e-6)
+    path = make_path("turntable", views, up=up)
+    np.testing.assert_allclose(path.poses[:, 2, 0], 0, atol=1e-6)  # all horizons are level
 
 
 @pytest.mark.parametrize("up, sign", [("+z", 1), ("-z", -1)])
