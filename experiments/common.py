@@ -77,7 +77,7 @@ def run(config, folder, *, split: str | None = None) -> dict[str, Any] | None:
         return None
     views = load_split(config, split or config.eval.split)
     results = evaluate.score_run(restore.restore_run(folder), folder, split=split, overwrite=True, views=views)
-    origin = {"config": _plain(config), "split": split}
+    origin = {"config": plain_config(config), "split": split}
     write_text(pathlib.Path(folder) / _SCORED, json.dumps({"origin": origin, "results": results}) + "\n")
     jax.clear_caches()  # no other run has this step and this renderer
     return results
@@ -89,15 +89,19 @@ def finished(config, folder, *, split: str | None = None) -> dict[str, Any] | No
     if not path.exists():
         return None
     kept = json.loads(path.read_text())
-    origin = {"config": _plain(config), "split": split}
-    if kept["origin"] != origin:
-        old, new = _flat(kept["origin"]), _flat(origin)
+    origin = {"config": plain_config(config), "split": split}
+    check_origin(kept["origin"], origin, folder, "give another folder, or the old settings")
+    return kept["results"]
+
+
+def check_origin(old: Mapping[str, Any], new: Mapping[str, Any], folder: Any, remedy: str) -> None:
+    """Raises ValueError if the run in a folder has another origin, and names the first value that differs."""
+    if old != new:
+        old, new = _flat(old), _flat(new)
         key = next(key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key))
         raise ValueError(
-            f"{folder}: holds a finished run with {key} {old.get(key)!r}, expected {new.get(key)!r}; "
-            "give another folder, or the old settings"
+            f"{folder}: holds a finished run with {key} {old.get(key)!r}, expected {new.get(key)!r}; {remedy}"
         )
-    return kept["results"]
 
 
 def load_split(config, split: str) -> Views:
@@ -111,7 +115,7 @@ def load_split(config, split: str) -> Views:
     return views
 
 
-def _plain(config):
+def plain_config(config) -> dict[str, Any]:
     """Returns a config as JSON holds it, without the place of the dataset."""
     plain = json.loads(run_config.read_config(config).to_json())
     return plain | {"data": {key: value for key, value in plain["data"].items() if key != "dir"}}

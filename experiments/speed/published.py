@@ -1,6 +1,7 @@
-"""What others report, gathered before the project began; no script of this project measured it.
+"""What others report, and other programs that were run by hand; no script of this project measured it.
 
-Each entry names its source; "hardware" repeats that source and adds nothing.
+Each entry names its source; "hardware" repeats that source and adds nothing. "seconds" is None where the source gives
+no time. "what" names the images: figures of the same "what" compare with each other.
 """
 
 
@@ -65,3 +66,54 @@ PEERS = {
     "grid": {"OpenSplat": {25: 26.1, 52: 28.4, 109: 30.2}},
     "capture can": {"OpenSplat": {60: 22.6, 120: 23.7, 300: 24.5}},
 }
+
+# Whole test splits, and the 25 of the 200 test views (every 8th) that the benchmark scores.
+_LEGO_25, _MIC, _MIC_25 = "lego, 800x800, 25 test views", "mic, 800x800", "mic, 800x800, 25 test views"
+_PER_IMAGE = "nerfbaselines, results of each image"
+_TABLE = "nerfbaselines, table of November 2025"
+_BY_HAND, _AVX2, _TWO_CORES = "one run of each, by hand", "one core, AVX2, CPU s", "two busy cores, AVX-512, CPU s"
+
+# Beside the benchmark, with the entries of TRAINING for the same images.
+BENCHMARK = [
+    _entry("3DGS", 35.94, 359, "A100", _LEGO_25, _PER_IMAGE),
+    _entry("Zip-NeRF", 35.88, 5.3 * 3600, "A100", _LEGO_25, _PER_IMAGE),
+    _entry("instant-ngp", 35.78, 160, "A100", _LEGO_25, _PER_IMAGE),
+    _entry("mip-NeRF 360", 33.21, 2.7 * 3600, "A100", _LEGO_25, _PER_IMAGE),
+    _entry("nerfacto", 31.21, 584, "A100", _LEGO_25, _PER_IMAGE),
+    _entry("TensoRF", 36.49, 600, "A100", _LEGO, _TABLE),
+    _entry("3DGUT", 36.12, None, "A100", _LEGO, _TABLE),
+    _entry("Zip-NeRF", 35.81, 5.3 * 3600, "A100", _LEGO, _PER_IMAGE),
+    _entry("K-Planes", 35.73, None, "A100", _LEGO, _TABLE),
+    _entry("3DGS", 35.70, 359, "A100", _LEGO, _PER_IMAGE),
+    _entry("instant-ngp", 35.64, 160, "A100", _LEGO, _PER_IMAGE),
+    _entry("mip-NeRF 360", 33.20, 2.7 * 3600, "A100", _LEGO, _PER_IMAGE),
+    _entry("nerfacto", 31.37, 584, "A100", _LEGO, _PER_IMAGE),
+    _entry("Zip-NeRF", 35.78, None, "A100", _MIC_25, _PER_IMAGE),
+    _entry("3DGS", 35.39, None, "A100", _MIC_25, _PER_IMAGE),
+    _entry("instant-ngp", 35.33, 145, "A100", _MIC_25, _PER_IMAGE),
+    _entry("Tetra-NeRF", 34.51, None, "A100", _MIC_25, _PER_IMAGE),
+    _entry("nerfacto", 33.67, None, "A100", _MIC_25, _PER_IMAGE),
+    _entry("mip-NeRF 360", 31.48, None, "A100", _MIC_25, _PER_IMAGE),
+    _entry("3DGS-MCMC", 37.28, None, "not said", _MIC, _TABLE),
+    _entry("Zip-NeRF", 35.90, None, "A100", _MIC, _PER_IMAGE),
+    _entry("3DGS", 35.49, None, "A100", _MIC, _PER_IMAGE),
+    _entry("instant-ngp", 35.40, 145, "A100", _MIC, _PER_IMAGE),
+    _entry("nerfacto", 33.74, None, "A100", _MIC, _PER_IMAGE),
+    _entry("mip-NeRF 360", 31.50, None, "A100", _MIC, _PER_IMAGE),
+    _entry("TensoRF", 25.08, 32 * 60, "not said", "fern, 1008x756", _TABLE),
+]
+_BESIDE = {
+    "grid": "lego, 100x100, 25 test views",
+    "grid without alpha": "lego, 100x100, 25 test views, without alpha",
+    "capture can": "can, 180x320",
+}
+BENCHMARK += [
+    _entry(name, psnr, seconds, _AVX2, what, _BY_HAND, "side by side")
+    for curve, what in _BESIDE.items()
+    for name, points in PEERS[curve].items()
+    for seconds, psnr in points.items()
+]
+BENCHMARK += [
+    _entry("OpenSplat", psnr, seconds, _TWO_CORES, "can with new poses, undistorted, 177x316", _BY_HAND, "side by side")
+    for seconds, psnr in {60: 20.1, 120: 22.0, 300: 24.6}.items()
+]

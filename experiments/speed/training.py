@@ -93,7 +93,7 @@ def measure(
         for seed in seeds if name in SEEDED else seeds[:1]:
             points = curve["runs"].setdefault(str(seed), [])
             for time_limit in sorted(seconds or plan["seconds"]):
-                if any(_covers(point, time_limit) for point in points):
+                if any(covers(point, time_limit) for point in points):
                     continue
                 point = run_to(time_limit, configuration(name, seed), folder / workdir_name(name, seed, time_limit))
                 if point is None:
@@ -123,7 +123,7 @@ def run_to(time_limit: float, config, where: pathlib.Path) -> dict[str, Any] | N
         config: of the run.
         where: its workdir. Comparable seconds are scaled by the machine's speed just before and after the run.
     """
-    config.train.max_seconds = float(time_limit)
+    config = common.changed(config, {"train.max_seconds": float(time_limit)})
     fresh = not metric_log.read_rows(where)
     speed, started = [common.matrix_gflops()], time.perf_counter()
     if not train_and_evaluate(config, where):
@@ -157,6 +157,6 @@ def medians(runs: dict[str, list[dict]]) -> list[dict]:
     return found
 
 
-def _covers(point, time_limit):
+def covers(point: dict[str, Any], time_limit: float) -> bool:
     """Returns whether a run of so many seconds need not be measured: it was, or a shorter one ended by itself."""
     return point["time_limit"] == time_limit or (point["ended"] and point["time_limit"] < time_limit)
