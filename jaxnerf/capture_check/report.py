@@ -241,11 +241,11 @@ def _up_axis(poses, given):
     if turned.any():
         line += f"; {turned.sum()} of {len(poses)} images are stored sideways"
     if tilt > _TILTED:
-        line += f", not sure: the images are tilted by {tilt:.0f} degrees in the median; --up sets it"
+        line += f", not sure: the images are tilted by {tilt:.0f} degrees in the median; --up sets it, and --config.data.up in training"
     looks_up = np.degrees(np.arcsin(np.clip(-(poses[:, :, 2] @ up).mean(), -1, 1)))
     if looks_up > _LOOKS_UP:
         line += f", not sure: the cameras look up by {looks_up:.0f} degrees in the mean, as they seem to if the images "
-        line += "are stored upside down; --up sets it"
+        line += "are stored upside down; --up sets it, and --config.data.up in training"
     return line
 
 
