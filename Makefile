@@ -36,7 +36,7 @@ test: $(BIN)/.dev
 test-slow: $(BIN)/.dev
 	$(PYTEST) -m slow
 
-# These take longer, need root to mount small disks, or need Chromium; .ci/run does not call them.
+# These take longer, need root to mount small disks, or need Chromium and npm; .ci/run does not call them.
 test-extra: $(BIN)/.dev
 	$(BIN)/pip install --quiet --editable '.[notebooks]'
 	$(PYTEST) -m extra
@@ -51,6 +51,7 @@ test-extra: $(BIN)/.dev
 	$(BIN)/python experiments/gpu/run.py --tiny --minutes=60 --out=runs/extra/gpu
 	$(BIN)/pip install --quiet playwright
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/viewer_in_browser.py runs/extra/viewer
+	PYTHONPATH=.:tests $(BIN)/python tests/slow/mesh_in_browser.py runs/extra/mesh
 
 # zensical prints what griffe finds in docstrings, but does not fail.
 docs: $(BIN)/.dev

@@ -51,10 +51,10 @@ def orbit(count=14):
     )
 
 
-def source_of(scene=ball, *, say=lambda line: None, background=None, **settings):
-    """Returns the ExportSource of a scene over a background colour."""
-    views = orbit()
-    render = functools.partial(render_rays, None, num_samples=96, median_depth=True)
+def source_of(scene=ball, *, say=lambda line: None, background=None, count=14, num_samples=96, **settings):
+    """Returns the ExportSource of a scene over a background colour, with a number of views and of samples per ray."""
+    views = orbit(count)
+    render = functools.partial(render_rays, None, num_samples=num_samples, median_depth=True)
     compiled = jax.jit(lambda rays: render(scene, rays))
     experiment = SimpleNamespace(
         view_rays=functools.partial(ray_batches.view_rays, ndc=False),

@@ -16,6 +16,7 @@ from runs import ROOT
 pytest_plugins = ["run_fixtures"]
 
 DOCS = ROOT / "docs"
+COLUMNS = 88  # of code on the site, in a window of 1,280 px
 PUBLIC = r"^::: jaxnerf\.(\w+)$"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 EXAMPLES = [
@@ -74,10 +75,20 @@ def test_every_public_name_is_in_an_example_of_its_page(page):
     assert [name for name in names if not re.search(rf"\bjaxnerf\.{name}\b", code)] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_code_is_as_narrow_as_the_site_shows_it(page):
+    """What a program printed, the page of options and what results quote, is shown as it is."""
+    text, _, _ = page.read_text().partition("<!-- options -->")
+    blocks = re.findall(r"^ *```.*?^ *```", text, re.DOTALL | re.MULTILINE)
+    lines = [line for block in blocks for line in block.splitlines() if page.parent.name != "results"]
+    assert [line for line in lines if len(line) > COLUMNS] == []
+
+
 def fenced_lines(page):
     """Returns the lines of a page's blocks without a language, without comments."""
     fences = re.findall(r"^```\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
-    return [line.split(" #")[0].strip() for fence in fences for line in fence.splitlines()]
+    lines = [line for fence in fences for line in fence.replace("\\\n", " ").splitlines()]
+    return [line.split(" #")[0].strip() for line in lines]
 
 
 def commands(page):
