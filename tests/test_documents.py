@@ -77,10 +77,10 @@ def test_every_public_name_is_in_an_example_of_its_page(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_code_is_as_narrow_as_the_site_shows_it(page):
-    """What a program printed, the page of options and what results quote, is shown as it is."""
+    """What results quote, the list of options, and files that a page includes, are shown as they are."""
     text, _, _ = page.read_text().partition("<!-- options -->")
-    blocks = re.findall(r"^ *```.*?^ *```", text, re.DOTALL | re.MULTILINE)
-    lines = [line for block in blocks for line in block.splitlines() if page.parent.name != "results"]
+    fences = re.findall(r"^ *```.*?^ *```", text, re.DOTALL | re.MULTILINE)
+    lines = [line for fence in fences for line in fence.splitlines() if page.parent.name != "results"]
     assert [line for line in lines if len(line) > COLUMNS] == []
 
 
