@@ -19,6 +19,7 @@ from jaxnerf.data.images.load_images import split_indices
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 
+_SETS_UP = "--up sets it, and --config.data.up in training"
 _LOOKS_UP = 5.0  # degrees in the mean, above which images may be upside down; -34 to 0 in lego, mic, fox, fern, can
 _TILTED = 15.0  # degrees, in the median, by which images of a capture with a known up are not level
 _MAX_IMAGES = 500  # that are read, at a fifth of a second each on two cores
@@ -241,11 +242,11 @@ def _up_axis(poses, given):
     if turned.any():
         line += f"; {turned.sum()} of {len(poses)} images are stored sideways"
     if tilt > _TILTED:
-        line += f", not sure: the images are tilted by {tilt:.0f} degrees in the median; --up sets it, and --config.data.up in training"
+        line += f", not sure: the images are tilted by {tilt:.0f} degrees in the median; {_SETS_UP}"
     looks_up = np.degrees(np.arcsin(np.clip(-(poses[:, :, 2] @ up).mean(), -1, 1)))
     if looks_up > _LOOKS_UP:
         line += f", not sure: the cameras look up by {looks_up:.0f} degrees in the mean, as they seem to if the images "
-        line += "are stored upside down; --up sets it, and --config.data.up in training"
+        line += f"are stored upside down; {_SETS_UP}"
     return line
 
 
