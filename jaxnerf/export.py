@@ -58,6 +58,10 @@ _CLOSED = flags.DEFINE_bool(
 _MIN_PIECE = flags.DEFINE_float(
     "min_piece", 0.005, "mesh: connected pieces with fewer triangles than this fraction of all are dropped."
 )
+_CONCERN = {  # the flags that only some kinds read
+    ("mesh",): (_FORMAT, _UP, _MAX_FACES, _CLOSED, _MIN_PIECE),
+    ("points", "splats"): (_NUM_POINTS,),
+}
 _NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an existing folder of that name.")
 
@@ -67,6 +71,12 @@ def main(argv):
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.exporters.base import ExportSettings, export_run
 
+    for kinds, holders in _CONCERN.items():
+        given = [flag.name for flag in holders if flags.FLAGS[flag.name].present]
+        if given and _KIND.value not in kinds and _KIND.value in ("mesh", "points", "splats", "depth"):
+            raise ValueError(
+                f"--{given[0]} is given and --kind={_KIND.value}, expected --kind={' or '.join(kinds)}; drop it"
+            )
     names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
     names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED, "up": _UP}
     try:

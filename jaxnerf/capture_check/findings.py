@@ -30,7 +30,9 @@ class Finding(NamedTuple):
     frames: tuple[int, ...] = ()
 
     def line(self) -> str:
-        """Returns the finding as one line of text."""
+        """Returns the finding as one line of text; a note of a reader expects nothing."""
+        if not self.expected:
+            return f"{self.severity.upper():7} {self.found}"
         return f"{self.severity.upper():7} {self.found}; expected {self.expected}; change: {self.change}"
 
 

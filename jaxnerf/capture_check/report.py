@@ -20,6 +20,9 @@ from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 
 _SETS_UP = "--up sets it, and --config.data.up in training"
+_FEW_FIT = 0.2  # fraction of matched corners that fit; 35 to 74 % in lego, mic, fox, fern, can
+_OF_CAMERAS = ("axes", "focal", "overlap", "pose", "swap", "fold")  # kinds of findings that explain it
+_SAME = 3  # findings about single files of one kind that are shown
 _LOOKS_UP = 5.0  # degrees in the mean, above which images may be upside down; -34 to 0 in lego, mic, fox, fern, can
 _TILTED = 15.0  # degrees, in the median, by which images of a capture with a known up are not level
 _MAX_IMAGES = 500  # that are read, at a fifth of a second each on two cores
@@ -55,7 +58,13 @@ class Report(NamedTuple):
         """Returns the report as text: one line for each fact, one for each finding, and a summary."""
         width = max(len(name) for name, _ in self.facts)
         lines = [f"{name:{width}}  {value}" for name, value in self.facts]
-        lines += [finding.line() for finding in self.findings]
+        groups: dict[tuple[str, str], list[Finding]] = {}
+        for finding in self.findings:  # a fault of all images is stated for the first ones
+            groups.setdefault((finding.severity, finding.kind), []).append(finding)
+        for (_, kind), found in groups.items():
+            shown = _SAME if kind in ("size", "file") else len(found)
+            lines += [finding.line() for finding in found[:shown]]
+            lines += [f"        and {len(found) - shown} more images like these"] if found[shown:] else []
         errors, warnings = self.num_errors, len(self.findings) - self.num_errors
         summary = f"{errors or 'no'} error{'s' * (errors != 1)}, {warnings or 'no'} warning{'s' * (warnings != 1)}"
         return "\n".join([*lines, summary])
@@ -99,6 +108,10 @@ def inspect(
             flagged = {index for finding in views for index in finding.frames if finding.severity == "error"}
             findings += folds.judge_folds(capture, evidence, flagged)
     findings += wrong
+    if evidence.fraction < _FEW_FIT and not any(finding.kind in _OF_CAMERAS for finding in findings):
+        found = f"{capture.source}: only {percent(evidence.fraction)} of the matched corners fit the cameras"
+        change = "focal lengths, lens and poses, unless the texture of the scene repeats itself"
+        findings.append(Finding("warning", "pose", found, "a third or more", change))
     points, point_tracks = cameras.points_of(evidence)
     bounds, stated = depths.ranges(capture, near, far)
     depth = depths.view_depths(evidence.poses, points, point_tracks)
@@ -106,13 +119,10 @@ def inspect(
         findings += depths.judge_bounds(depth, bounds[point_tracks.views[:, 0]], stated)
     findings += depths.judge_box(capture, points)
     findings += _judge_splits(whole)
-    findings += [
-        Finding("warning", "skipped", note, "nothing skipped", "the files named, if this is not intended")
-        for note in whole.notes
-    ]
+    findings += [Finding("warning", "skipped", note, "", "") for note in dict.fromkeys(whole.notes)]
     path, line = _path(whole, given)
     facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence, images, given)
-    facts += [("near, far", _range(bounds, stated, depth)), ("path", line)]
+    facts += [("near, far", _range(bounds, stated, depth, capture.box)), ("path", line)]
     order = sorted(findings, key=lambda finding: finding.severity != "error")
     direction = up_of(evidence.poses) if given is None else given
     return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path, direction)
@@ -205,9 +215,10 @@ def _scale_to_files(capture, images):
     return 1.0, ""
 
 
-def _range(bounds, stated, depth):
+def _range(bounds, stated, depth, box):
     near, far = np.median(bounds, axis=0)
-    line = f"{near:.4g} to {far:.4g} ({f'from {stated}' if stated else 'computed from the cameras and points'})"
+    computed = f"computed from the cameras{' and the box of the file' if box is not None else ' and points'}"
+    line = f"{near:.4g} to {far:.4g} ({f'from {stated}' if stated else computed})"
     if len(depth):
         low, high = np.percentile(depth, [2, 98])
         line += f"; {len(depth)} points on which the images agree are at depths of {low:.4g} to {high:.4g}"
@@ -255,7 +266,7 @@ def _path(capture, up):
     frames = [capture.frames[index] for index in split_indices(capture, "train")]
     poses = np.stack([frame.camera.to_world for frame in frames])
     try:
-        kind, reason = path_poses.default_kind(poses)
+        kind, reason = path_poses.default_kind(poses, up=up)
     except ValueError as error:
         return None, str(error)
     line = f"jaxnerf-render selects {kind}, as {reason}"

@@ -59,7 +59,7 @@ class DataOptions(Options):
     )
     factor: int = option(
         1,
-        "images are shrunk by this factor (area average); auto: to about `width`",
+        "images are shrunk by this whole number (area average); auto: the one whose images are nearest to `width`",
         range=at_least(1),
         auto=True,
         protocol=True,
@@ -220,6 +220,8 @@ def _resolve(data):
             color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
             infer("background", color, f"background    {color}")
         infer("fingerprint", fingerprint(capture))
+    if data.up:
+        lines.append(f"up            {data.up} of the dataset's files, as data.up says")
     infer("ndc", data.world == "forward", f"NDC           {'on' if data.world == 'forward' else 'off'}")
     return data, lines, capture
 

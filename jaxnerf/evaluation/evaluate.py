@@ -198,7 +198,8 @@ def summary(results: dict[str, Any]) -> str:
         metrics += f" ({results['psnr_aligned']:.2f} dB, {results['ssim_aligned']:.4f} after colour alignment)"
     shared = results.get("conventions", {}).get("shared_with_training")
     note = f"; note: {shared['note']}" if shared else ""
-    return f"{step}{metrics} over {results['views']} views{speed}{note}"
+    paired = "" if results.get("paired_by", "name") == "name" else f", paired by {results['paired_by']}"
+    return f"{step}{metrics} over {results['views']} views{speed}{paired}{note}"
 
 
 def _score_views(run, render, views, folder, shard):

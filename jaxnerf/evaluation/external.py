@@ -1,6 +1,7 @@
 """Scores predictions, images that were rendered elsewhere, against a dataset or a folder of references."""
 
 import json
+import logging
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -8,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from absl import logging
 from jax.typing import ArrayLike
 
 from jaxnerf.data.images.image_files import is_hidden, read_image
@@ -18,6 +18,9 @@ from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import build
 from jaxnerf.training.config import Config
+
+_logger = logging.getLogger(__name__)
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
 def score_folder(
@@ -58,12 +61,13 @@ def score_folder(
         references = [np.asarray(views.image(index)) for index in range(len(truths))]
         masks = [pixel_mask(views, index) for index in range(len(truths))]
         about = protocol.of_views(conventions, views, split=split)
+    names = [Path(str(truth)).stem for truth in truths]
     if len(paths) != len(truths):
         raise ValueError(
-            f"{paths[0].parent}: holds {len(paths)} images, expected {len(truths)}, one for each reference; add or "
-            "remove images"
+            f"{paths[0].parent}: holds {len(paths)} images, expected {len(truths)}, one for each reference"
+            f"{_unpaired([path.stem for path in paths], names)}; add or remove images"
         )
-    paths, how = _paired(paths, [Path(str(truth)).stem for truth in truths])
+    paths, how = _paired(paths, names)
     names = [path.name for path in paths]
     results = score_predictions(map(_colors, paths), references, names=names, masks=masks) | {"paired_by": how, **about}
     atomic_files.write_text(target, json.dumps(results, indent=2) + "\n")
@@ -102,6 +106,15 @@ def score_predictions(
     return {**means(rows), "views": len(rows), "images": rows}
 
 
+def _unpaired(found, expected):
+    """Returns which names have no reference, and which references no image, if most names agree."""
+    extra, missing = (sorted(set(a) - set(b), key=_natural) for a, b in ((found, expected), (expected, found)))
+    if len(missing) > len(expected) / 2:
+        return ""
+    parts = [(extra, "without a reference"), (missing, "missing")]
+    return "".join(f"; {what}: {', '.join(some[:5])}{' ...' if some[5:] else ''}" for some, what in parts if some)
+
+
 def _paired(paths, names):
     """Returns the paths, given in natural order, in the order of the references, and by what they were paired."""
     for how, key in {"name": str, "number": _last_number}.items():
@@ -117,7 +130,7 @@ def _reported(paths, names, how):
         pairs = ", ".join(f"{path.name} with {name}" for path, name in zip(paths[:3], names[:3], strict=True))
         by = "the numbers in them" if how == "number" else "order, as the numbers in them differ, too"
         folder = paths[0].parent
-        logging.warning("%s: names differ from those of the references; paired by %s: %s ...", folder, by, pairs)
+        _logger.warning("%s: names differ from those of the references; paired by %s: %s ...", folder, by, pairs)
     return paths, how
 
 
@@ -134,12 +147,12 @@ def _natural(name):
 
 
 def _image_paths(folder):
-    found = [path for path in folder.glob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    found = [path for path in folder.glob("*") if path.suffix.lower() in _SUFFIXES]
     paths = sorted((path for path in found if not is_hidden(path.name)), key=lambda path: _natural(path.stem))
     if not paths:
         raise ValueError(
-            f"{folder}: holds no PNG or JPEG images, expected images; correct the folder, or name the dataset of the "
-            "references with --data_dir, --config or --workdir"
+            f"{folder}: holds no images ({', '.join(_SUFFIXES)}); correct the folder, or, if these are the references, "
+            "name their dataset with --data_dir, --config or --workdir"
         )
     return paths
 

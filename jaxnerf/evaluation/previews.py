@@ -17,7 +17,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_run
-from jaxnerf.runtime import atomic_files, memory, processes
+from jaxnerf.runtime import atomic_files, memory, processes, stages
 from jaxnerf.training import metric_log
 from jaxnerf.training.state import TrainState
 
@@ -101,11 +101,13 @@ class Previews:
         lines = []
         if self._run.experiment.config.eval.summary_seconds:
             try:
-                variables = _on_one_device(self._run.variables(step))
-                lines.append(f"training      {self._mean_psnr(variables, views)} of {len(views.offset)} images")
-                if held_out is not None and not results.exists():
-                    lines.append(f"held-out      {self._mean_psnr(variables, held_out)} images of the split {split!r}")
-                lines.append(self._write(variables, step, views))
+                with stages.stage("scoring some images"):
+                    variables = _on_one_device(self._run.variables(step))
+                    lines.append(f"training      {self._mean_psnr(variables, views)} of {len(views.offset)} images")
+                    if held_out is not None and not results.exists():
+                        scored = self._mean_psnr(variables, held_out)
+                        lines.append(f"held-out      {scored} images of the split {split!r}")
+                    lines.append(self._write(variables, step, views))
             except _FAILURES as error:
                 lines.append(f"scores        none: {error}")
         if results.exists():

@@ -204,6 +204,8 @@ def load_scene(workdir: str | os.PathLike) -> tuple[SceneFn, Callable[[Rays], Re
         except the progress of training, which is the checkpoint's; and render, a function
         Rays [...] -> Rendering [...] with the samples and background of the run's evaluation. It renders in chunks
         that fit into memory, and skips rays that hit nothing; inside a jitted function it renders all rays at once.
+        It has no gradient in reverse mode, as it ends rays early; for one, pass scene to `render_rays`, with the near,
+        far and background of the run, see `TrainedRun`.
 
     Raises:
         ValueError: if the folder holds no finished checkpoint; names it.

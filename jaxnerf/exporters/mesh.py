@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from skimage import measure
 
 from jaxnerf.core.cameras import project
-from jaxnerf.data.geometry.poses import axis_of, up_of
+from jaxnerf.data.geometry.poses import AXES, axis_of, up_of
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.exporters.base import ExportSource, check_memory
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
@@ -32,6 +32,7 @@ _TRUNCATION = 2.5  # voxels
 _FREE = 3.0  # truncations in front of a surface, from which on space counts as free whatever the surface's normal
 _MIN_WEIGHT = 0.05  # of all views of a vertex; one that sees an opaque surface at 45 degrees has 0.7
 _CHUNK = 2**18  # vertices updated at once
+_NEARLY_AXIS = 15.0  # degrees from an axis of the files, within which up may be meant to be that axis
 _EMPTY_WEIGHT = 0.3  # of a pixel that shows empty space
 
 
@@ -57,8 +58,14 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     with atomic_files.naming(path):
         if settings.format == "glb":
             poses = poses_in_file(np.asarray(source.views.cameras.to_world), source.views.to_file)
-            up = settings.up or source.run.experiment.config.data.up
-            write_glb(mesh, path, up=axis_of(up) if up else up_of(poses))
+            given = settings.up or source.run.experiment.config.data.up
+            up = axis_of(given) if given else up_of(poses)
+            nearest = max(AXES, key=lambda axis: axis_of(axis) @ up)
+            angle = np.degrees(np.arccos(np.clip(axis_of(nearest) @ up, -1, 1)))
+            if not given and 0.1 < angle < _NEARLY_AXIS:
+                where = f"{angle:.1f} degrees from {nearest}"
+                source.say(f"up is {where}, by how the cameras are held; --up={nearest} sets it")
+            write_glb(mesh, path, up=up)
         else:
             mesh.export(path)
     sides = " x ".join(f"{side:.4g}" for side in mesh.extents)

@@ -9,6 +9,7 @@ import importlib
 import logging as std_logging
 import os
 import pathlib
+import re
 import signal
 import sys
 import traceback
@@ -182,8 +183,10 @@ def config_path(value: str) -> str:
     if os.path.isfile(name):
         return value
     if name not in config_names():
+        near = difflib.get_close_matches(name, config_names(), n=1)
+        meant = f"; did you mean {near[0]}?" if near else ""
         raise ValueError(
-            f"there is no file and no config {name!r}, expected a path or one of {', '.join(config_names())}"
+            f"there is no file and no config {name!r}, expected a path or one of {', '.join(config_names())}{meant}"
         )
     return f"{CONFIGS / name}.py{colon}{argument}"
 
@@ -231,8 +234,18 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         if not verbosity.present or verbosity.value in (0, 1):
             level = std_logging.INFO if verbosity.present else std_logging.WARNING
             logging.set_verbosity(logging.FATAL)  # orbax logs every file that it touches
-            std_logging.getLogger("jaxnerf").setLevel(level)
+            logger = std_logging.getLogger("jaxnerf")
+            logger.setLevel(level)
+            if logger.propagate:  # otherwise absl would put the date and a line number before each message
+                logger.addHandler(std_logging.StreamHandler())
+                logger.propagate = False
         return rest
+    except flags.IllegalFlagValueError as error:
+        required = re.fullmatch(r"flag --(\w+)=None: Flag --\w+ must have a value other than None\.", str(error))
+        if not required:
+            _leave(2, error)
+        help = flags.FLAGS[required[1]].help
+        _leave(2, f"--{required[1]} is missing: {help[0].lower()}{' '.join(help[1:].split())}")
     except flags.UnrecognizedFlagError as error:
         if error.flagname.startswith("config."):
             _leave(2, f"{error}; give --config=NAME, which has such fields")
@@ -289,6 +302,7 @@ def _help(module: str) -> str:
         name = f"[no]{flag.name}" if flag.boolean else flag.name
         default = f" Default: {flag.default_as_str.strip(chr(39))}." if flag.default else ""
         lines.append(flags.text_wrap(f"--{name}: {flag.help}{default}", 100, indent="      ", firstline_indent="  "))
+    lines.append("  --verbosity: 1 prints every inferred value with its reason, 2 also what libraries log.")
     return "\n".join([*lines, "", "--helpfull lists the flags of the libraries, too."])
 
 

@@ -1,6 +1,5 @@
 """Memory: how much is free, whether a program fits, and retrying with smaller parts when it does not."""
 
-import itertools
 import pathlib
 import sys
 from collections.abc import Callable
@@ -165,22 +164,19 @@ def image_renderer(
         key = requested, _shapes(variables)
 
         def attempt(size):
-            done, total = itertools.count(1), -(-rays.near.size // size)
-
             def part(rays):
                 if (size, key) not in checked:
                     # For the arrays themselves, not only their shapes: the call would compile again for arrays that are
                     # bound to a device.
                     check(render.lower(variables, rays).compile())
                     checked.add((size, key))
-                current.update(next(done), total)
                 return render(variables, rays)
 
             if cull is None:
                 return jax.block_until_ready(render_image(part, rays, chunk=size))
             return jax.block_until_ready(render_selected(part, rays, *cull(variables, rays), chunk=size))
 
-        with stages.stage("rendering an image") as current:
+        with stages.stage("rendering an image"):
             result, fitting[key] = back_off(
                 attempt, fitting.get(key, requested), cause="image", unit="rays per chunk (--chunk)"
             )

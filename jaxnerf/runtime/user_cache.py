@@ -54,7 +54,7 @@ def load_or_make(
             return arrays
         _logger.warning("%s holds unexpected arrays; they are computed again", path)
     except FileNotFoundError:
-        _logger.info("%s does not exist yet; its arrays are computed", path)
+        _logger.debug("%s does not exist yet; its arrays are computed", path)
     except Exception as error:  # a damaged zip file raises almost any exception
         _logger.warning("%s cannot be read (%s); its arrays are computed again", path or folder or "the cache", error)
     start = time.perf_counter()

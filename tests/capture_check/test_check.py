@@ -93,6 +93,33 @@ def kinds(report):
     return {finding.kind for finding in report.findings if finding.severity == "error"}
 
 
+def test_cameras_that_hardly_fit_any_image_are_reported(folders, tmp_path):
+    """No single camera is at fault, and no common change of all of them helps."""
+
+    def plant(folder):
+        content = json.loads((folder / "transforms.json").read_text())
+        rng = np.random.default_rng(0)
+        for frame in content["frames"]:
+            factor = float(rng.choice([0.75, 1.0, 1.3]))
+            frame |= {"fl_x": factor * content["fl_x"], "fl_y": factor * content["fl_y"]}
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+    report = planted(folders, tmp_path, "transforms", plant)
+    assert [finding for finding in report.findings if finding.kind in ("pose", "focal", "axes")], report.text()
+
+
+def test_a_fault_of_all_images_is_stated_for_the_first_ones(folders, tmp_path):
+    def plant(folder):
+        content = json.loads((folder / "transforms.json").read_text())
+        for level in [content, *content["frames"]]:
+            if "w" in level:
+                level["w"], level["h"] = level["h"] // 2, level["w"]
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+    text = planted(folders, tmp_path, "transforms", plant).text()
+    assert text.count("its camera is for") == 3 and "and 9 more images like these" in text and "12 errors" in text
+
+
 @pytest.mark.parametrize("format", ["transforms", "colmap", "llff"])
 def test_a_dataset_without_defects_has_no_errors(folders, format):
     report = inspect(folders / format)

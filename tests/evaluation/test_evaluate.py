@@ -14,7 +14,7 @@ import captures
 import oracle
 from jaxnerf import load_dataset, load_scene, pixel_grid, render_image
 from jaxnerf.evaluation import external
-from jaxnerf.evaluation.evaluate import evaluate, score_run, watch
+from jaxnerf.evaluation.evaluate import evaluate, score_run, summary, watch
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import build
@@ -160,6 +160,17 @@ def test_predictions_are_paired_by_name_or_number_or_in_natural_order(tmp_path, 
     assert results["paired_by"] == how and results["psnr"] == np.inf
     warned = [record.getMessage() for record in caplog.records if "paired by" in record.getMessage()]
     assert len(warned) == (how != "name")
+    assert (f"paired by {how}" in summary(results)) == (how != "name")
+
+
+def test_predictions_without_a_reference_and_missing_ones_are_named(tmp_path):
+    for folder, names in (("color", "01349x"), ("gt-color", "0123456789")):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            iio.imwrite(tmp_path / folder / f"r_{name}.png", np.zeros((12, 12, 3), np.uint8))
+    named = "without a reference: r_x; missing: r_2, r_5, r_6, r_7, r_8; add"
+    with pytest.raises(ValueError, match=f"6 images, expected 10, .*; {named}"):
+        external.score_folder(tmp_path)
 
 
 @pytest.mark.parametrize(

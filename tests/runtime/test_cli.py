@@ -84,6 +84,8 @@ def test_an_existing_file_wins_over_a_config_name(tmp_path, monkeypatch):
 def test_a_wrong_config_name_lists_the_names():
     with pytest.raises(ValueError, match="no config 'lego_slow', expected a path or one of .*lego_fast, lego_mlp_fast"):
         cli.config_path("lego_slow")
+    with pytest.raises(ValueError, match="no config 'lego_fats', .*; did you mean lego_fast"):
+        cli.config_path("lego_fats")
 
 
 @pytest.mark.parametrize(
@@ -156,6 +158,7 @@ def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
 @pytest.mark.parametrize(
     "program, flag, expected",
     [
+        ("export", "--workdir=x", "--kind is missing: what to export: mesh, points, depth, splats, or a registered"),
         ("train", "--max_steps=3", "--max_steps: no such flag; did you mean --config.train.max_steps?"),
         ("train", "--train.lr_init=1", "--train.lr_init: no such flag; did you mean --config.train.lr_init?"),
         ("train", "--max-step=1", "--max-step: no such flag; did you mean --config.train.max_steps?"),

@@ -84,8 +84,14 @@ def coverage(poses: Float[Array | np.ndarray, "V 3 4"], up: Float[np.ndarray, "3
     return Coverage(center, up, azimuth, elevation, distance, float(gaps.max()), (float(arc[0]), float(arc[1])))
 
 
-def default_kind(poses: Float[Array | np.ndarray, "V 3 4"]) -> tuple[str, str]:
+def default_kind(
+    poses: Float[Array | np.ndarray, "V 3 4"], up: Float[np.ndarray, "3"] | None = None
+) -> tuple[str, str]:
     """Selects the kind of path that stays where cameras are.
+
+    Args:
+        poses: of the cameras.
+        up: unit vector; None: `up_of`.
 
     Returns:
         The kind: "turntable" only where the cameras surround what they look at, "arc" where they look at it from
@@ -100,7 +106,7 @@ def default_kind(poses: Float[Array | np.ndarray, "V 3 4"]) -> tuple[str, str]:
         return "interpolate", f"all {len(poses)} cameras are at one position"
     if look_one_way(poses):
         return "spiral", f"all {len(poses)} cameras look one way"
-    cover = coverage(poses)
+    cover = coverage(poses, up)
     inwards = (((poses[:, :, 3] - cover.center) * poses[:, :, 2]).sum(axis=1) > 0).mean()
     if inwards < 0.9:
         return "interpolate", f"only {inwards:.0%} of the {len(poses)} cameras look at a common point"

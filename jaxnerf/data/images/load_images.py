@@ -163,9 +163,12 @@ def check_size(path: Path, found: tuple[int, int], declared: tuple[int, int]) ->
         ValueError: names the image and both sizes.
     """
     if not fits(found, declared):
+        change = "copy the original or correct the camera"
+        if fits(found, declared[::-1]):
+            change = "swap the camera's width and height, and look at its focal lengths and centre, too"
         raise ValueError(
             f"{path}: is {found[1]} x {found[0]}, its camera is for {declared[1]} x {declared[0]}; expected "
-            "that size divided by a whole number; copy the original or correct the camera"
+            f"that size, or both sides smaller by one whole number; {change}"
         )
 
 

@@ -139,7 +139,7 @@ def origin_near(positions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"] |
     if not distance > _FAR_AWAY * spread > 0:
         return None
     unit = 10.0 ** math.floor(math.log10(spread))
-    return np.round(middle / unit) * unit
+    return np.array([float(f"{value:.12g}") for value in np.round(middle / unit) * unit])
 
 
 def moved(frame: Frame, origin: Float[np.ndarray, "3"] | None) -> Frame:

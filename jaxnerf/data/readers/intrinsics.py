@@ -22,7 +22,8 @@ _UNUSED = {  # facts of other programs: why they are not used
     "rolling_shutter": "all pixels of an image have one pose",
     **dict.fromkeys(("transform_matrix_start", "transform_matrix_end"), "transform_matrix is the pose"),
     **dict.fromkeys(("K", "intrinsics", "intrinsic_matrix"), "fl_x, fl_y, cx and cy are read"),
-    **dict.fromkeys(("near", "far"), "set data.near and data.far"),
+    "near": "it follows from the cameras; data.near sets it",
+    "far": "it follows from the cameras; data.far sets it",
     **dict.fromkeys(("shift_x", "shift_y"), "cx and cy are read"),
 }
 _TERMS = {"SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
@@ -86,7 +87,7 @@ def ignored_facts(levels: list[tuple[Any, dict]], camera: Camera, image: Path) -
     model, where = fields.get("camera_model", (None, None))
     extra = [key for key in _COEFFICIENTS if model in _TERMS and key in fields and key not in _TERMS[model]]
     if extra := [key for key in extra if fields[key][0]]:
-        found["camera_model"] = f"{where}: camera_model {model} has no {extra[0]}, which is used as stated"
+        found["camera_model"] = f"{where}: camera_model {model} has no {', '.join(extra)}, used as stated all the same"
     return found | _other_angles(fields, camera, image)
 
 

@@ -15,6 +15,12 @@ from jaxnerf.data.readers.split_files import SPLITS, full_cameras, split_files
 from jaxnerf.data.readers.validation import is_number, read_json, read_times, required
 from jaxnerf.registry import Reader
 
+_UNUSED = {  # facts of other programs that are no camera's, and what sets them instead
+    "up": "data.up sets the axis that is up",
+    "exposure": "cameras.exposure trains the exposure of each image",
+    "background_color": "data.background_color sets it",
+}
+
 
 def read_capture(folder: str | os.PathLike) -> Capture:
     """Returns the Capture of the images that <folder>/transforms.json lists, or transforms_{train,val,test}.json.
@@ -80,9 +86,23 @@ def _read_splits(folder, stated):
         splits=split_ranges(paths, frames) if len(paths) > 1 else None,
         points=first.points,
         box=first.box,
-        notes=(*sum((file.notes for file in files.values()), ()), *finder.notes(first.source), *notes),
+        notes=(*_joined_notes(files.values()), *finder.notes(first.source), *notes),
         choices=(choice, *held_out, *_world(first)),
     )
+
+
+def _joined_notes(files):
+    """Returns the notes of files; one that several files have is stated once, with their names."""
+    found: dict[str, list[Path]] = {}
+    for file in files:
+        for note in file.notes:
+            place, _, rest = note.partition(": ")
+            found.setdefault(rest if place == str(file.source) else note, []).append(file.source)
+    own = {note for file in files for note in file.notes}
+    return [
+        note if note in own else f"{', '.join([str(sources[0]), *(source.name for source in sources[1:])])}: {note}"
+        for note, sources in found.items()
+    ]
 
 
 class _File(NamedTuple):
@@ -168,6 +188,11 @@ def _entries(content, source, finder):
             raise ValueError(f"{source}: {found}, expected different names; remove or rename one")
     depths = sum("depth_file_path" in frame or "depth_path" in frame for frame in frames)
     notes = [f"{source}: depth files of {depths} frames are not used"] if depths else []
+    notes += [
+        f"{source}: {key} is not used: {why}"
+        for key, why in _UNUSED.items()
+        if any(key in level for level in (content, *frames))
+    ]
     return entries, base, [*_missing(entries, source, finder), *notes]
 
 
@@ -254,7 +279,7 @@ def _world(file):
     keys = [key for key in ("applied_transform", "applied_scale", "orientation_override") if key in file.content]
     if not keys:
         return []
-    return [f"{file.source.name}: {', '.join(keys)} not undone: the world of the file is that of its poses"]
+    return [f"{file.source.name}: {', '.join(keys)}: positions are those after it, as in the file's poses"]
 
 
 def _points(content, source, finder):

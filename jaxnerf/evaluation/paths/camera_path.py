@@ -81,7 +81,7 @@ def make_path(
     if kind == "interpolate":
         poses, focal = _through_views(views, num_frames, closed)
     else:
-        poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames, _direction(up, views))
+        poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames, up_direction(up, views))
         focal = np.tile(np.float64(views.cameras.focal)[:1], (len(poses), 1))
     height, width = (int(side) for side in views.size[0])
     center = np.tile(np.float64(views.cameras.center)[:1], (len(poses), 1))
@@ -164,7 +164,7 @@ def path_pixels(posed: Views, path: CameraPath, index: int, *, offset: float = 0
     return np.float32(points * posed.cameras.focal[index] + posed.cameras.center[index])
 
 
-def _direction(up, views):
+def up_direction(up: str | None, views: Views) -> np.ndarray | None:
     """Returns the unit vector of an axis of the dataset's files, "+x" to "-z", in the run's world; None of None."""
     return None if up is None else direction_in_run(axis_of(up), views.to_file)
 

@@ -187,9 +187,11 @@ def test_a_test_split_without_images_does_not_end_training(tmp_path, shots):
         ({"camera_angle_y": 1.0}, "camera_angle_y 1 is a focal length of 21.966 of 24 px, 41 px is stated"),
         ({"k5": 0.1}, "k5 is not used, as no lens"),
         ({"rolling_shutter": [0, 0, 0.1, 0]}, "rolling_shutter is not used, as all pixels"),
-        ({"near": 0.5}, "near is not used, as set data.near"),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, "camera_model PINHOLE has no k1, which is used as stated"),
-        ({"camera_model": "SIMPLE_RADIAL", "k2": 0.1}, "camera_model SIMPLE_RADIAL has no k2, which is used"),
+        ({"near": 0.5}, "near is not used, as it follows from the cameras; data.near sets it"),
+        ({"camera_model": "PINHOLE", "k1": 0.1, "p1": 0.2}, "camera_model PINHOLE has no k1, p1, used as stated"),
+        ({"up": [0, 1, 0]}, "up is not used: data.up sets"),
+        ({"exposure": 0.5}, "exposure is not used"),
+        ({"camera_model": "SIMPLE_RADIAL", "k2": 0.1}, "camera_model SIMPLE_RADIAL has no k2, used"),
         ({"k1": 0.2, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, "k1 is 0.2, distortion_params has 0.1, which is used"),
         ({"camera_angle_x": 2 * np.arctan(16 / 40), "rolling_shutter": [0, 0, 0, 0], "k5": 0.0}, None),
         ({"camera_model": "OPENCV", "k1": 0.1}, None),
@@ -206,7 +208,8 @@ def test_facts_that_are_stated_and_not_used_are_noted(tmp_path, stated, note, ow
     capture = transforms.read_capture(tmp_path)
     assert len(capture.notes) == (note is not None)
     if note:
-        assert note in capture.notes[0] and capture.notes[0].endswith("so in 4 frames") == own
+        counted = own and "data.up" not in note and "exposure" not in note
+        assert note in capture.notes[0] and capture.notes[0].endswith("so in 4 frames") == counted
 
 
 def test_an_angle_that_a_frame_overrides_is_no_contradiction(tmp_path):
@@ -225,4 +228,4 @@ def test_frames_in_no_list_of_names_are_noted(tmp_path, shots):
 def test_the_world_that_a_file_was_made_from_is_named(tmp_path, shots):
     captures.write_transforms(tmp_path, shots, extra={"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2})
     choices = transforms.read_capture(tmp_path).choices
-    assert len(choices) == 1 and "applied_transform, applied_scale not undone" in choices[0]
+    assert len(choices) == 1 and "applied_transform, applied_scale: positions are those after it" in choices[0]
