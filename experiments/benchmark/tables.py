@@ -26,7 +26,8 @@ Beside it stand published figures, and programs that were run on the same images
   25, every 8th of the 200. nerfbaselines truncates colours, which costs up to 0.07 dB at 35 dB.
 {protocols}
 - **Training.** Each row is a run of its own, whose learning rate reaches its end when its time does. Seconds exclude
-  set-up (reading images, marking cells) and compilation; a run that was interrupted has no time of set-up. Comparable
+  set-up (reading images, marking cells) and compilation; a run that was interrupted has no time of set-up. With
+  `--report` the command writes what it trained before, one job and time after another. Comparable
   seconds are seconds times the GFLOP/s of a matrix product just before and after the run, over {reference:.0f}; they
   compare CPUs of one kind.
 - **Memory.** The peak of the whole process, which reads, trains and scores, or of the accelerator.
