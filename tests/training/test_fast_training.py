@@ -22,6 +22,7 @@ from jaxnerf.models import occupancy as occupancy_module
 from jaxnerf.models.base import ViewOptions
 from jaxnerf.models.grid_schedule import InitialCells, make_grid_schedule
 from jaxnerf.models.occupancy import OccupancyOptions, occupancy_model
+from jaxnerf.runtime import processes
 from jaxnerf.training import loop
 from jaxnerf.training.auto_config import device_fields, resolve, resolve_for_device
 from jaxnerf.training.build import build
@@ -319,8 +320,9 @@ def test_resumed_run_is_bit_exact_with_its_grid(toy, unoptimized, tmp_path):
 
 
 @pytest.mark.slow
-def test_workdir_restores_the_scene_and_its_images(unoptimized, tmp_path, capsys):
+def test_workdir_restores_the_scene_and_its_images(unoptimized, tmp_path, capsys, monkeypatch):
     """The config has "auto" sizes, and only the workdir is known afterwards."""
+    monkeypatch.setattr(processes, "prints_details", lambda: True)
     config = tiny_config()
     config.field, config.occupancy.step_size = "mlp", "auto"
     config.fine.update({"depth": 1, "width": 8, "num_freqs": "auto", "view_width": 8})
