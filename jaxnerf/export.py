@@ -75,7 +75,7 @@ def main(argv):
         given = [flag.name for flag in holders if flags.FLAGS[flag.name].present]
         if given and _KIND.value not in kinds and _KIND.value in ("mesh", "points", "splats", "depth"):
             raise ValueError(
-                f"--{given[0]} is given and --kind={_KIND.value}, expected --kind={' or '.join(kinds)}; drop it"
+                f"--{given[0]} is given and --kind={_KIND.value}, expected --kind={' or --kind='.join(kinds)}; drop it"
             )
     names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
     names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED, "up": _UP}

@@ -17,7 +17,7 @@ class Finding(NamedTuple):
         kind: "axes", "focal", "swap", "pose", "fold", "overlap", "points", "size", "file", "mask", "duplicate",
             "blur", "bounds", "leak" or "skipped".
         found: what the check found, with the name of the file.
-        expected: what it expects there.
+        expected: what it expects there; empty for the note of a reader.
         change: the file, field or flag to change, and how.
         frames: indices of the frames concerned; empty if the finding concerns all frames.
     """

@@ -12,6 +12,7 @@ from jaxnerf.capture_check import images as images_module
 from jaxnerf.capture_check.findings import Finding, percent
 from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
+from jaxnerf.data.geometry.bounds import known_bounds
 from jaxnerf.data.geometry.path_poses import coverage
 from jaxnerf.data.geometry.poses import axis_of, gaze_center, sideways, up_of
 from jaxnerf.data.geometry.world import looks_forward, poses_of
@@ -59,7 +60,7 @@ class Report(NamedTuple):
         width = max(len(name) for name, _ in self.facts)
         lines = [f"{name:{width}}  {value}" for name, value in self.facts]
         groups: dict[tuple[str, str], list[Finding]] = {}
-        for finding in self.findings:  # a fault of all images is stated for the first ones
+        for finding in self.findings:  # of a fault that all images have, the first few are shown
             groups.setdefault((finding.severity, finding.kind), []).append(finding)
         for (_, kind), found in groups.items():
             shown = _SAME if kind in ("size", "file") else len(found)
@@ -122,7 +123,7 @@ def inspect(
     findings += [Finding("warning", "skipped", note, "", "") for note in dict.fromkeys(whole.notes)]
     path, line = _path(whole, given)
     facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence, images, given)
-    facts += [("near, far", _range(bounds, stated, depth, capture.box)), ("path", line)]
+    facts += [("near, far", _range(bounds, stated, depth, capture)), ("path", line)]
     order = sorted(findings, key=lambda finding: finding.severity != "error")
     direction = up_of(evidence.poses) if given is None else given
     return Report(capture, tuple(facts), tuple(order), evidence.poses, points, path, direction)
@@ -215,9 +216,11 @@ def _scale_to_files(capture, images):
     return 1.0, ""
 
 
-def _range(bounds, stated, depth, box):
+def _range(bounds, stated, depth, capture):
     near, far = np.median(bounds, axis=0)
-    computed = f"computed from the cameras{' and the box of the file' if box is not None else ' and points'}"
+    points, box = any(known_bounds(capture)), capture.box is not None
+    sources = ["the cameras", *["points"] * points, *["the box of the file"] * box]
+    computed = f"computed from {' and '.join(sources)}"
     line = f"{near:.4g} to {far:.4g} ({f'from {stated}' if stated else computed})"
     if len(depth):
         low, high = np.percentile(depth, [2, 98])

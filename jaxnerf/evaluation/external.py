@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxnerf.data.images.image_files import is_hidden, read_image
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden, read_image
 from jaxnerf.evaluation import protocol
 from jaxnerf.evaluation.aggregate import means
 from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
@@ -20,7 +20,6 @@ from jaxnerf.training import build
 from jaxnerf.training.config import Config
 
 _logger = logging.getLogger(__name__)
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
 def score_folder(
@@ -147,12 +146,12 @@ def _natural(name):
 
 
 def _image_paths(folder):
-    found = [path for path in folder.glob("*") if path.suffix.lower() in _SUFFIXES]
+    found = [path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
     paths = sorted((path for path in found if not is_hidden(path.name)), key=lambda path: _natural(path.stem))
     if not paths:
         raise ValueError(
-            f"{folder}: holds no images ({', '.join(_SUFFIXES)}); correct the folder, or, if these are the references, "
-            "name their dataset with --data_dir, --config or --workdir"
+            f"{folder}: holds no images ({', '.join(IMAGE_SUFFIXES)}); correct the folder, or, if these are the "
+            "references, name their dataset with --data_dir, --config or --workdir"
         )
     return paths
 

@@ -98,14 +98,14 @@ def test_cameras_that_hardly_fit_any_image_are_reported(folders, tmp_path):
 
     def plant(folder):
         content = json.loads((folder / "transforms.json").read_text())
-        rng = np.random.default_rng(0)
-        for frame in content["frames"]:
-            factor = float(rng.choice([0.75, 1.0, 1.3]))
+        for index, frame in enumerate(content["frames"]):
+            factor = 1.16 if index % 2 else 1.0
             frame |= {"fl_x": factor * content["fl_x"], "fl_y": factor * content["fl_y"]}
         (folder / "transforms.json").write_text(json.dumps(content))
 
     report = planted(folders, tmp_path, "transforms", plant)
-    assert [finding for finding in report.findings if finding.kind in ("pose", "focal", "axes")], report.text()
+    (found,) = (finding for finding in report.findings if finding.kind == "pose")
+    assert "of the matched corners fit the cameras; expected a third or more" in found.line()
 
 
 def test_a_fault_of_all_images_is_stated_for_the_first_ones(folders, tmp_path):

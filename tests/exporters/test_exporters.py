@@ -15,6 +15,7 @@ from jaxnerf.exporters.depth import export_depth
 from jaxnerf.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field, write_glb
 from jaxnerf.exporters.points import export_points, thinned
 from jaxnerf.exporters.splats import export_splats, score
+from runs import run
 
 IN_FILE = 2 * RADIUS  # the ball's radius there
 VOXEL = 2 * IN_FILE / 32
@@ -292,3 +293,12 @@ def test_an_export_is_whole_or_absent(workdir, monkeypatch):
     assert [path.name for path in (workdir / "exports").iterdir()] == ["test-7"]
     with pytest.raises(ValueError, match="expected a plain file name"):
         export_run(workdir, "test", name="../out")
+
+
+@pytest.mark.parametrize(
+    "kind, flag, kinds", [("points", "--format=obj", "mesh"), ("depth", "--num_points=5", "points or --kind=splats")]
+)
+def test_flags_of_other_kinds_are_refused(tmp_path, kind, flag, kinds):
+    code, _, err = run("export", f"--workdir={tmp_path}", f"--kind={kind}", flag)
+    expected = f"error: {flag.partition('=')[0]} is given and --kind={kind}, expected --kind={kinds}; drop it"
+    assert code == 1 and err.startswith(expected)

@@ -179,7 +179,7 @@ def _boxes(schedule, cubes):
 
 
 def _may_see(to_world, clear_radius, near, far, least, scale, lower, upper):
-    """Returns which boxes [N] a view may see, or has around its camera. No box that it sees is left out."""
+    """Returns which boxes [N] a view may see, or has around its camera. It includes all boxes that the view sees."""
     turn, eye = np.float64(to_world[:, :3]), to_world[:, 3]
     middle, half = (lower + upper) / 2 - eye, (upper - lower) / 2 * (1 + 1e-5)
     ahead, beyond = -turn[:, 2], least + _SLOPES / scale
