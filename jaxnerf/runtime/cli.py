@@ -79,7 +79,7 @@ def run(
         _leave(1, error)
     except KeyboardInterrupt as interrupt:
         code = 128 + (interrupt.args or (signal.SIGINT,))[0]
-        print(f"error: stopped {stopped}", file=sys.stderr)
+        print(f"stopped {stopped}", file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
         # A regular exit would destroy what threads of XLA still use, which can end in a segmentation fault.

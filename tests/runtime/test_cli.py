@@ -229,7 +229,7 @@ def test_a_reader_that_goes_away_while_flags_are_parsed_is_one_line(flag):
     done = subprocess.run(command, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert done.returncode == 129
-    assert done.stderr.startswith("error: stopped before") and len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("stopped before") and len(done.stderr.splitlines()) == 1
 
 
 def test_a_signal_after_the_end_prints_nothing(tmp_path):

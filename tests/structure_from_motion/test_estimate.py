@@ -229,7 +229,7 @@ def test_cameras_of_a_few_images_agree_with_the_given_ones_and_an_interrupted_ca
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate()
-    assert process.returncode == 130 and err.startswith("error: stopped") and err.count("\n") == 1, err
+    assert process.returncode == 130 and err.startswith("stopped") and err.count("\n") == 1, err
     assert not (out / "sparse").exists()
     extracted = colmap_process.count_rows(database, "descriptors")
 

@@ -298,7 +298,7 @@ def test_signal_before_training_prints_one_line(number):
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, stdin=subprocess.PIPE
     )
     assert done.returncode == 128 + number
-    assert done.stderr.startswith("error: stopped before ") and len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("stopped before ") and len(done.stderr.splitlines()) == 1
 
 
 def test_partial_files_of_a_killed_run_are_removed_and_no_others(tmp_path):
