@@ -399,7 +399,12 @@ def _compile(experiment, views, together=()):
             run = _gather_ahead(run, jax.jit(lambda step, data: ids(step, data=data)), pixels)
         if turns:
             sharding = state.step.sharding
-            states = (state, *(devices.place(initial_state(index), sharding) for index in range(1, len(seeds))))
+            # As the first one is made: another compilation would round the initial parameters differently.
+            device = next(iter(sharding.device_set))
+            others = [
+                devices.unoptimized(functools.partial(initial_state, index), device)() for index in range(1, len(seeds))
+            ]
+            states = (state, *devices.place(others, sharding))
             taken = devices.place([many_runs.taken_leaves(each, own) for each in each_data], sharding)
             return many_runs.in_turn(run, taken, own), states, placed
         return run, state, placed

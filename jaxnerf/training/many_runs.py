@@ -7,7 +7,6 @@ grid do, stay branches under vmap instead of computing both sides.
 On a CPU, the compiled step of one run is called for each run in turn. A step of one run already fills a core and its
 cache, so vmap is slower there: it keeps the activations of all runs at once, and its products have a batch axis for
 which XLA has no fast routine. `jax.lax.map` is slower, too, as its loop copies the tables of each run in and out.
-experiments/few_views/many_runs.py measures all three.
 """
 
 import dataclasses
