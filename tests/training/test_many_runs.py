@@ -34,26 +34,26 @@ def difference(a, b):
 
 
 @pytest.mark.parametrize(
-    ("kind", "at_once"),
+    ("kind", "vmapped"),
     [
         ("packed", False),
         pytest.param("packed", True, marks=pytest.mark.slow),
         pytest.param("paper", True, marks=pytest.mark.slow),
     ],
 )
-def test_each_run_ends_as_it_does_alone(kind, at_once, tmp_path, monkeypatch):
-    monkeypatch.setattr(many_runs, "runs_in_turn", lambda: not at_once)
+def test_each_run_ends_as_it_does_alone(kind, vmapped, tmp_path, monkeypatch):
+    monkeypatch.setattr(many_runs, "runs_in_turn", lambda: not vmapped)
     train = {"max_steps": 10, "log_every": 5}
     folders = [tmp_path / "a", tmp_path / "b"]
     assert jaxnerf.train_many([config_of(kind, seed, **train) for seed in (3, 5)], folders)
     assert jaxnerf.train_and_evaluate(config_of(kind, 5, **train), tmp_path / "alone")
     alone = variables(tmp_path / "alone", 10)
-    assert difference(variables(folders[1], 10), alone) <= (2e-4 if at_once else 0)
+    assert difference(variables(folders[1], 10), alone) <= (2e-4 if vmapped else 0)
     assert difference(variables(folders[0], 10), alone) > 0.01
     rows, expected = (metric_log.read_rows(folder) for folder in (folders[1], tmp_path / "alone"))
     assert [row["step"] for row in rows] == [5, 10]
     for row, same in zip(rows, expected, strict=True):
-        np.testing.assert_allclose(row["loss"], same["loss"], rtol=1e-5 if at_once else 0)
+        np.testing.assert_allclose(row["loss"], same["loss"], rtol=1e-5 if vmapped else 0)
         assert row["rays"] == same["rays"] and row.keys() == same.keys()
 
 
@@ -86,7 +86,7 @@ def scene_config(folder, seed):
     return config
 
 
-def test_runs_of_several_scenes_share_a_program(tmp_path):
+def test_runs_of_several_scenes_end_as_each_does_alone(tmp_path):
     configs = [scene_config(tmp_path / f"scene{index}", index) for index in range(2)]
     assert jaxnerf.train_many(configs, [tmp_path / "a", tmp_path / "b"])
     assert jaxnerf.train_and_evaluate(configs[1], tmp_path / "alone")
