@@ -53,7 +53,7 @@ from jaxnerf.registry import register_exporter, register_field, register_loss, r
 if _typing.TYPE_CHECKING:
     from jaxnerf.data.dataset import load_dataset
     from jaxnerf.data.ray_batches import draw_batch
-    from jaxnerf.evaluation.evaluate import train_and_evaluate
+    from jaxnerf.evaluation.evaluate import train_and_evaluate, train_many
     from jaxnerf.evaluation.restore import TrainedRun, load_scene, restore_run
     from jaxnerf.fields.hash_grid import hash_grid_field
     from jaxnerf.fields.mlp import mlp_field
@@ -71,6 +71,7 @@ _ON_DEMAND = {
     "restore_run": "jaxnerf.evaluation.restore",
     "TrainedRun": "jaxnerf.evaluation.restore",
     "train_and_evaluate": "jaxnerf.evaluation.evaluate",
+    "train_many": "jaxnerf.evaluation.evaluate",
 }
 
 if not _typing.TYPE_CHECKING:  # a type checker would accept every name
@@ -105,7 +106,7 @@ __all__ = [
     # data and fields
     "Views", "SparsePoints", "Batch", "load_dataset", "draw_batch", "mlp_field", "hash_grid_field", "still_life",
     # runs
-    "load_scene", "restore_run", "TrainedRun", "train_and_evaluate",
+    "load_scene", "restore_run", "TrainedRun", "train_and_evaluate", "train_many",
     # registration
     "register_field", "register_sampler", "register_loss", "register_reader", "register_exporter",
 ]  # fmt: skip

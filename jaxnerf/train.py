@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import copy
 import os
 import sys
 
@@ -64,6 +65,12 @@ _HEARTBEAT_SECONDS = flags.DEFINE_float(
 _STOPPED_CODE = flags.DEFINE_integer(
     "stopped_code", 0, "The exit code after SIGTERM or Ctrl-C. Kubernetes restarts a program that does not exit with 0."
 )
+_SEEDS = flags.DEFINE_list(
+    "seeds",
+    None,
+    "Seeds of several runs that train at once, such as 0,1,2,3: an ensemble. Each has a workdir of its own, "
+    "seed_<seed> in --workdir.",
+)
 _BATCH = cli.define_count(
     "batch",
     "The rays of a microbatch, or auto: as many as fit into memory. It overrides config.train.microbatch_size.",
@@ -78,7 +85,7 @@ _VIEWER_PORT = flags.DEFINE_integer("viewer_port", 8080, "The viewer's port; 0: 
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.evaluation.evaluate import train_observed
+    from jaxnerf.evaluation.evaluate import train_many, train_observed
     from jaxnerf.runtime import processes
 
     if _CONFIG.value is None:
@@ -98,9 +105,28 @@ def main(argv):
         heartbeat_seconds=_HEARTBEAT_SECONDS.value,
     ):
         with _viewer(processes.is_first()) as observe:
-            finished = train_observed(config, _WORKDIR.value, observe=observe)
+            if _SEEDS.value is None:
+                finished = train_observed(config, _WORKDIR.value, observe=observe)
+            else:
+                finished = train_many(*_runs_of_seeds(config, _SEEDS.value, _WORKDIR.value))
     if not finished:
         sys.exit(_STOPPED_CODE.value)
+
+
+def _runs_of_seeds(config, seeds, workdir):
+    """Returns the configs and the workdirs of runs that differ in the seed."""
+    try:
+        numbers = [int(seed) for seed in seeds]
+    except ValueError:
+        numbers = []
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise ValueError(f"--seeds={','.join(seeds)}: expected different whole numbers, such as 0,1,2,3")
+    if _VIEWER.value:
+        raise ValueError("--viewer shows one run, and --seeds trains several; omit one of them")
+    configs = [copy.deepcopy(config) for _ in numbers]
+    for each, number in zip(configs, numbers, strict=True):
+        each.seed = number
+    return configs, [os.path.join(workdir, f"seed_{number}") for number in numbers]
 
 
 @contextlib.contextmanager

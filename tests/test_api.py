@@ -62,6 +62,7 @@ SURFACE = {
     "load_scene": "workdir |",
     "restore_run": "workdir config=None | data_dir=None settings=None",
     "train_and_evaluate": "config workdir | views=None",
+    "train_many": "configs workdirs |",
     "register_field": "name make | options=None",
     "register_sampler": "name make | options=None",
     "register_loss": "name function | on='renderings' needs=() weight=0.0 help=''",
@@ -128,6 +129,7 @@ PLAIN = {
     *("uniform_edges", "merge_edges", "points_on_rays", "render_image", "look_at", "turntable", "ndc_to_t"),
     *("mse", "psnr", "round_to_8_bits", "expected_depth", "expected_disparity", "median_depth", "transmittance"),
     *("load_dataset", "draw_batch", "still_life", "mlp_field", "load_scene", "restore_run", "train_and_evaluate"),
+    "train_many",
     *("register_field", "register_sampler", "register_loss", "register_reader", "register_exporter"),
 }
 

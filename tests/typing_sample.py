@@ -142,6 +142,7 @@ def fields_and_data(folder: str) -> jaxnerf.Views:
 
 def runs(config: ConfigDict, workdir: str, rays: jaxnerf.Rays) -> Array:
     finished: bool = jaxnerf.train_and_evaluate(config, workdir)
+    finished = finished and jaxnerf.train_many([config], [workdir])
     run: jaxnerf.TrainedRun = jaxnerf.restore_run(workdir)
     loaded, render = jaxnerf.load_scene(workdir)
     density, _ = loaded(jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))

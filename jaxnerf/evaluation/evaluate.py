@@ -12,7 +12,7 @@ import pathlib
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -28,7 +28,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config
-from jaxnerf.training.loop import train
+from jaxnerf.training.loop import train, train_runs
 from jaxnerf.training.state import TrainState
 
 _REMEDY = "give --overwrite without --shard, or remove it"
@@ -51,6 +51,41 @@ def train_and_evaluate(config: Config, workdir: str | os.PathLike, *, views: Vie
             were not finite.
     """
     return train_observed(config, workdir, views=views)
+
+
+def train_many(configs: Sequence[Config], workdirs: Sequence[str | os.PathLike]) -> bool:
+    """Trains several runs in one program and scores each; each workdir then is that of an ordinary run.
+
+    The runs take the same steps at the same time. On an accelerator one vmapped step computes all of them; each result
+    equals that of the run alone up to rounding in float32. On a CPU the runs share the compiled step and the dataset in
+    memory and take their steps in turn, and the results are the same, bit for bit. A time limit holds for all runs
+    together.
+
+    Args:
+        configs: of the runs, see `train_and_evaluate`. They may differ in `seed`, which makes an ensemble, and in
+            `data.dir`: datasets of the same shapes. Options that are inferred from a dataset (`"auto"`), such as the
+            box, must be the same for all; set them where they are not.
+        workdirs: one for each run, made if missing. Runs continue from the newest step that all of them have.
+
+    Returns:
+        Whether all are complete. False: stopped and saved; the same call continues.
+
+    Raises:
+        ValueError: as `train_and_evaluate` does, and if the configs or the datasets do not fit into one program.
+    """
+
+    def finish(views):
+        del views
+        try:
+            for config, workdir in zip(configs, workdirs, strict=True):
+                if config.eval.at_end:
+                    _score_newest(workdir)
+        except KeyboardInterrupt:
+            processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
+            return False
+        return True
+
+    return train_runs(configs, workdirs, at_end=finish)
 
 
 def train_observed(

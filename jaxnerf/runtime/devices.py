@@ -76,7 +76,7 @@ def compile_step(
     processes.check_same("data or configuration", data)
     data = place(data, everywhere)
     with ThreadPoolExecutor(1) as pool:
-        made = pool.submit(_unoptimized(state, devices[0]) if callable(state) else make)
+        made = pool.submit(unoptimized(state, devices[0]) if callable(state) else make)
         if mode == "pmap" and jax.process_count() > 1:  # JAX compiles this at the first call only
             compiled = _with_global_state(jitted, everywhere)
         else:
@@ -103,7 +103,7 @@ def _sharded(train_step, mesh):
     return jax.jit(sharded, donate_argnums=0)
 
 
-def _unoptimized(function, device):
+def unoptimized(function, device):
     """Jits a function that runs once: optimizing its code takes longer than running it."""
     options = {"xla_backend_optimization_level": 0} if device.platform == "cpu" else None
     return jax.jit(function, compiler_options=options)
