@@ -1,5 +1,6 @@
 // The page: it loads the scene, and redraws it when the camera or the window changes. While the camera moves, the
-// resolution is such that a frame takes FRAME_MS; when it rests, the frame is drawn again in full.
+// resolution is such that a frame takes FRAME_MS; when it rests, the frame is drawn again with twice the resolution, up
+// to that of the window.
 "use strict";
 
 const FRAME_MS = 33, MIN_PIXELS = 3000;
@@ -35,7 +36,8 @@ class Page {
     this.shown = 0;
     this.tourTime = null;
     this.changed = true;   // the frame that is shown is not that of the camera
-    this.sharp = false;    // the frame that is shown or drawn has the canvas's resolution
+    this.scale = 1;        // of the last frame, over the canvas's resolution
+    this.refining = false; // the frame that is drawn repeats one that is shown
     this.heldUp = null;    // a frame that the caller of `render` waits for
     this.fill();
     this.listen();
@@ -98,20 +100,20 @@ class Page {
       this.renderer.drop();
     }
     const busy = this.renderer.frame !== null;
-    if (this.changed && (!busy || this.sharp)) {
+    if (this.changed && (!busy || this.refining)) {
       // A moving frame is finished before the next begins, so that something is always shown.
       const pixels = this.canvas.width * this.canvas.height;
       const most = Math.max((this.renderer.pixelsPerMs || 100) * FRAME_MS, MIN_PIXELS);
-      const scale = Math.min(1, Math.sqrt(most / pixels));
-      this.changed = false;
-      this.sharp = scale === 1;
-      this.began = now;
-      this.renderer.begin(this.view(scale));
-    } else if (!busy && !this.sharp && !this.renderer.lost) {
-      this.sharp = true;
-      this.began = now;
-      this.renderer.begin(this.view(1));
+      this.start(now, Math.min(1, Math.sqrt(most / pixels)), false);
+    } else if (!busy && this.scale < 1 && !this.renderer.lost) {
+      this.start(now, Math.min(1, 2 * this.scale), true);
     }
+  }
+
+  start(now, scale, refining) {
+    this.changed = false;
+    Object.assign(this, {scale, refining, began: now});
+    this.renderer.begin(this.view(scale));
   }
 
   report(now) {
