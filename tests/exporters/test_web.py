@@ -31,8 +31,8 @@ FIELDS = {
 }
 
 
-def packed(options, precision="16 bits", contracted=False):
-    """Returns the function that evaluates a field with random parameters, and its WebScene."""
+def packed(options, precision="16 bits", contracted=False, as_scene=False):
+    """Returns the function that evaluates a field with random parameters, and its WebScene; as_scene: it is a scene."""
     network, field = HashGrid(**options), hash_grid_field(**options)
     params = field.init(jax.random.key(1))
     leaves, tree = jax.tree.flatten(params)
@@ -47,6 +47,9 @@ def packed(options, precision="16 bits", contracted=False):
     )
     field = contract_field(field, lower, upper) if contracted else field
     decoded = scene.decoded(params, network.feature_scale)
+
+    if as_scene:
+        return lambda x, viewdirs: field.apply(decoded, x, viewdirs), scene
 
     def evaluate(x, viewdirs):
         density, rgb = field.apply(decoded, jnp.float32(x)[None], jnp.float32(viewdirs)[None])
