@@ -94,7 +94,8 @@ def test_resizing_and_closing_leave_nothing_on_the_gpu(browser, tmp_path):
         const made = WebGL2RenderingContext.prototype["create" + kind];
         const freed = WebGL2RenderingContext.prototype["delete" + kind];
         WebGL2RenderingContext.prototype["create" + kind] = function () { window.alive++; return made.call(this); };
-        WebGL2RenderingContext.prototype["delete" + kind] = function (it) { window.alive--; return freed.call(this, it); };
+        const remove = function (it) { window.alive--; return freed.call(this, it); };
+        WebGL2RenderingContext.prototype["delete" + kind] = remove;
       }</script>"""
     path.write_text(path.read_text().replace("<style>", counter + "<style>", 1))
     comparison.open_page(page, path)
