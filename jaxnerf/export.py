@@ -1,8 +1,8 @@
 """Exports a trained run for other programs: jaxnerf-export --workdir=DIR --kind=mesh.
 
 `python -m jaxnerf.export` is the same program. It writes DIR/exports/KIND-STEP/, in the units and axes of the dataset's
-files: a mesh with vertex colours, points with normals, depth images with cameras, or Gaussian splats. It needs
-scikit-image, scipy and trimesh: pip install 'jaxnerf[export]'.
+files: a mesh with vertex colours, points with normals, depth images with cameras, Gaussian splats, or a web page. All
+but the page need scikit-image, scipy and trimesh: pip install 'jaxnerf[export]'.
 """
 
 import sys
@@ -58,9 +58,11 @@ _CLOSED = flags.DEFINE_bool(
 _MIN_PIECE = flags.DEFINE_float(
     "min_piece", 0.005, "mesh: connected pieces with fewer triangles than this fraction of all are dropped."
 )
+_SPLIT = flags.DEFINE_bool("split", False, "web: whether the scene's data is in a file beside the page, for hosting.")
 _CONCERN = {  # the flags that only some kinds read
     ("mesh",): (_FORMAT, _UP, _MAX_FACES, _CLOSED, _MIN_PIECE),
     ("points", "splats"): (_NUM_POINTS,),
+    ("web",): (_SPLIT,),
 }
 _NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an existing folder of that name.")
@@ -73,12 +75,13 @@ def main(argv):
 
     for kinds, holders in _CONCERN.items():
         given = [flag.name for flag in holders if flags.FLAGS[flag.name].present]
-        if given and _KIND.value not in kinds and _KIND.value in ("mesh", "points", "splats", "depth"):
+        if given and _KIND.value not in kinds and _KIND.value in ("mesh", "points", "splats", "depth", "web"):
             raise ValueError(
                 f"--{given[0]} is given and --kind={_KIND.value}, expected --kind={' or --kind='.join(kinds)}; drop it"
             )
     names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
     names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED, "up": _UP}
+    names |= {"split": _SPLIT}
     try:
         box = None if _BOX.value is None else tuple(map(float, _BOX.value))
     except ValueError:

@@ -138,6 +138,7 @@ EXPORTERS = Registry(
         "points": "jaxnerf.exporters.points:export_points",
         "depth": "jaxnerf.exporters.depth:export_depth",
         "splats": "jaxnerf.exporters.splats:export_splats",
+        "web": "jaxnerf.exporters.web:export_web",
     },
 )
 

@@ -39,6 +39,7 @@ class ExportSettings(NamedTuple):
             not trained there, and what nothing shows to be free is solid.
         max_faces: the number of triangles to which a mesh is decimated; 0: it is not.
         min_piece: connected pieces of a mesh with fewer triangles than this fraction of all are dropped.
+        split: whether the data of a web page is in a file beside it.
     """
 
     resolution: int = 256
@@ -51,6 +52,7 @@ class ExportSettings(NamedTuple):
     closed: bool = False
     max_faces: int = 0
     min_piece: float = 0.005
+    split: bool = False
 
     @property
     def image_size(self) -> int:

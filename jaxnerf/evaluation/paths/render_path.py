@@ -82,7 +82,7 @@ def render_path(
     variables = run.variables(step)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     up = up or run.experiment.config.data.up or None
-    path = camera_path.make_path(_select_kind(path, views, up), views, num_frames=num_frames, closed=closed, up=up)
+    path = camera_path.make_path(select_kind(path, views, up), views, num_frames=num_frames, closed=closed, up=up)
     path = camera_path.resize(path, *size)
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
     atomic_files.check_tree(target.parent)
@@ -144,7 +144,7 @@ def _write_frames(target, run, variables, views, path, *, rgba, shard):
     return len(missing())
 
 
-def _select_kind(kind, views, up):
+def select_kind(kind, views, up):
     """Returns the kind of path, the default for None. Prints that one, and whether a turntable leaves the cameras."""
     poses, up = np.asarray(views.cameras.to_world), camera_path.up_direction(up, views)
     if kind is None:
