@@ -4,7 +4,7 @@
         [--page=docs/results/multiscale.md]
 
 Each scene is trained with `lego_fast` twice: on images shrunk by --factor alone, and on four scales of them, with as
-many rays from each. Truth at each size is the mean over the pixels of the original images. Supersampling renders
+many rays from each; options follow from the largest. Truth at each size is the mean over the pixels of the original images. Supersampling renders
 several rays a pixel, on a regular grid, and averages their colours.
 """
 
@@ -29,6 +29,7 @@ from jaxnerf.core.metrics import psnr
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation import evaluate, restore
 from jaxnerf.runtime import cli
+from jaxnerf.training import auto_config
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs; finished ones are not repeated.", required=True)
 _SCENES = flags.DEFINE_list("scenes", ["lego", "mic"], "Datasets with images of 800 px.")
@@ -85,8 +86,9 @@ def measure(scene: str, scales: Sequence[int], folder: pathlib.Path) -> dict[str
     if kept:
         common.check_origin(kept["origin"], origin, folder, "give another folder, or the old settings")
         return kept["measured"]
-    train = joined([_views(config, scale, "train") for scale in scales])
-    if not evaluate.train_and_evaluate(config, folder / "run", views=train):
+    parts = [_views(config, scale, "train") for scale in scales]
+    config = auto_config.resolve(config, parts[0]).config  # sizes of the hash grid are those for the largest images
+    if not evaluate.train_and_evaluate(config, folder / "run", views=joined(parts)):
         raise KeyboardInterrupt
     seconds = json.loads((folder / "run" / "metrics.jsonl").read_text().splitlines()[-1])["seconds"]
     run = restore.restore_run(folder / "run")
