@@ -39,6 +39,11 @@ def _wrong_color(color):
     return None if right else "red, green and blue in [0, 1], or () for black"
 
 
+def _wrong_indices(indices):
+    valid = all(isinstance(index, int) and not isinstance(index, bool) and index >= 0 for index in indices)
+    return None if valid and len(set(indices)) == len(indices) else "different whole numbers of at least 0"
+
+
 @dataclasses.dataclass(frozen=True)
 class DataOptions(Options):
     """The options of the dataset: which images are read, and how."""
@@ -100,6 +105,13 @@ class DataOptions(Options):
     )
     num_views: int = option(
         0, "number of training views to use, spread evenly over all of them; 0: all", range=at_least(0), protocol=True
+    )
+    view_indices: tuple[int, ...] = option(
+        (),
+        "indices of the training views to use, in the dataset's order from 0, as published protocols with few views "
+        "name them; (): all",
+        check=_wrong_indices,
+        protocol=True,
     )
     pixel_offset: float = option(
         0.5, "rays pass through pixel centres (0.5) or pixel corners (0)", unit="px", protocol=True
@@ -298,7 +310,7 @@ def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -
     """Reads the Views of a split of the dataset that options describe.
 
     With `hold_out`, some views of "train" form the split "held_out" instead. With `num_views`, "train" has only
-    that many of its views. Fields that are still "auto" are resolved first.
+    that many of its views, with `view_indices` those that it names. Fields that are still "auto" are resolved first.
 
     Args:
         data: the options.
@@ -446,7 +458,13 @@ def _selection(data: DataOptions, split: str) -> Callable[[int], np.ndarray] | N
     """Returns a function from the number of views to the indices of those that a split has; None: all."""
     every = data.hold_out if split in ("train", "held_out") else 0
     number = data.num_views if split == "train" else 0
-    if not every and not number:
+    named = list(data.view_indices) if split == "train" else []
+    if named and number:
+        raise ValueError(
+            f"data.num_views is {number} and data.view_indices {data.view_indices}, expected only one of them; set "
+            "data.num_views to 0 or data.view_indices to ()"
+        )
+    if not every and not number and not named:
         return None
 
     def select(count):
@@ -459,6 +477,14 @@ def _selection(data: DataOptions, split: str) -> Callable[[int], np.ndarray] | N
             held = held_out(count, every)
             indices = held if split == "held_out" else np.setdiff1d(indices, held)
             count = len(indices)
+        if named:
+            missing = sorted(set(named) - set(indices.tolist()))
+            if missing:
+                raise ValueError(
+                    f"data.view_indices has {missing[0]}, expected indices of training views that are not held out "
+                    f"(data.hold_out {every}), below {indices[-1] + 1}; correct it"
+                )
+            indices = np.array(named)
         if number:
             if not 1 <= number <= count:
                 raise ValueError(

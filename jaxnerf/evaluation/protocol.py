@@ -93,7 +93,7 @@ def comparable_with(conventions: Mapping[str, Any]) -> list[dict[str, Any]]:
         ]
         differences += [
             f"trained without some of the training views ({name} {conventions[name]}), there with all"
-            for name in ("hold_out", "num_views")
+            for name in ("hold_out", "num_views", "view_indices")
             if conventions.get(name)
         ]
         if shared := conventions.get("shared_with_training"):

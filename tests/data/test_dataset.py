@@ -14,6 +14,7 @@ from jaxnerf.data.dataset import DataOptions, held_out, load_split, select_views
 from jaxnerf.data.readers import transforms
 from jaxnerf.options import replaced
 from jaxnerf.registry import READERS, Reader
+from jaxnerf.training.config import read_config
 
 SIZES = [(2, 3), (1, 4), (3, 3), (2, 2)]
 
@@ -164,6 +165,29 @@ def test_num_views_are_evenly_spread_over_the_views_that_are_not_held_out():
     assert len(load_split(data, "held_out").offset) == 9
     with pytest.raises(ValueError, match="data.num_views is 52 of 51 views, expected 1 to 51"):
         load_split(replaced(data, num_views=52), "train")
+
+
+def test_view_indices_name_the_training_views():
+    data = DataOptions(size=24, view_indices=(26, 2, 55))
+    every, some = (load_split(each, "train") for each in (DataOptions(size=24), data))
+    assert some.names == tuple(every.names[index] for index in (26, 2, 55))
+    np.testing.assert_array_equal(some.image(1), every.image(2))
+    assert load_split(data, "test").names == load_split(DataOptions(size=24), "test").names
+    for changes, problem in (
+        ({"view_indices": (3, 60)}, "data.view_indices has 60, expected indices of training views"),
+        ({"hold_out": 7, "view_indices": (0, int(held_out(60, 7)[1]))}, "that are not held out"),
+        ({"num_views": 2}, "data.num_views is 2 and data.view_indices .*, expected only one"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            load_split(replaced(data, **changes), "train")
+
+
+@pytest.mark.parametrize("wrong", [(1, 1), (-1,), (True,), (1.5,)])
+def test_wrong_view_indices_are_named(wrong):
+    config = capture.get_config()
+    config.data.view_indices = wrong
+    with pytest.raises(ValueError, match="data.view_indices is .*, expected different whole numbers"):
+        read_config(config)
 
 
 def test_num_views_of_files_reads_only_those_views(tmp_path):
