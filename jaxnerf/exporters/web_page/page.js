@@ -63,6 +63,7 @@ class Page {
     if (width === this.canvas.width && height === this.canvas.height) return;
     this.canvas.width = width;
     this.canvas.height = height;
+    if (!this.renderer.lost) this.renderer.present();  // a new size clears the canvas
     this.redraw();
   }
 
