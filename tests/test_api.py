@@ -67,6 +67,7 @@ SURFACE = {
     "register_loss": "name function | on='renderings' needs=() weight=0.0 help=''",
     "register_reader": "name read | detect=None",
     "register_exporter": "name export |",
+    "register_estimator": "name estimate |",
 }
 TYPES = ["Rays", "Samples", "PackedSamples", "Rendering", "Camera", "Views", "Batch", "OccupancyGrid", "SceneFn"]
 TYPES += ["SparsePoints", "TrainedRun"]
@@ -129,6 +130,7 @@ PLAIN = {
     *("mse", "psnr", "round_to_8_bits", "expected_depth", "expected_disparity", "median_depth", "transmittance"),
     *("load_dataset", "draw_batch", "still_life", "mlp_field", "load_scene", "restore_run", "train_and_evaluate"),
     *("register_field", "register_sampler", "register_loss", "register_reader", "register_exporter"),
+    "register_estimator",
 }
 
 

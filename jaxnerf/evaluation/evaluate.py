@@ -210,7 +210,9 @@ def summary(results: dict[str, Any]) -> str:
     found = results.get("uncertainty", {})
     errors = f"; AUSE {found['ause_rmse']:.3f} (RMSE), {found['ause_mae']:.3f} (MAE)" if found else ""
     if "coverage" in found:
-        errors += f", {100 * found['coverage']:.1f} % of errors within intervals for {100 * found['target_coverage']:g} %"
+        errors += (
+            f", {100 * found['coverage']:.1f} % of errors within intervals for {100 * found['target_coverage']:g} %"
+        )
     return f"{step}{metrics} over {results['views']} views{speed}{errors}{paired}{note}"
 
 

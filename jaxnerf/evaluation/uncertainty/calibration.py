@@ -77,7 +77,9 @@ def calibrate(
     if not 0 < coverage < 1:
         raise ValueError(f"coverage is {coverage}, expected a number between 0 and 1, such as 0.9; correct --coverage")
     if len(scores) < 2:
-        raise ValueError(f"calibration has {len(scores)} views, expected at least 2; lower data.hold_out and train again")
+        raise ValueError(
+            f"calibration has {len(scores)} views, expected at least 2; lower data.hold_out and train again"
+        )
     scores, errors = ([np.ravel(np.asarray(each, np.float64)) for each in values] for values in (scores, errors))
     for name, found in zip(views, scores, strict=True):
         if not np.isfinite(found).all():

@@ -138,12 +138,13 @@ def deform(lower: Vector, upper: Vector, contracted: bool):
         def apply(params, x, viewdirs, **inputs):
             params, displacement = params
             cells = displacement.shape[0] - 1
-            place, scale = (x - middle) / quarter, 1.0
+            center, side = (each.reshape((1,) * (x.ndim - 1) + (3,)) for each in (middle, quarter))
+            place, scale = (x - center) / side, 1.0
             if contracted:
                 scale = jnp.maximum(contraction.length_scale(place), _SMALLEST_SCALE)[..., None]
                 place = contraction.contract(place)
             moved = interpolate(displacement, (place + 2) * (cells / 4)) / scale
-            return field.apply(params, x + moved * (4 * quarter / cells), viewdirs, **inputs)
+            return field.apply(params, x + moved * (4 * side / cells), viewdirs, **inputs)
 
         return field._replace(apply=apply)
 
@@ -157,12 +158,13 @@ def interpolate(values: Float[ArrayLike, "X Y Z C"], place: Float[ArrayLike, "*b
         values: [X, Y, Z, C], each axis with at least two vertices.
         place: [..., 3] in cells, vertex (0, 0, 0) at 0; clipped to the grid. Of a NaN the result is any value.
     """
-    most = jnp.asarray(values.shape[:3]) - 1
+    most = jnp.asarray(values.shape[:3]).reshape((1,) * (jnp.ndim(place) - 1) + (3,)) - 1
     place = jnp.clip(jnp.nan_to_num(place), 0, most)
     first = jnp.minimum(place.astype(jnp.int32), most - 1)
     part = place - first
 
     def corner(offset: Int[ArrayLike, "3"]):
+        offset = offset.reshape(most.shape)
         index = first + offset
         weight = jnp.where(offset, part, 1 - part).prod(axis=-1)
         return weight[..., None] * values[index[..., 0], index[..., 1], index[..., 2]]

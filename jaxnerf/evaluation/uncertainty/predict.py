@@ -118,8 +118,8 @@ def make_predictor(
         )
     else:
         say(
-            f"uncertainty: {name}, calibrated on {len(known.views)} held-out views; {100 * known.coverage:g} % of errors "
-            f"are expected within {known.factor:.2f} times the predicted one"
+            f"uncertainty: {name}, calibrated on {len(known.views)} held-out views; {100 * known.coverage:g} % of "
+            f"errors are expected within {known.factor:.2f} times the predicted one"
         )
     identity = f"{name} {key} {known.factor if known else 'uncalibrated'} {coverage}"
     return Predictor(name, found.score, known, fingerprint(identity))
