@@ -28,10 +28,10 @@ def estimate_ensemble(source: UncertaintySource) -> Estimate:
     seen = {fingerprint(source.variables[0]): "the run itself"}
     for workdir in source.members:
         other = restore_run(workdir, settings=_changed_settings(run))
-        if other.identity != run.identity:
+        if differing := _difference(other.identity, run.identity):
             raise ValueError(
                 f"{workdir}: its field or sampler has other options than the run's, expected a run of the same config "
-                f"with another seed; they differ in {_difference(other.identity, run.identity)}"
+                f"with another seed; they differ in {differing}"
             )
         variables = other.variables(newest_step(other, workdir))
         found = fingerprint(variables[0])
@@ -58,6 +58,7 @@ def _changed_settings(run):
 
 
 def _difference(first, second):
+    """Returns the names of options that differ between two identities of runs, the seed excepted; "" if none do."""
     first, second = json.loads(first), json.loads(second)
-    names = sorted(name for name in {*first, *second} if first.get(name) != second.get(name))
+    names = sorted(name for name in {*first, *second} - {"seed"} if first.get(name) != second.get(name))
     return ", ".join(names[:5])
