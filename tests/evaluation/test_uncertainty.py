@@ -5,9 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.evaluation.uncertainty import calibration
 from jaxnerf.evaluation.uncertainty.laplace import deform, interpolate
+from jaxnerf.evaluation.uncertainty.predict import make_predictor
 from jaxnerf.fields.base import Field
+
+pytest_plugins = ["run_fixtures"]
 
 
 def draws(seed, count=4000):
@@ -90,3 +94,10 @@ def test_a_deformed_field_is_the_field_until_it_is_moved(contracted):
     np.testing.assert_allclose(moved.apply((1.0, still + 0.1), x, x)[1], x + 0.1, rtol=1e-5)
     change = jax.jvp(lambda d: moved.apply((1.0, d), x, x)[0], (still,), (still + 1,))[1]
     np.testing.assert_allclose(change, 1, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("members, message", [((), "--members"), ("same", "another seed")])
+def test_an_ensemble_needs_other_runs(unoptimized, trained, members, message):
+    with pytest.raises(ValueError, match=message):
+        make_predictor(restore_run(trained), trained, "ensemble", members=[str(trained)] if members else ())
