@@ -26,6 +26,7 @@ from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.uncertainty.base import Estimate, UncertaintySource
 from jaxnerf.fields.base import Field
 from jaxnerf.options import is_auto
+from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.memory import image_renderer
 
@@ -80,8 +81,6 @@ def load_deformation(source: UncertaintySource) -> Deformation:
             source.say(f"{path}: is damaged, and computed again")
     posterior = fit_deformation(source)
     source.folder.mkdir(parents=True, exist_ok=True)
-    from jaxnerf.runtime import atomic_files
-
     with atomic_files.partial_file(path, ".tmp.npz") as partial:
         np.savez(partial, key=key, **{name: np.asarray(value) for name, value in posterior._asdict().items()})
     return posterior
