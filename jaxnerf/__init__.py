@@ -48,7 +48,14 @@ from jaxnerf.core.volume_rendering import (
     transmittance,
     weights_from_density,
 )
-from jaxnerf.registry import register_exporter, register_field, register_loss, register_reader, register_sampler
+from jaxnerf.registry import (
+    register_estimator,
+    register_exporter,
+    register_field,
+    register_loss,
+    register_reader,
+    register_sampler,
+)
 
 if _typing.TYPE_CHECKING:
     from jaxnerf.data.dataset import load_dataset
@@ -109,4 +116,5 @@ __all__ = [
     "load_scene", "restore_run", "TrainedRun", "train_and_evaluate", "train_many",
     # registration
     "register_field", "register_sampler", "register_loss", "register_reader", "register_exporter",
+    "register_estimator",
 ]  # fmt: skip

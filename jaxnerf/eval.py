@@ -51,6 +51,19 @@ _SHARD = flags.DEFINE_string(
     "K/N scores each N-th view from view K on, where K counts from 0; auto takes K and N from srun or mpirun. "
     "Any number of processes may run at once; the last one to finish writes results.json.",
 )
+_UNCERTAINTY = flags.DEFINE_string(
+    "uncertainty",
+    None,
+    "An estimator of the error of each pixel: laplace, of one run, ensemble, of several, or a registered one. The "
+    "program writes uncertainty/NNN.tiff and compares it with the true errors.",
+)
+_MEMBERS = flags.DEFINE_list("members", None, "ensemble: workdirs of the other runs, which differ in seed.")
+_COVERAGE = flags.DEFINE_float(
+    "coverage",
+    0.9,
+    "The fraction of true errors that the intervals of --uncertainty are to hold. They are calibrated on the views "
+    "that config.data.hold_out has kept from training.",
+)
 
 
 def main(argv):
@@ -78,21 +91,43 @@ def main(argv):
         options |= {"step": _STEP.value, "data_dir": _DATA_DIR.value, "overwrite": _OVERWRITE.value}
         if _ERROR_BUDGET.value is not None:
             options["settings"] |= quality_search.choose(_WORKDIR.value, _ERROR_BUDGET.value, **options)
-        results = evaluate.evaluate(_WORKDIR.value, shard=shard, **options)
+        results = evaluate.evaluate(_WORKDIR.value, shard=shard, predictor=_predictor(), **options)
     if results is None:
         print(f"shard {_SHARD.value} is done; views of other shards are missing")
         return
     print(evaluate.summary(results))
 
 
+def _predictor():
+    """Returns the function that makes the Predictor of a run; None without --uncertainty."""
+    if _UNCERTAINTY.value is None:
+        return None
+    import functools
+
+    from jaxnerf.evaluation.uncertainty.predict import make_predictor
+    from jaxnerf.registry import ESTIMATORS
+
+    ESTIMATORS.get(_UNCERTAINTY.value)  # a wrong name is reported before anything is read
+    options = {"members": _MEMBERS.value or (), "coverage": _COVERAGE.value, "step": _STEP.value}
+    return functools.partial(make_predictor, workdir=_WORKDIR.value, name=_UNCERTAINTY.value, **options)
+
+
 def _check_flags(is_sharded):
+    if not 0 < _COVERAGE.value < 1:
+        raise ValueError(f"--coverage is {_COVERAGE.value}, expected a number between 0 and 1, such as 0.9; correct it")
+    if _MEMBERS.value and _UNCERTAINTY.value is None:
+        raise ValueError("--members is given without --uncertainty=ensemble; add that, or drop --members")
     if not (_WORKDIR.value or _PREDICTIONS.value):
         raise ValueError("there is nothing to score; give --workdir=DIR of a run, or --predictions=DIR of images")
     for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):
         if is_sharded and value:
             raise ValueError(f"--shard splits the views of one checkpoint, not --{name}; drop one of them")
     # What --predictions and --watch cannot use.
-    of_one_checkpoint = {"step": _STEP.value, "error_budget": _ERROR_BUDGET.value}
+    of_one_checkpoint = {
+        "step": _STEP.value,
+        "error_budget": _ERROR_BUDGET.value,
+        "uncertainty": _UNCERTAINTY.value,
+    }
     of_a_run = of_one_checkpoint | {"chunk": _CHUNK.value, "bake_occupancy": _BAKE_OCCUPANCY.value}
     unused = {
         "predictions": (_PREDICTIONS.value, of_a_run | {"watch": _WATCH.value or None}),

@@ -1,4 +1,4 @@
-"""What code that registers a field, a sampler, a loss, a dataset reader or an exporter builds on.
+"""What code that registers a field, a sampler, a loss, a dataset reader, an exporter or an estimator builds on.
 
 `jaxnerf.register_field` and its siblings say what each needs; docs/extending has an example of each.
 """
@@ -6,6 +6,7 @@
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
 from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.evaluation.uncertainty.base import Estimate, UncertaintySource
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.models.base import Model, SamplerContext
@@ -28,6 +29,8 @@ __all__ = [
     "Field", "Model", "SamplerContext", "field_scene", "needs_of_fields", "split_key", "without_samples",
     # readers and exporters
     "Capture", "Frame", "ExportSource",
+    # estimators of uncertainty
+    "Estimate", "UncertaintySource",
     # options
     "Options", "option", "Changes", "at_least", "between", "POSITIVE", "FRACTION", "BELOW_ONE", "infer", "Facts",
     "Device",

@@ -141,6 +141,14 @@ EXPORTERS = Registry(
         "web": "jaxnerf.exporters.web:export_web",
     },
 )
+ESTIMATORS = Registry(
+    "estimator of uncertainty",
+    "jaxnerf.register_estimator",
+    {
+        "laplace": "jaxnerf.evaluation.uncertainty.laplace:estimate_laplace",
+        "ensemble": "jaxnerf.evaluation.uncertainty.ensemble:estimate_ensemble",
+    },
+)
 
 
 def register_field(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
@@ -232,6 +240,19 @@ def register_exporter(name: str, export: Callable[..., Any]) -> None:
         ValueError: if another exporter has that name.
     """
     EXPORTERS.add(name, export)
+
+
+def register_estimator(name: str, estimate: Callable[..., Any]) -> None:
+    """Registers an estimator of the error of each pixel under a name for `--uncertainty`.
+
+    Args:
+        name: of the estimator.
+        estimate: (source: UncertaintySource) -> Estimate, see `jaxnerf.extend.UncertaintySource` and `Estimate`.
+
+    Raises:
+        ValueError: if another estimator has that name.
+    """
+    ESTIMATORS.add(name, estimate)
 
 
 def _checked_options(function, options):

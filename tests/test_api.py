@@ -68,6 +68,7 @@ SURFACE = {
     "register_loss": "name function | on='renderings' needs=() weight=0.0 help=''",
     "register_reader": "name read | detect=None",
     "register_exporter": "name export |",
+    "register_estimator": "name estimate |",
 }
 TYPES = ["Rays", "Samples", "PackedSamples", "Rendering", "Camera", "Views", "Batch", "OccupancyGrid", "SceneFn"]
 TYPES += ["SparsePoints", "TrainedRun"]
@@ -131,6 +132,7 @@ PLAIN = {
     *("load_dataset", "draw_batch", "still_life", "mlp_field", "load_scene", "restore_run", "train_and_evaluate"),
     "train_many",
     *("register_field", "register_sampler", "register_loss", "register_reader", "register_exporter"),
+    "register_estimator",
 }
 
 

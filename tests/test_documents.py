@@ -214,7 +214,9 @@ def test_python_examples_run(code, unoptimized, tmp_path, monkeypatch):
         (tmp_path / "runs" / "lego").mkdir(parents=True)
         (tmp_path / "runs" / "lego" / "config.json").write_text('{"seed": 0}')
         (tmp_path / "runs" / "lego" / "metrics.jsonl").write_text('{"step": 1, "seconds": 2.0, "psnr_fine": 20.0}\n')
-    for parts in (registry.LOSSES, registry.FIELDS, registry.SAMPLERS, registry.READERS, registry.EXPORTERS):
+    for parts in (
+        *(getattr(registry, name) for name in ("LOSSES", "FIELDS", "SAMPLERS", "READERS", "EXPORTERS", "ESTIMATORS")),
+    ):
         monkeypatch.setattr(parts, "_parts", dict(parts._parts))  # what an example registers is forgotten
     with jax.numpy_rank_promotion("allow"):
         exec(compile(code, "example", "exec"), {})

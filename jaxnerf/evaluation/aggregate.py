@@ -96,6 +96,7 @@ def merge(
     variables: tuple,
     provenance: Mapping[str, Any],
     overwrite: bool,
+    predictor: Any = None,
 ) -> dict[str, Any] | None:
     """Writes results.json and moves the folder `partial` to `target`, which it replaces only with overwrite.
 
@@ -110,6 +111,8 @@ def merge(
         return None
     finished = [atomic_files.read_json(_row_file(partial, index), _AGAIN) for index in range(count)]
     results = _results(run, workdir, views, variables, finished, provenance)
+    if predictor is not None:
+        results["uncertainty"] = predictor.summary(results["images"])
     rows = [read_stored(_contact_sheet_file(partial, index)) for index in _on_contact_sheet(count)]
     output_images.write_contact_sheet(partial / "contact_sheet.png", rows)
     with atomic_files.partial_file(partial / "results.json") as file:

@@ -127,6 +127,7 @@ def evaluate(
     settings: dict[str, Any] | None = None,
     overwrite: bool = False,
     shard: tuple[int, int] = shards.WHOLE,
+    predictor: Callable[[TrainedRun], Any] | None = None,
 ) -> dict[str, Any] | None:
     """Scores one checkpoint and writes <workdir>/eval/<step>/.
 
@@ -138,6 +139,8 @@ def evaluate(
         step: of the checkpoint; the newest when None.
         overwrite: whether an earlier result of the same step and split is replaced.
         shard: (index, count): only every count-th view, from view `index` on.
+        predictor: TrainedRun -> `uncertainty.predict.Predictor`; its predicted errors are written to
+            uncertainty/NNN.tiff, and compared with the true ones. None: no error is predicted.
 
     Returns:
         What results.json holds; None while views of other shards are missing.
@@ -147,7 +150,8 @@ def evaluate(
             scored with other settings.
     """
     run = restore_run(workdir, config, data_dir=data_dir, settings=settings)
-    return score_run(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
+    options = {"overwrite": overwrite, "shard": shard, "predictor": predictor and predictor(run)}
+    return score_run(run, workdir, split=split, step=step, **options)
 
 
 def score_run(
@@ -159,6 +163,7 @@ def score_run(
     overwrite: bool = False,
     views: Views | None = None,
     shard: tuple[int, int] = shards.WHOLE,
+    predictor: Any = None,
 ) -> dict[str, Any] | None:
     """Scores a checkpoint as `evaluate` does, for a restored run, with views if they have been read already."""
     step = newest_step(run, workdir, step)
@@ -168,6 +173,8 @@ def score_run(
     variables = run.variables(step)
     views = refined_views(run, views, split, variables[0])
     partial, provenance = target.with_name(target.name + ".tmp"), _provenance(run, variables, views, split, step)
+    if predictor is not None:
+        provenance["uncertainty"] = predictor.identity
     if target.exists() and not overwrite:
         return aggregate.read(target, provenance, _REMEDY)
     shards.make_folder(partial, provenance, overwrite=overwrite, file=aggregate.PROVENANCE, remedy=_REMEDY)
@@ -175,8 +182,9 @@ def score_run(
         with atomic_files.naming(partial):
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
-            _score_views(run, functools.partial(run.render_image, variables), views, partial, shard)
+            _score_views(run, functools.partial(run.render_image, variables), views, partial, shard, predictor)
             options = {"run": run, "workdir": workdir, "views": views, "variables": variables, "provenance": provenance}
+            options |= {"predictor": predictor}
             return aggregate.merge(partial, target, overwrite=overwrite, **options)
     except OSError as error:
         # Another process has finished and moved the folder, perhaps just now, which a later one may have made again.
@@ -234,10 +242,16 @@ def summary(results: dict[str, Any]) -> str:
     shared = results.get("conventions", {}).get("shared_with_training")
     note = f"; note: {shared['note']}" if shared else ""
     paired = "" if results.get("paired_by", "name") == "name" else f", paired by {results['paired_by']}"
-    return f"{step}{metrics} over {results['views']} views{speed}{paired}{note}"
+    found = results.get("uncertainty", {})
+    errors = f"; AUSE {found['ause_rmse']:.3f} (RMSE), {found['ause_mae']:.3f} (MAE)" if found else ""
+    if "coverage" in found:
+        errors += (
+            f", {100 * found['coverage']:.1f} % of errors within intervals for {100 * found['target_coverage']:g} %"
+        )
+    return f"{step}{metrics} over {results['views']} views{speed}{errors}{paired}{note}"
 
 
-def _score_views(run, render, views, folder, shard):
+def _score_views(run, render, views, folder, shard, predictor):
     """Renders and scores those views of a shard that are not finished."""
     count = len(views.names)
     frames = shards.indices_of(range(count), shard)
@@ -256,6 +270,10 @@ def _score_views(run, render, views, folder, shard):
         truth = views.image(index)
         row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
+        if predictor is not None:
+            error, figures = predictor.scored(rays, image.rgb, truth, pixel_mask(views, index))
+            output_images.write_error(folder, f"{index:03d}", error)
+            row |= figures
         output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
         aggregate.mark_finished(folder, index, row, truth, image, count=count, first=first)
         progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")

@@ -32,6 +32,12 @@ def write_view(folder: pathlib.Path, name: str, rgb: ArrayLike, truth: ArrayLike
         write_image(path, pixels)
 
 
+def write_error(folder: pathlib.Path, name: str, error: ArrayLike) -> None:
+    """Writes uncertainty/NAME.tiff, the predicted error of each pixel in units of colour, float32."""
+    (pathlib.Path(folder) / "uncertainty").mkdir(exist_ok=True)
+    write_image(pathlib.Path(folder) / "uncertainty" / f"{name}.tiff", np.asarray(error, np.float32))
+
+
 def view_files(folder: pathlib.Path, name: str) -> list[pathlib.Path]:
     """Returns the paths that `write_view` writes; their folders must exist."""
     return [pathlib.Path(folder) / kind / f"{name}.{suffix}" for kind, suffix in _VIEW_FILES.items()]

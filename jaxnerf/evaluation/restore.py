@@ -34,8 +34,8 @@ class TrainedRun(NamedTuple):
         render_image: (variables, Rays [...], chunk=None, median_depth=False) -> Rendering [...] as `render`, in
             chunks that fit into memory.
         variables_of: (`image_params`, grid) of a state of training -> (params, grid) as `variables` returns them.
-        model_with: settings of the section `eval`, by name -> the Model that renders with these in place of the run's
-            own. It takes the same variables.
+        model_with: (settings of the section `eval`, by name; wrap=None) -> the Model that renders with these in place
+            of the run's own, and whose field is wrapped as `build_model` does. It takes the same variables.
     """
 
     experiment: build.Experiment
@@ -45,7 +45,7 @@ class TrainedRun(NamedTuple):
     identity: str
     render_image: Callable[..., Rendering]
     variables_of: Callable[[Any, Any], tuple]
-    model_with: Callable[[dict[str, Any]], Model]
+    model_with: Callable[..., Model]
 
 
 def restore_run(
@@ -118,9 +118,9 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         state = checkpoints.load(step, template())
         return variables_of(image_params(state), state.grid)
 
-    def model_with(settings):
+    def model_with(settings, wrap=None):
         other = _with_settings(config, settings)
-        model = build.build_model(other)
+        model = build.build_model(other, wrap)
         return build.bake_model(other, model, lambda count: None)[0] if bake else model
 
     def cull(variables, rays, **options):

@@ -114,20 +114,29 @@ def build(config: Config) -> Experiment:
     )
 
 
-def build_model(config: Config) -> Model:
-    """Builds the Model: the config's field under the config's sampler."""
+def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) -> Model:
+    """Builds the Model: the config's field under the config's sampler.
+
+    Args:
+        config: resolved.
+        wrap: changes the field that images show; None: it is as the config says.
+    """
     config = read_config(config)
     part = SAMPLERS.get(config.sampler)
     _check_sampling(config)
     return part.make(
         SamplerContext(
             options=_filled(config.options_of(part, config.sampler), part.section or config.sampler),
-            make_field=functools.partial(_make_field, config),
+            make_field=lambda network: _wrapped(wrap, network, _make_field(config, network)),
             view=config.eval,
             background=dataset.color_behind(config.data),
             box=_box(config),
         )
     )
+
+
+def _wrapped(wrap, network, field):
+    return wrap(field) if wrap is not None and network == "fine" else field
 
 
 def build_cameras(config: RunConfig, needs: tuple[str, ...] = ()) -> CameraParameters | None:

@@ -1,0 +1,170 @@
+"""Errors from raw scores: a monotone map and a conformal factor, both from views that were not trained on."""
+
+import json
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxnerf.runtime import atomic_files
+
+_NUM_BINS = 50
+_LEAST_ERROR = 1 / (255 * 12**0.5)  # the standard deviation of rounding to 8 bits
+_AGAIN = "remove it, and the same command calibrates again"
+
+
+class Calibration(NamedTuple):
+    """Turns raw scores into errors.
+
+    Attributes:
+        scores: [M] ascending.
+        errors: [M] ascending, the RMS error of pixels of such a score; linear in between, proportional to the score
+            outside.
+        factor: the error of a pixel is at most this times its predicted RMS error, with probability `coverage`.
+        coverage: in (0, 1).
+        num_pixels: that the factor was found from.
+        views: names of the images.
+    """
+
+    scores: tuple[float, ...]
+    errors: tuple[float, ...]
+    factor: float
+    coverage: float
+    num_pixels: int
+    views: tuple[str, ...]
+
+    def predicted(self, score: ArrayLike) -> np.ndarray:
+        """Returns the predicted RMS error [...] of scores [...], in units of colour."""
+        score = np.asarray(score, np.float64)
+        first, last = self.scores[0], self.scores[-1]
+        error = np.interp(score, self.scores, self.errors)
+        beyond = np.where(score > last, score / max(last, 1e-12), 1.0)
+        below = np.where(score < first, score / max(first, 1e-12), 1.0)
+        return np.maximum(error * beyond * below, _LEAST_ERROR).astype(np.float32)
+
+    def interval(self, score: ArrayLike) -> np.ndarray:
+        """Returns half the width [...] of the interval that holds a pixel's error with probability `coverage`."""
+        return (self.factor * self.predicted(score)).astype(np.float32)
+
+
+def pixel_error(rgb: ArrayLike, truth: ArrayLike) -> np.ndarray:
+    """Returns the error [...] of colours [..., 3]: the RMS over their channels."""
+    return np.sqrt(((np.clip(np.asarray(rgb), 0, 1) - np.asarray(truth)) ** 2).mean(axis=-1))
+
+
+def calibrate(
+    scores: Sequence[ArrayLike], errors: Sequence[ArrayLike], views: Sequence[str], coverage: float = 0.9
+) -> Calibration:
+    """Calibrates by split conformal prediction: every second view gives the map, the others the factor.
+
+    The map is the RMS error by score, made monotone (isotonic regression of the means of bins with equally many
+    pixels), so that it keeps the order of the scores. With n pixels of the other views the factor is the
+    ceil((n + 1) coverage)-th smallest ratio of error and predicted error. A new pixel from the same distribution is
+    then within the interval with at least that probability (arXiv:1604.04173). Pixels of one view are alike, so that
+    the coverage of a single view differs from it by more than its number of pixels suggests.
+
+    Args:
+        scores, errors: of each view, [N] each.
+        views: names.
+        coverage: in (0, 1).
+
+    Raises:
+        ValueError: with fewer than two views, a score that is not finite, or too few pixels for the coverage.
+    """
+    if not 0 < coverage < 1:
+        raise ValueError(f"coverage is {coverage}, expected a number between 0 and 1, such as 0.9; correct --coverage")
+    if len(scores) < 2:
+        raise ValueError(
+            f"calibration has {len(scores)} views, expected at least 2; lower data.hold_out and train again"
+        )
+    scores, errors = ([np.ravel(np.asarray(each, np.float64)) for each in values] for values in (scores, errors))
+    for name, found in zip(views, scores, strict=True):
+        if not np.isfinite(found).all():
+            raise ValueError(f"{name}: has scores that are not finite, so nothing can be calibrated; check the run")
+    known = _monotone(np.concatenate(scores[::2]), np.concatenate(errors[::2]))
+    count = sum(found.size for found in scores[1::2])
+    rank = math.ceil((count + 1) * coverage)
+    if rank > count:
+        raise ValueError(f"calibration has {count} pixels, too few for a coverage of {coverage}; lower --coverage")
+    draft = Calibration(*known, 1.0, coverage, count, tuple(views))
+    ratio = np.concatenate(errors[1::2]) / draft.predicted(np.concatenate(scores[1::2]))
+    return draft._replace(factor=float(np.partition(ratio, rank - 1)[rank - 1]))
+
+
+def _monotone(scores, errors):
+    """Returns (scores, errors) of bins, ascending: their mean scores and RMS errors, neighbours out of order merged."""
+    order = np.argsort(scores, kind="stable")
+    merged = []  # [sum of squared errors, sum of scores, count]
+    for part in np.array_split(order, min(_NUM_BINS, scores.size)):
+        merged.append([np.square(errors[part]).sum(), scores[part].sum(), part.size])
+        while len(merged) > 1 and merged[-2][0] / merged[-2][2] >= merged[-1][0] / merged[-1][2]:
+            merged[-2:] = [[sum(pair) for pair in zip(*merged[-2:], strict=True)]]
+    squares, total, count = np.array(merged).T
+    return tuple((total / count).tolist()), tuple(np.maximum(np.sqrt(squares / count), _LEAST_ERROR).tolist())
+
+
+def sparsification(error: ArrayLike, score: ArrayLike, *, num_fractions: int = 100) -> dict[str, float]:
+    """Computes the areas under the sparsification error, AUSE (as in arXiv:1802.07095), of one image.
+
+    The pixels of the largest scores are removed, a fraction f at a time. The RMSE, or the mean error, of those that
+    are left falls as f grows, and most if the scores sort the pixels as their errors do. AUSE is the mean over f of the
+    difference from that best order, in units of the RMSE, or mean error, of the whole image: 0 is best.
+
+    Args:
+        error: [N], >= 0.
+        score: [N]. Pixels of equal scores are removed in a random order.
+        num_fractions: of f, evenly in [0, 1).
+
+    Returns:
+        "ause_rmse" and "ause_mae"; 0 for an image without any error.
+    """
+    error, score = np.ravel(np.asarray(error, np.float64)), np.ravel(np.asarray(score, np.float64))
+    shuffled = np.random.default_rng(0).permutation(error.size)
+    kept = error.size - (np.arange(num_fractions) * error.size) // num_fractions
+
+    def curve(values, order):
+        return (np.cumsum(values[order]) / np.arange(1, error.size + 1))[kept - 1]
+
+    by_score, by_error = shuffled[np.argsort(score[shuffled], kind="stable")], np.argsort(error, kind="stable")
+    found = {}
+    for name, values, root in (("ause_rmse", error**2, np.sqrt), ("ause_mae", error, np.abs)):
+        whole = root(values.mean())
+        found[name] = float((root(curve(values, by_score)) - root(curve(values, by_error))).mean() / max(whole, 1e-12))
+    return found
+
+
+def save(path: pathlib.Path, calibration: Calibration, key: str) -> None:
+    """Writes a calibration; key: text that is equal for the same checkpoint and estimate."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_files.write_text(path, json.dumps({"key": key, **calibration._asdict()}, indent=1) + "\n")
+
+
+def load(path: pathlib.Path, key: str) -> Calibration:
+    """Reads a calibration.
+
+    Raises:
+        ValueError: if it is damaged, or that of another checkpoint or estimate.
+    """
+    content = atomic_files.read_json(path, _AGAIN)
+    if not isinstance(content, dict) or set(content) != {"key", *Calibration._fields}:
+        raise ValueError(f"{path}: is damaged, expected what jaxnerf-eval --uncertainty writes; {_AGAIN}")
+    if content.pop("key") != key:
+        raise ValueError(f"{path}: was calibrated for other parameters, another field or other members; {_AGAIN}")
+    try:
+        found = Calibration(**{name: tuple(v) if isinstance(v, list) else v for name, v in content.items()})
+        numbers = np.array([*found.scores, *found.errors, found.factor, found.coverage], float)
+        valid = len(found.scores) == len(found.errors) > 0 and np.isfinite(numbers).all()
+    except (ValueError, TypeError):
+        valid = False
+    if not valid:
+        raise ValueError(f"{path}: is damaged, expected numbers; {_AGAIN}")
+    return found
+
+
+def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Returns the means over the images of what `Predictor.row` computes."""
+    names = [name for name in ("coverage", "interval", "ause_rmse", "ause_mae") if all(name in row for row in rows)]
+    return {name: float(np.mean([row[name] for row in rows])) for name in names}

@@ -1,0 +1,225 @@
+"""The estimator "laplace": how far the training images let the scene be deformed (after arXiv:2309.03185).
+
+The trained scene is a function of position. It is composed with a deformation, x + d(x), where d is linear between
+the vertices of a grid, and the trained scene has d = 0. Around that point the rendered colours are linear in d, so that
+the posterior of d is a normal distribution. Of its precision only the diagonal is kept:
+
+    precision = sum over training rays of J^2 / noise + 1 / prior,
+
+with J the derivative of a ray's colour with respect to a displacement. The predicted variance of any other ray's colour
+is J' diag(1 / precision) J. Both are estimated by random signs, from products of the Jacobian with vectors alone: a
+vjp for the first, a jvp for the second. Nothing needs to be known of the field or the sampler.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxnerf.core import contraction
+from jaxnerf.core.types import Rays, Vector
+from jaxnerf.data.ray_batches import draw_batch
+from jaxnerf.evaluation.uncertainty.base import Estimate, UncertaintySource
+from jaxnerf.fields.base import Field
+from jaxnerf.options import is_auto
+from jaxnerf.runtime import atomic_files
+from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.runtime.memory import image_renderer
+
+RESOLUTION = 64  # cells of the deformation along each axis of the box
+NUM_BATCHES = 128  # each adds one random product; the precision then has a relative error of sqrt(2 / 128)
+BATCH_SIZE = 1024  # rays
+NUM_PROBES = 8  # deformations that a predicted variance is the mean of
+_SMALLEST_SCALE = 1e-6  # of a contraction: at infinity it is 0
+_LEAST_NOISE = 1 / (12 * 255**2)  # the variance of rounding to 8 bits
+
+
+class Deformation(NamedTuple):
+    """The posterior of the displacements of a run.
+
+    Attributes:
+        std: [R, R, R, 3] in (0, 1], in cells; 1, that of the prior, where no training ray says anything.
+        noise: mean squared error of the training rays, the variance that is left of a known scene.
+    """
+
+    std: Float[Array, "R R R 3"]
+    noise: Float[Array, ""]
+
+
+def estimate_laplace(source: UncertaintySource) -> Estimate:
+    """Makes the estimate of a run from one pass over rays of its training views.
+
+    The score is the root of the predicted variance of the colour, mean over the channels, and the training
+    rays' mean squared error.
+
+    Raises:
+        ValueError: if the run has no box.
+    """
+    posterior = load_deformation(source)
+    render = image_renderer(_scored_rendering(source), source.run.experiment.config.eval.chunk, _cull(source))
+
+    def score(rays: Rays):
+        return render((source.variables, posterior), rays).rgb[..., 0]
+
+    return Estimate(score, f"laplace, {RESOLUTION} cells, {NUM_BATCHES} x {BATCH_SIZE} rays, {NUM_PROBES} probes")
+
+
+def load_deformation(source: UncertaintySource) -> Deformation:
+    """Returns the posterior of a checkpoint: from its file, or else computed and written there."""
+    path = source.folder / "laplace.npz"
+    key = fingerprint(source.fingerprint, RESOLUTION, NUM_BATCHES, BATCH_SIZE)
+    if path.is_file():
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                if str(stored["key"]) == key:
+                    return Deformation(jnp.asarray(stored["std"]), jnp.asarray(stored["noise"]))
+        except (ValueError, OSError, KeyError):
+            source.say(f"{path}: is damaged, and computed again")
+    posterior = fit_deformation(source)
+    source.folder.mkdir(parents=True, exist_ok=True)
+    with atomic_files.partial_file(path, ".tmp.npz") as partial:
+        np.savez(partial, key=key, **{name: np.asarray(value) for name, value in posterior._asdict().items()})
+    return posterior
+
+
+def fit_deformation(source: UncertaintySource) -> Deformation:
+    """Computes the posterior in one pass over NUM_BATCHES batches of random training rays."""
+    experiment = source.run.experiment
+    model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.occupancy.contracted))
+    params, grid = source.variables
+    views = dataclasses.replace(source.views, mask=None, sparse=None)
+    given, step = experiment.config.data, jnp.int32(2**30)
+    options = {"pixel_offset": given.pixel_offset, "ndc": given.ndc, "needs": model.needs}
+    still = jnp.zeros((RESOLUTION + 1,) * 3 + (3,))
+
+    @jax.jit
+    def product(index, params, grid, views):
+        keys, batch = draw_batch(np.uint32(0), index, jnp.arange(BATCH_SIZE), views, **options)
+
+        def colors(displacement):
+            rendered = model.render(keys, _deformed(params, displacement), grid, batch.rays, step)
+            return rendered[model.image_networks[-1]].rgb
+
+        rgb, transpose = jax.vjp(colors, still)
+        signs = jax.random.rademacher(jax.random.fold_in(keys[0], 1), rgb.shape, rgb.dtype)
+        return transpose(signs)[0] ** 2, ((rgb - batch.rgb) ** 2).mean()
+
+    squares, error = jnp.zeros_like(still), 0.0
+    for index in range(NUM_BATCHES):
+        more, mean = product(index, params, grid, views)
+        squares, error = squares + more, error + mean / NUM_BATCHES
+    noise = jnp.maximum(error, _LEAST_NOISE)
+    rays = np.prod(np.asarray(views.size, np.int64), axis=1).sum()
+    information = squares * (rays / (NUM_BATCHES * BATCH_SIZE)) / noise
+    return Deformation(1 / jnp.sqrt(1 + information), noise)
+
+
+def deform(lower: Vector, upper: Vector, contracted: bool):
+    """Makes the function Field -> Field whose params are a pair: those of the field, and displacements.
+
+    Args:
+        lower, upper: [3] world units, corners of the box of the displacements.
+        contracted: whether the box holds all of space, see `contract_field`. Cells grow there as it contracts them.
+
+    Returns:
+        The function. The displacements are [R + 1, R + 1, R + 1, 3], at the vertices, in cells of the box; outside
+        a box that is not contracted they are those of its faces.
+    """
+    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
+    middle, quarter = (lower + upper) / 2, (upper - lower) / 4
+
+    def wrap(field: Field) -> Field:
+        @functools.wraps(field.apply)
+        def apply(params, x, viewdirs, **inputs):
+            params, displacement = params
+            cells = displacement.shape[0] - 1
+            center, side = (each.reshape((1,) * (x.ndim - 1) + (3,)) for each in (middle, quarter))
+            place, scale = (x - center) / side, 1.0
+            if contracted:
+                scale = jnp.maximum(contraction.length_scale(place), _SMALLEST_SCALE)[..., None]
+                place = contraction.contract(place)
+            moved = interpolate(displacement, (place + 2) * (cells / 4)) / scale
+            return field.apply(params, x + moved * (4 * side / cells), viewdirs, **inputs)
+
+        return field._replace(apply=apply)
+
+    return wrap
+
+
+def interpolate(values: Float[ArrayLike, "X Y Z C"], place: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch C"]:
+    """Interpolates values at vertices linearly along each axis.
+
+    Args:
+        values: [X, Y, Z, C], each axis with at least two vertices.
+        place: [..., 3] in cells, vertex (0, 0, 0) at 0; clipped to the grid. Of a NaN the result is any value.
+    """
+    most = jnp.asarray(values.shape[:3]).reshape((1,) * (jnp.ndim(place) - 1) + (3,)) - 1
+    place = jnp.clip(jnp.nan_to_num(place), 0, most)
+    first = jnp.minimum(place.astype(jnp.int32), most - 1)
+    part = place - first
+
+    def corner(offset: Int[ArrayLike, "3"]):
+        offset = offset.reshape(most.shape)
+        index = first + offset
+        weight = jnp.where(offset, part, 1 - part).prod(axis=-1)
+        return weight[..., None] * values[index[..., 0], index[..., 1], index[..., 2]]
+
+    return sum(corner(np.array(offset)) for offset in np.ndindex(2, 2, 2))
+
+
+def _scored_rendering(source):
+    """Returns the function ((variables, posterior), Rays [N]) -> Rendering [N] with the score in place of rgb."""
+    experiment = source.run.experiment
+    model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.occupancy.contracted))
+
+    @jax.jit
+    def render(variables, rays):
+        (params, grid), posterior = variables
+        keys = jax.random.split(jax.random.key(0), NUM_PROBES)
+        still = jnp.zeros_like(posterior.std)
+
+        def view(displacement):
+            return model.view(_deformed(params, displacement), grid, rays)
+
+        def change(key):
+            probe = posterior.std * jax.random.rademacher(key, still.shape, still.dtype)
+            return jax.jvp(lambda displacement: view(displacement).rgb, (still,), (probe,))[1]
+
+        variance = (jax.vmap(change)(keys) ** 2).mean(axis=(0, -1))
+        return _with_score(view(still), jnp.sqrt(variance + posterior.noise))
+
+    return render
+
+
+def _cull(source):
+    """Returns the function that `image_renderer` takes; None where the model has none."""
+    model = source.run.model_with({})
+    if model.cull is None:
+        return None
+
+    def cull(variables, rays):
+        (_, grid), posterior = variables
+        hits, empty = model.cull(grid, rays)
+        return hits, _with_score(empty, jnp.broadcast_to(jnp.sqrt(posterior.noise), empty.opacity.shape))
+
+    return jax.jit(cull)
+
+
+def _with_score(rendering, score):
+    return dataclasses.replace(rendering, rgb=jnp.broadcast_to(score[..., None], (*score.shape, 3)))
+
+
+def _deformed(params, displacement):
+    """Returns the params of a model whose field "fine" is deformed."""
+    return {**params, "fine": (params["fine"], displacement)}
+
+
+def _box_of(config):
+    corners = config.occupancy.lower, config.occupancy.upper
+    if any(map(is_auto, corners)):
+        raise ValueError("occupancy.lower or occupancy.upper is 'auto', expected the box of the scene; set both")
+    return corners

@@ -1,0 +1,103 @@
+"""Predicted errors: calibration, sparsification, the deformation, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnerf.evaluation.restore import restore_run
+from jaxnerf.evaluation.uncertainty import calibration
+from jaxnerf.evaluation.uncertainty.laplace import deform, interpolate
+from jaxnerf.evaluation.uncertainty.predict import make_predictor
+from jaxnerf.fields.base import Field
+
+pytest_plugins = ["run_fixtures"]
+
+
+def draws(seed, count=4000):
+    """Returns scores, and errors whose spread is proportional to them."""
+    rng = np.random.default_rng(seed)
+    scores = rng.uniform(0.05, 0.5, count)
+    return scores, np.abs(rng.normal(size=count)) * scores * 0.3
+
+
+def calibrated(coverage=0.9):
+    scores, errors = zip(*(draws(seed) for seed in range(6)), strict=True)
+    return calibration.calibrate(scores, errors, [f"view_{index}" for index in range(6)], coverage)
+
+
+@pytest.mark.parametrize("coverage", [0.5, 0.9, 0.99])
+def test_intervals_hold_the_stated_fraction_of_new_errors(coverage):
+    scores, errors = draws(99, 20_000)
+    assert (errors <= calibrated(coverage).interval(scores)).mean() == pytest.approx(coverage, abs=0.015)
+
+
+def test_predicted_errors_are_the_rms_error_and_keep_the_order_of_scores():
+    scores = np.linspace(0.01, 1.0, 200)  # beyond those that were seen, too
+    predicted = calibrated().predicted(scores)
+    assert (np.diff(predicted) >= 0).all()
+    np.testing.assert_allclose(predicted[20:], 0.3 * scores[20:], rtol=0.15)
+
+
+def test_the_factor_has_the_finite_sample_correction():
+    errors = [np.full(4, 0.1), np.array([0.1, 0.2, 0.3, 0.4])]
+    found = calibration.calibrate([np.ones(4), np.ones(4)], errors, ["a", "b"], 0.8)
+    assert found.factor == pytest.approx(4.0, rel=1e-5)  # the 4th of 4, as ceil(5 * 0.8) = 4; the 80 % quantile is less
+    with pytest.raises(ValueError, match="too few"):
+        calibration.calibrate([np.ones(4), np.ones(4)], errors, ["a", "b"], 0.9)
+
+
+@pytest.mark.parametrize(
+    "scores, coverage", [([np.ones(9)], 0.9), ([np.ones(9)] * 2, 1.0), ([np.full(9, np.nan)] * 2, 0.5)]
+)
+def test_what_cannot_be_calibrated_is_refused(scores, coverage):
+    with pytest.raises(ValueError):
+        calibration.calibrate(scores, [np.ones(9)] * len(scores), ["a", "b"], coverage)
+
+
+def test_a_stored_calibration_is_refused_for_another_checkpoint(tmp_path):
+    path = tmp_path / "10" / "laplace.json"
+    calibration.save(path, calibrated(), "this")
+    assert calibration.load(path, "this") == calibrated()
+    with pytest.raises(ValueError, match="other parameters"):
+        calibration.load(path, "other")
+    path.write_text('{"key": "this"}')
+    with pytest.raises(ValueError, match="damaged"):
+        calibration.load(path, "this")
+
+
+def test_ause_is_zero_for_true_errors_and_larger_the_less_the_score_says():
+    error = np.random.default_rng(0).exponential(size=5000)
+    noisy = error + np.random.default_rng(1).normal(size=5000)
+    best, some, none = (
+        calibration.sparsification(error, score)["ause_rmse"] for score in (error, noisy, np.zeros(5000))
+    )
+    assert best == pytest.approx(0, abs=1e-9)
+    assert 0.05 < some < 0.8 * none
+
+
+def test_interpolation_is_exact_for_linear_functions_and_clipped():
+    vertices = jnp.stack(jnp.meshgrid(*[jnp.arange(5.0)] * 3, indexing="ij"), axis=-1)
+    x = jax.random.uniform(jax.random.key(0), (50, 3), maxval=4.0)
+    np.testing.assert_allclose(interpolate(vertices, x), x, atol=1e-5)
+    np.testing.assert_allclose(interpolate(vertices, jnp.array([[9.0, -1.0, 2.0]])), [[4, 0, 2]], atol=1e-6)
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_a_deformed_field_is_the_field_until_it_is_moved(contracted):
+    field = Field(lambda key: jnp.ones(()), lambda params, x, viewdirs: (params * x[..., 0], x))
+    moved = deform([-2.0] * 3, [2.0] * 3, contracted)(field)
+    x = jnp.array([[[0.3, -0.2, 0.1], [0.7, 0.6, -0.5]]])
+    still = jnp.zeros((5, 5, 5, 3))
+    np.testing.assert_array_equal(moved.apply((1.0, still), x, x)[1], x)
+    # Vertices are one world unit apart in the inner half, so that a displacement of 0.1 cells is 0.1.
+    np.testing.assert_allclose(moved.apply((1.0, still + 0.1), x, x)[1], x + 0.1, rtol=1e-5)
+    change = jax.jvp(lambda d: moved.apply((1.0, d), x, x)[0], (still,), (still + 1,))[1]
+    np.testing.assert_allclose(change, 1, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("members, message", [((), "--members"), ("same", "another seed")])
+def test_an_ensemble_needs_other_runs(unoptimized, trained, members, message):
+    with pytest.raises(ValueError, match=message):
+        make_predictor(restore_run(trained), trained, "ensemble", members=[str(trained)] if members else ())
