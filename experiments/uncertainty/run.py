@@ -6,7 +6,7 @@ python experiments/uncertainty/run.py --runs=DIR+MEMBER+MEMBER,DIR
 import pathlib
 
 import numpy as np
-from absl import app, flags
+from absl import app, flags, logging
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.evaluation.metrics import pixel_mask
@@ -24,9 +24,9 @@ def measure(workdir, members):
     step = newest_step(run, workdir)
     variables, experiment = run.variables(step), run.experiment
     views = refined_views(run, experiment.load_split("test"), "test", variables[0])
-    predictors = {"laplace": make_predictor(run, workdir, "laplace")}
+    predictors = {"laplace": make_predictor(run, workdir, "laplace", say=logging.info)}
     if members:
-        predictors["ensemble"] = make_predictor(run, workdir, "ensemble", members=members)
+        predictors["ensemble"] = make_predictor(run, workdir, "ensemble", members=members, say=logging.info)
     rows = {name: [] for name in (*predictors, "1 - opacity", "constant")}
     count = len(views.names)
     for index in np.unique(np.linspace(0, count - 1, min(_VIEWS.value, count)).astype(int)):
