@@ -4,8 +4,8 @@
         [--page=docs/results/multiscale.md]
 
 Each scene is trained with `lego_fast` twice: on images shrunk by --factor alone, and on four scales of them, with as
-many rays from each; options follow from the largest. Truth at each size is the mean over the pixels of the original images. Supersampling renders
-several rays a pixel, on a regular grid, and averages their colours.
+many rays from each; options follow from the largest images. Truth at each size is the mean over the pixels of the
+original images. Supersampling renders several rays a pixel, on a regular grid, and averages their colours.
 """
 
 import dataclasses

@@ -1,15 +1,18 @@
 """Predicted errors: calibration, sparsification, the deformation, and what is refused."""
 
+import imageio.v3 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.evaluation.uncertainty import calibration
+from jaxnerf.evaluation.uncertainty import calibration, laplace
 from jaxnerf.evaluation.uncertainty.laplace import deform, interpolate
 from jaxnerf.evaluation.uncertainty.predict import make_predictor
 from jaxnerf.fields.base import Field
+from runs import smoke_config
 
 pytest_plugins = ["run_fixtures"]
 
@@ -101,3 +104,25 @@ def test_a_deformed_field_is_the_field_until_it_is_moved(contracted):
 def test_an_ensemble_needs_other_runs(unoptimized, trained, members, message):
     with pytest.raises(ValueError, match=message):
         make_predictor(restore_run(trained), trained, "ensemble", members=[str(trained)] if members else ())
+
+
+@pytest.mark.slow
+def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path, monkeypatch):
+    monkeypatch.setattr(laplace, "NUM_BATCHES", 4)
+    monkeypatch.setattr(laplace, "NUM_PROBES", 2)
+    config = smoke_config()
+    config.data.hold_out = 10
+    config.eval.at_end = False
+    assert train_and_evaluate(config, tmp_path)
+
+    def predictor(run):
+        return make_predictor(run, tmp_path, "laplace", coverage=0.8)
+
+    results = evaluate(tmp_path, predictor=predictor)
+    found = results["uncertainty"]
+    assert found["estimator"] == "laplace" and found["target_coverage"] == 0.8
+    assert found["coverage"] == pytest.approx(0.8, abs=0.1) and found["interval"] > 0
+    (folder,) = (tmp_path / "eval").glob("*/uncertainty")
+    errors = [imageio.imread(path) for path in sorted(folder.glob("*.tiff"))]
+    assert len(errors) == len(results["images"])
+    assert all(np.isfinite(error).all() and error.min() > 0 and np.ptp(error) > 0 for error in errors)
