@@ -159,3 +159,4 @@ def register() -> None:
     jaxnerf.register_loss("mine", total_weight, on="renderings", needs=("alpha",))
     jaxnerf.register_reader("mine", lambda folder: None, detect=lambda folder: False)
     jaxnerf.register_exporter("mine", lambda source, folder: None)
+    jaxnerf.register_estimator("mine", lambda source: None)

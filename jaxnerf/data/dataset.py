@@ -403,6 +403,7 @@ def color_behind(data: DataOptions) -> tuple[float, ...] | None:
 def conventions(data: DataOptions) -> dict[str, Any]:
     """Returns the options of a dataset that an evaluation protocol records, and its test views that are trained on."""
     found = {name: getattr(data, name) for name, (each, _) in declarations(DataOptions).items() if each.protocol}
+    found = {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}  # as in JSON
     shared = {} if data.format == "synthetic" else views_shared_with_training(data)
     return found | ({"shared_with_training": shared} if shared else {})
 

@@ -185,7 +185,7 @@ class _Runs:
             self._logs.append(log)
         rows = self._logs[0].rows
         self.seconds = rows[-1]["seconds"] if rows else 0.0
-        return (self._join(state, loaded) if self.first else state), lines
+        return self._join(state, loaded), lines
 
     def _load_first(self, state, index):
         if self.first == 0:

@@ -364,7 +364,7 @@ def cases():
 
 
 CASES = cases()
-READS_FILES = {"load_dataset", "draw_batch", "load_scene", "restore_run", "train_and_evaluate"}
+READS_FILES = {"load_dataset", "draw_batch", "load_scene", "restore_run", "train_and_evaluate", "train_many"}
 
 
 def test_every_public_function_has_a_case():
