@@ -26,6 +26,7 @@ _FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training w
 _ADDED = {
     "data.background_color": (),
     "data.up": "",
+    "data.view_indices": (),
     "occupancy.min_views": 0,
     "occupancy.uniform_fraction": 1.0,
     "train.lr_decay_power": 1.0,

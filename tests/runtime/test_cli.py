@@ -158,7 +158,11 @@ def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
 @pytest.mark.parametrize(
     "program, flag, expected",
     [
-        ("export", "--workdir=x", "--kind is missing: what to export: mesh, points, depth, splats, web, or a registered"),
+        (
+            "export",
+            "--workdir=x",
+            "--kind is missing: what to export: mesh, points, depth, splats, web, or a",
+        ),
         ("train", "--max_steps=3", "--max_steps: no such flag; did you mean --config.train.max_steps?"),
         ("train", "--train.lr_init=1", "--train.lr_init: no such flag; did you mean --config.train.lr_init?"),
         ("train", "--max-step=1", "--max-step: no such flag; did you mean --config.train.max_steps?"),
