@@ -62,7 +62,7 @@ def test_the_wheel_holds_one_package_with_configs_and_types(wheel):
         assert path.relative_to(ROOT).as_posix() in files
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_programs_of_the_wheel_find_the_configs(installed):
     program, _, _ = installed
     listed = program("jaxnerf-train", "--config=help")

@@ -237,7 +237,7 @@ def test_images_that_are_gone_leave_the_metrics(tmp_path):
     assert "mae" not in content["metrics"] and "predictions_sha256" not in content
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 @pytest.mark.scenes("lego")
 def test_a_job_is_trained_scored_and_not_repeated(tmp_path):
     command = [sys.executable, "experiments/benchmark/run.py", "--jobs=lego_100", "--seconds=1", f"--out={tmp_path}"]
