@@ -84,6 +84,7 @@ def test_interpolation_is_exact_for_linear_functions_and_clipped():
     x = jax.random.uniform(jax.random.key(0), (50, 3), maxval=4.0)
     np.testing.assert_allclose(interpolate(vertices, x), x, atol=1e-5)
     np.testing.assert_allclose(interpolate(vertices, jnp.array([[9.0, -1.0, 2.0]])), [[4, 0, 2]], atol=1e-6)
+    assert jnp.isnan(interpolate(vertices, jnp.array([[jnp.nan, 1.0, 2.0]]))).all()
 
 
 @pytest.mark.parametrize("contracted", [False, True])

@@ -155,10 +155,10 @@ def interpolate(values: Float[ArrayLike, "X Y Z C"], place: Float[ArrayLike, "*b
 
     Args:
         values: [X, Y, Z, C], each axis with at least two vertices.
-        place: [..., 3] in cells, vertex (0, 0, 0) at 0; clipped to the grid. Of a NaN the result is any value.
+        place: [..., 3] in cells, vertex (0, 0, 0) at 0; clipped to the grid. The result is NaN where it is.
     """
     most = jnp.asarray(values.shape[:3]).reshape((1,) * (jnp.ndim(place) - 1) + (3,)) - 1
-    place = jnp.clip(jnp.nan_to_num(place), 0, most)
+    place = jnp.clip(place, 0, most)
     first = jnp.minimum(place.astype(jnp.int32), most - 1)
     part = place - first
 

@@ -107,6 +107,8 @@ def make_predictor(
     known = calibrations.load(path, key) if path.is_file() else None
     if known is None or known.coverage != coverage:
         if run.experiment.config.data.hold_out:
+            if known is not None:
+                say(f"{path}: was calibrated for a coverage of {known.coverage:g}, and is calibrated again")
             known = _calibrate(run, variables, found.score, coverage)
             calibrations.save(path, known, key)
         else:
