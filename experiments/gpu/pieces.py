@@ -3,10 +3,8 @@
 import collections
 import functools
 import math
-import os
 import pathlib
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -31,7 +29,6 @@ from jaxnerf.training.step import make_train_step, repeat_step
 # Types of the layers, precisions of products, and bounds of the relative error against float32 on a CPU. "default" is
 # TF32 on a GPU with tensor cores, which keeps 10 bits, and bfloat16 keeps 7.
 _PRECISIONS = (("float32", "highest", 1e-4), ("float32", "default", 1e-2), ("bfloat16", "default", 5e-2))
-_DETERMINISTIC = "--xla_gpu_deterministic_ops=true"
 
 
 class Context(NamedTuple):
@@ -116,35 +113,28 @@ def _relative(found, exact):
 
 
 def determinism(context: Context) -> dict[str, Any]:
-    """Takes the same steps twice, as they are and with XLA's deterministic operations, each in a process of its own."""
+    """Takes the same steps twice, as they are and with train.deterministic."""
     rows = []
-    for flags in ("", _DETERMINISTIC):
-        environment = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
-        environment.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-        command = [sys.executable, __file__, str(int(context.tiny))]
-        found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        if found.returncode:
-            raise ValueError(f"{' '.join(command)} with XLA_FLAGS={flags!r} failed: {found.stderr.strip()[-500:]}")
-        same, seconds = found.stdout.split()[-2:]
-        rows.append({"XLA_FLAGS": flags or "none", "same bits": same == "True", "ms per step": 1e3 * float(seconds)})
+    for deterministic in (False, True):
+        config = context.config("lego_fast", profiles.FULL_SIZE | {"train.deterministic": deterministic})
+        same, seconds = _twice(common.compile_step(config), 2 if context.tiny else 100)
+        rows.append({"train.deterministic": deterministic, "same bits": same, "ms per step": 1e3 * seconds})
     return {"rows": rows}
 
 
-def _twice(tiny):
-    """Prints whether two runs of some steps agree bit for bit, and the seconds of a step."""
-    config = profiles.configuration("lego_fast", {"data.factor": 8}, tiny=tiny)
-    step = common.compile_step(config)
+def _twice(step, num_steps):
+    """Returns whether two runs of some steps agree bit for bit, and the seconds of a step."""
     states = []
     for _ in range(2):
         state = jax.tree.map(jnp.copy, step.state)
         started = time.perf_counter()
-        for _ in range(2 if tiny else 50):
+        for _ in range(num_steps):
             state, _ = step.run(state, step.data, step.positions)
         jax.block_until_ready(state)
-        seconds = (time.perf_counter() - started) / (2 if tiny else 50)
+        seconds = (time.perf_counter() - started) / num_steps
         states.append(jax.device_get(state.params))
     same = all(np.array_equal(*pair) for pair in zip(*map(jax.tree.leaves, states), strict=True))
-    print(same, seconds)
+    return same, seconds
 
 
 def ceilings(context: Context) -> dict[str, Any]:
@@ -255,11 +245,12 @@ def _kernels(profile):
             yield from (event for event in line.events if planes or "hlo_op" in dict(event.stats))
 
 
-def lego(context: Context, *, seconds: float) -> dict[str, Any]:
-    """Trains lego at 800 x 800 for so many seconds and scores its test views."""
+def blender(context: Context, *, name: str = "lego", seconds: float) -> dict[str, Any]:
+    """Trains a scene at 800 x 800 for so many seconds and scores its test views."""
     limit = min(seconds, 1.0) if context.tiny else seconds
-    config = context.config("lego_fast", profiles.FULL_SIZE | profiles.TIMED | {"train.max_seconds": float(limit)})
-    return _trained(config, context.folder / f"lego-{seconds:g}")
+    overrides = {"data.dir": name, "train.max_seconds": float(limit)}
+    config = context.config("lego_fast", profiles.FULL_SIZE | profiles.TIMED | overrides)
+    return _trained(config, context.folder / f"{name}-{seconds:g}")
 
 
 _SMALL = {"hash_grid.width": 64, "hash_grid.view_width": 64, "hash_grid.table_size": 2**20}
@@ -309,7 +300,7 @@ def frame(context: Context) -> dict[str, Any]:
     """Times an 800 x 800 frame of the longest lego run that is there, by chunk and size of the sample buffer."""
     folders = [path for path in context.folder.glob("lego-*") if Checkpoints(path).steps()]
     if not folders:  # of an earlier machine, which kept nothing
-        lego(context, seconds=30)
+        blender(context, seconds=30)
         folders = [context.folder / "lego-30"]
     folder = max(folders, key=lambda path: float(path.name.split("-")[1]))
     rows = []
@@ -406,7 +397,3 @@ def memory_use(context: Context) -> dict[str, Any]:
         stats = render.lower(rays).compile().memory_analysis()
         rows.append({"what": f"chunk of {chunk} rays", "temporary MB": stats.temp_size_in_bytes / 1e6})
     return {"rows": rows}
-
-
-if __name__ == "__main__":
-    _twice(bool(int(sys.argv[1])))

@@ -249,7 +249,7 @@ def main(argv: list[str]) -> None:
         "overlap.",
         "",
         "Additions to the table's gradient are atomic on a GPU, in no fixed order, so float32 sums differ between "
-        "runs. With `XLA_FLAGS=--xla_gpu_deterministic_ops=true` two runs are the same bit for bit, but much slower.",
+        "runs. With `train.deterministic` two runs are the same bit for bit.",
     ]
     for name, overrides in _CONFIGS.items():
         config = profiles.configuration(name, overrides, tiny=_TINY.value)

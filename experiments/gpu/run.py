@@ -47,9 +47,12 @@ PIECES = {
     "step": Piece(pieces.step_parts, 2, "The training step and its parts, lego 800 x 800"),
     "kernels": Piece(pieces.kernels, 1, "The kernels of a training step, lego 800 x 800"),
     **{
-        f"lego_{seconds}": Piece(
-            functools.partial(pieces.lego, seconds=seconds), seconds / 60 + 1.5, f"Lego 800 x 800 after {seconds} s"
+        f"{name}_{seconds}": Piece(
+            functools.partial(pieces.blender, name=name, seconds=seconds),
+            seconds / 60 + 1.5,
+            f"{name.capitalize()} 800 x 800 after {seconds} s",
         )
+        for name in ("lego", "mic")
         for seconds in (15, 30, 60, 120, 300)
     },
     "frame": Piece(pieces.frame, 2, "A frame of 800 x 800"),

@@ -1,4 +1,4 @@
-"""Short loops, compiled as suits the device."""
+"""What is compiled otherwise for a CPU than for an accelerator: short loops, and the layout of arrays."""
 
 import functools
 from collections.abc import Callable
@@ -9,6 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Int, Num
 
 _Tree = TypeVar("_Tree")
+
+
+def is_cpu() -> bool:
+    """Returns whether functions are traced for a CPU: of two layouts of the same arrays it is then the faster one.
+
+    Where the operations themselves differ, `jax.lax.platform_dependent` asks the device that a program is compiled for.
+    """
+    return jax.default_backend() == "cpu"
 
 
 def short_loop(count: int, body: Callable[[Any, _Tree], _Tree], start: _Tree) -> _Tree:

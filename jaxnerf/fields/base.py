@@ -11,6 +11,7 @@ from flax import linen
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaxnerf.core import contraction
+from jaxnerf.core.loops import is_cpu
 from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import SceneFn, Vector
 
@@ -95,7 +96,8 @@ def apply_network(
     """Evaluates a network at positions in a layout that suits a CPU's cache.
 
     Rows of features whose length is a multiple of 2 KiB collide in the cache, which slows down each product.
-    Such a batch is padded by one ray or, if there are few rays, by a few samples per ray.
+    On a CPU such a batch is padded by one ray or, if there are few rays, by a few samples per ray. An accelerator
+    prefers such a batch: it divides products among its processors.
 
     Args:
         network: its call takes x and viewdirs, and returns [..., S] and [..., S, 3].
@@ -109,7 +111,7 @@ def apply_network(
     """
     *leading, samples = shape = x.shape[:-1]
     rays = math.prod(leading)
-    if not rays * samples or rays * samples % _CACHE_ROW:
+    if not rays * samples or rays * samples % _CACHE_ROW or not is_cpu():
         return network.apply({"params": params}, x, viewdirs, **inputs)
     more = (0, _MORE_SAMPLES) if rays < _FEW_RAYS else (1, 0)
 

@@ -14,6 +14,8 @@ from flax import linen
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxnerf.core.fixed_order import add_rows, in_fixed_order
+from jaxnerf.core.loops import is_cpu
 from jaxnerf.core.safe_math import clamp
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector, check_shapes
@@ -327,11 +329,14 @@ def interpolate(
     counts = {len(level.rows) for level in levels if _is_hashed(level)}
     if len(counts) > 1:
         raise ValueError(f"interpolate: hashed levels have {sorted(counts)} rows, expected the same number in each")
-    return _interpolate(tuple(levels), table, tuple(place))
+    chosen = _interpolate_in_fixed_order if in_fixed_order() else _interpolate
+    return chosen(tuple(levels), jnp.asarray(table), tuple(map(jnp.asarray, place)))
 
 
 def _interpolated(levels, table, place):
-    """Interpolates level by level, which is faster than by `_all_corners` where no derivative is needed."""
+    """Interpolates level by level, which on a CPU is faster than by `_all_corners` where no derivative is needed."""
+    if not is_cpu():
+        return _together(*_all_corners(levels, place), table)
     weights, features = [], []
     for level in levels:
         low, fractions = _cells(level.size, place)
@@ -353,7 +358,9 @@ def _interpolate_jvp(levels, primals, tangents):
     (table, place), (change, moved) = primals, tangents
     rows, weights = _all_corners(levels, place)
     tangent = 0.0
-    if not isinstance(change, SymbolicZero):
+    if not isinstance(change, SymbolicZero) and not is_cpu():
+        tangent = _change_together(rows, weights, change)
+    elif not isinstance(change, SymbolicZero):
         read = jax.lax.split(_read(change, rows.reshape(-1)), [rows.shape[2]] * (rows.shape[0] * 8))
         tangent = _weighted_sums(weights, [read[start : start + 8] for start in range(0, len(read), 8)])
     if not all(isinstance(each, SymbolicZero) for each in moved):
@@ -362,7 +369,52 @@ def _interpolate_jvp(levels, primals, tangents):
             for value, each in zip(place, moved, strict=True)
         )
         tangent += jax.jvp(functools.partial(_interpolated, levels, table), (place,), (moved,))[1]
+    if not is_cpu():
+        return _together(rows, weights, table), tangent
     return _weighted_sums(weights, [[_read(table, row) for row in level] for level in rows]), tangent
+
+
+def _together(rows, weights, table):
+    """Returns the weighted sums [N, L F] over the vertices [L, 8, N]: all levels at once, in the same way.
+
+    The neighbouring threads of an accelerator then have the same work.
+    """
+    corners = (weights[:, corner, :, None] * _read(table, rows[:, corner]) for corner in range(8))
+    return _by_sample(functools.reduce(jnp.add, corners))
+
+
+def _change_together(rows, weights, change):
+    """Returns what `_together` does, from one array of all rows: its transpose is a single scatter."""
+    read = _read(change, rows.reshape(-1)).reshape(*rows.shape, -1)
+    return _by_sample(jnp.sum(weights[..., None] * read, axis=1))
+
+
+def _by_sample(features):
+    """Returns [N, L F] for features [L, N, F]."""
+    levels, samples, size = features.shape
+    return jnp.moveaxis(features, 0, 1).reshape(samples, levels * size)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _interpolate_in_fixed_order(levels, table, place):
+    return _together(*_all_corners(levels, place), table)
+
+
+def _forward_in_fixed_order(levels, table, place):
+    return _interpolate_in_fixed_order(levels, table, place), (table, place)
+
+
+def _backward_in_fixed_order(levels, residuals, change):
+    table, place = residuals
+    rows, weights = _all_corners(levels, place)
+    change_of_level = jnp.moveaxis(change.reshape(*rows.shape[2:], len(levels), -1), 1, 0)
+    values = weights[..., None] * change_of_level[:, None]
+    sums = add_rows(values.reshape(-1, values.shape[-1]), rows.reshape(-1), len(table))
+    moved = jax.vjp(lambda place: _interpolated(levels, table, place), place)[1](change)[0]
+    return sums.astype(table.dtype), moved
+
+
+_interpolate_in_fixed_order.defvjp(_forward_in_fixed_order, _backward_in_fixed_order)
 
 
 def _weighted_sums(weights, features):

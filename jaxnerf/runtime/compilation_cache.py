@@ -19,6 +19,10 @@ _HASH_BYTES = 32
 
 def use_compilation_cache() -> None:
     """Sets JAX's compilation cache, unless JAX_COMPILATION_CACHE_DIR is set: to a folder, or empty for no cache."""
+    if "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES" not in os.environ:
+        # With XLA's own cache, of the kernels that it chooses for a GPU, an H200 compiled a training step in 54 s the
+        # first time and 16 s later; without it, a step that is not in this cache took 11 s.
+        jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir:
         return
     try:

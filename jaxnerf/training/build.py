@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxnerf.core.fixed_order import with_fixed_order
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
@@ -77,6 +78,8 @@ def build(config: Config) -> Experiment:
     optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
     if cameras is not None:
         model = cameras.added_to(model)
+    if train.deterministic:
+        model = _in_fixed_order(model, cameras)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
     options = {"batching": train.batching, "extras": extras}
@@ -112,6 +115,16 @@ def build(config: Config) -> Experiment:
         prepare=functools.partial(_prepare, config, model, extras),
         background=dataset.color_behind(given),
     )
+
+
+def _in_fixed_order(model, cameras):
+    """Returns a model whose sums have a fixed order."""
+    if cameras is not None and jax.default_backend() != "cpu":
+        raise ValueError(
+            "train.deterministic is True, and exposures or poses of the images are trained, whose gradients have no "
+            "fixed order on an accelerator; set it to False, or turn off cameras.exposure and cameras.refine"
+        )
+    return model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view))
 
 
 def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) -> Model:

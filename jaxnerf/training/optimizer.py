@@ -1,6 +1,7 @@
 """The optimizer: Adam as in the paper, or Muon for the matrices of layers and AdamW for the rest; averaging."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxnerf.core.loops import is_cpu
 from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Options, at_least, option
 from jaxnerf.training.camera_parameters import CAMERAS, CameraOptions
 from jaxnerf.training.state import TrainState
@@ -133,7 +135,50 @@ def with_muon(
         size: root mean square of a matrix's update over the learning rate.
     """
     muon = optax.contrib.muon(schedule, _ITERATIONS, consistent_rms=size, weight_decay=size / _MAX_RMS)
+    if not is_cpu():
+        muon = muon._replace(update=functools.partial(_update_together, schedule, size))
     return optax.partition({"muon": muon, "other": optimizer}, _labels)
+
+
+def _update_together(schedule, size, grads, state, params):
+    """Does what the update of optax.contrib.muon does, in products of all matrices at once.
+
+    One by one, the products of small matrices take an accelerator longer to start than to compute. The matrices are
+    padded with zeros to one shape; the padding of their singular vectors stays zero.
+    """
+    masked = state.inner_states["muon"]
+    (first, *others, last) = masked.inner_state
+    leaves, structure = jax.tree.flatten(grads)
+    wide = [min(leaf.shape) for leaf in leaves], [max(leaf.shape) for leaf in leaves]
+
+    def stack(tree):
+        matrices = [leaf.T if leaf.shape[0] > leaf.shape[1] else leaf for leaf in structure.flatten_up_to(tree)]
+        shape = max(wide[0]), max(wide[1])
+        return jnp.stack([jnp.pad(x, [(0, a - b) for a, b in zip(shape, x.shape, strict=True)]) for x in matrices])
+
+    def unstack(stacked):
+        parts = [x[:rows, :columns] for x, rows, columns in zip(stacked, *wide, strict=True)]
+        turned = [x.T if leaf.shape[0] > leaf.shape[1] else x for x, leaf in zip(parts, leaves, strict=True)]
+        return jax.tree.unflatten(structure, turned)
+
+    # Without a loop: its iterations are launches, too.
+    once = optax.contrib.scale_by_muon(
+        _ITERATIONS[0], weight_dimension_numbers=optax.contrib.MuonDimensionNumbers(1, 2)
+    )
+    stacked = first._replace(mu=stack(first.mu), ns_coeffs=first.ns_coeffs[0])
+    directions, stacked = once.update(stack(grads), stacked)
+    first = first._replace(mu=unstack(stacked.mu), count=stacked.count)
+    rate = schedule(last.count)
+
+    def change(direction, param):
+        return -rate * (size * max(param.shape) ** 0.5 * direction + size / _MAX_RMS * param)
+
+    updates = jax.tree.map(change, unstack(directions), params)
+    last = last._replace(count=optax.safe_increment(last.count))
+    # Its Adam has no parameters; only the numbers of steps change.
+    adam = jax.tree.map(optax.safe_increment, state.inner_states["adam"])
+    inner = {"muon": masked._replace(inner_state=(first, *others, last)), "adam": adam}
+    return updates, state._replace(inner_states=inner)
 
 
 def _labels(params):

@@ -49,6 +49,12 @@ class TrainOptions(OptimizerOptions):
         choices=devices.MODES,
         changes=Changes.SPEED,
     )
+    deterministic: bool = option(
+        False,
+        "whether sums on an accelerator have a fixed order, so that a run repeated on the same device gives the same "
+        "bits; a step of the hash grid then takes a quarter longer. On a CPU they always have.",
+        changes=Changes.SPEED,
+    )
     max_steps: int = option(
         200_000,
         "steps after which the run ends; auto: by the size of the images and `batch_size`, without limit if time is "

@@ -1,5 +1,6 @@
 """The training step: draw rays, render them, and descend on the weighted sum of the losses."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -173,8 +174,15 @@ def make_train_step(
             updates, opt_state = optimizer.update(mean, state.opt_state, state.params, **options)
             return optax.apply_updates(state.params, updates), opt_state
 
-        # A branch: selecting between old and new arrays would take about as long as the update itself.
-        params, opt_state = jax.lax.cond(finite, descend, lambda: (state.params, state.opt_state))
+        def selected():
+            return jax.tree.map(
+                lambda new, old: jnp.where(finite, new, old), descend(), (state.params, state.opt_state)
+            )
+
+        # On a CPU a branch: the selection would take about as long as the update itself. On an accelerator it is part
+        # of the update's kernels, and a branch would make the host wait for its condition.
+        branch = functools.partial(jax.lax.cond, finite, descend, lambda: (state.params, state.opt_state))
+        params, opt_state = jax.lax.platform_dependent(cpu=branch, default=selected)
         missed = (~finite).astype(jnp.int32)
         counters = {
             **dead,

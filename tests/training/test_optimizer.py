@@ -73,6 +73,21 @@ def test_adamw_updates_all_other_parameters(power):
     assert np.abs(ends[0]["kernel"] - ends[1]["kernel"]).max() > RATE / 10
 
 
+def test_muon_of_all_matrices_together_is_that_of_each(monkeypatch):
+    start, ends = {"fine": network(jax.random.key(0))}, []
+    for backend in ("cpu", "gpu"):
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        update = optimizer()
+        params, state = start, update.init(start)
+        for seed in range(3):
+            grads = {"fine": network(jax.random.key(seed))}
+            updates, state = update.update(grads, state, params)
+            params = optax.apply_updates(params, updates)
+        ends.append((params, state))
+    assert jax.tree.structure(ends[0]) == jax.tree.structure(ends[1])  # so a run goes on, on another device
+    assert_same(*ends, rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.parametrize("muon, least", [(SIZE, 0.04 * RATE), (0.0, 0.0)])
 def test_parameters_decay_with_muon_and_not_with_adam_alone(muon, least):
     params = {"fine": network(jax.random.key(0))}

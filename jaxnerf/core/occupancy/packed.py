@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnerf.core import rendering, volume_rendering
+from jaxnerf.core.fixed_order import in_fixed_order, segment_sums
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
 from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
@@ -408,7 +409,10 @@ def _composite(function, scene, rays, placed, *, rule, longest, median_depth=Fal
     colors = [rgb[:, channel] * weights for channel in range(rgb.shape[1])]
     moments = volume_rendering.multiply_or_zero(weights, t), volume_rendering.divide_or_zero(weights, t)
     parts = [optical_depth, *colors, *moments]
-    sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
+    if in_fixed_order():
+        sums = segment_sums(jnp.stack(parts, axis=-1), ray, starts, placed.used, rays.near.size, longest)
+    else:
+        sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
     packed = PackedSamples(weights=weights, t=t, delta=placed.delta, ray_index=ray, used=placed.used, rule=rule)
     median = None
     if median_depth:
