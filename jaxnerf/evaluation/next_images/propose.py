@@ -1,0 +1,287 @@
+"""Where further images of a trained run's scene should be taken, in words and as a camera path."""
+
+import os
+import pathlib
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxnerf.core import contraction
+from jaxnerf.core.occupancy.grid import OccupancyGrid
+from jaxnerf.core.types import Camera
+from jaxnerf.core.views import Views
+from jaxnerf.data.geometry.candidate_poses import Candidates, azimuth_to_right, candidate_poses
+from jaxnerf.data.geometry.poses import gaze_center, up_of
+from jaxnerf.data.geometry.world import unit_of
+from jaxnerf.evaluation.next_images.coverage import ViewCoverage, choose_views
+from jaxnerf.evaluation.paths import camera_path
+from jaxnerf.evaluation.paths.camera_path import CameraPath
+from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
+from jaxnerf.runtime import stages
+
+NAME = "next_images"  # of the camera path
+_THIN = 30.0  # degrees: what has been seen from farther aside is thinly covered
+_MOST_THIN = 5  # groups that are named
+_MOST_CELLS = 6000  # that are plotted
+_ZENITH = 85.0  # degrees, above which an azimuth says nothing
+
+
+class Proposal(NamedTuple):
+    """A further image.
+
+    Attributes:
+        pose: [3, 4] in the run's world.
+        words: where to take it, from the nearest image.
+        angle: degrees, from how far aside what it shows has been seen, by the images and the proposals before it.
+    """
+
+    pose: Float[np.ndarray, "3 4"]
+    words: str
+    angle: float
+
+
+class CoverageReport(NamedTuple):
+    """What `propose_images` finds.
+
+    Attributes:
+        step: of the checkpoint.
+        views: of the split "train", with refined cameras.
+        up: unit vector.
+        candidates: those that were compared.
+        angles: [rows, columns] of the candidates' groups, degrees: from how far aside what a camera there would show
+            has been seen; NaN where there is no candidate.
+        positions: [M, 3] of cells that have been seen, world units, at most a few thousand; none in NDC.
+        directions: [M] from how many of the 64 directions.
+        counts: [65] how many occupied cells have been seen from so many directions.
+        proposals: the best first.
+        path: of the proposals.
+    """
+
+    step: int
+    views: Views
+    up: Float[np.ndarray, "3"]
+    candidates: Candidates
+    angles: Float[np.ndarray, "R C"]
+    positions: Float[np.ndarray, "M 3"]
+    directions: Int[np.ndarray, " M"]
+    counts: Int[np.ndarray, "65"]
+    proposals: tuple[Proposal, ...]
+    path: CameraPath
+
+    @property
+    def next_cameras(self) -> Camera:
+        """The cameras of the proposals, stacked, with the lens of the first view."""
+        path = self.path
+        return Camera(to_world=path.poses, focal=path.focal, center=path.center, height=path.height, width=path.width)
+
+    def text(self) -> str:
+        """Returns the report as text."""
+        seen = self.counts[1:].sum()
+        few = self.counts[1:4].sum() / max(seen, 1)
+        lines = [
+            f"images   {len(self.views.names)} of the split train, with the checkpoint of step {self.step}",
+            f"cells    {self.counts.sum():,} occupied, {seen:,} seen; {few:.0%} of these from 1 to 3 of 64 directions",
+            f"cameras  {self.candidates.kind}, as {self.candidates.reason}",
+            "",
+            "From how far aside what a camera would show has been seen, in degrees, by where it would be",
+            f"({_COLUMNS[self.candidates.kind].format(first=_name(self.views, 0))}):",
+            *_table(self.angles, self.candidates),
+            "",
+            *self._thin(),
+            "",
+            "Next images, each as if those before it had been taken:",
+        ]
+        for number, each in enumerate(self.proposals, 1):
+            seen_from = (
+                "nothing of it has been seen" if each.angle > 179 else f"seen from {each.angle:.0f} degrees aside"
+            )
+            lines.append(f"{number:3}. {each.words}; {seen_from}")
+        return "\n".join(lines)
+
+    def _thin(self):
+        rows, columns = np.nonzero(np.nan_to_num(self.angles) > _THIN)
+        if not len(rows):
+            return [f"thin     nowhere: everything has been seen from at most {_THIN:.0f} degrees aside"]
+        order = np.argsort(-self.angles[rows, columns])[:_MOST_THIN]
+        names = [
+            f"{self.candidates.rows[row]}, {self.candidates.columns[column]} ({self.angles[row, column]:.0f})"
+            for row, column in zip(rows[order], columns[order], strict=True)
+        ]
+        more = f"; and {len(rows) - len(order)} more" if len(rows) > len(order) else ""
+        return [f"thin     {'; '.join(names)}{more}"]
+
+
+_COLUMNS = {
+    "around": "columns: azimuth around the scene, degrees to the right of {first}",
+    "beside": "of the place of {first} and the other cameras",
+    "turned": "columns: azimuth of the gaze, degrees to the right of that of {first}",
+}
+
+
+def propose_images(
+    workdir: str | os.PathLike,
+    count: int = 5,
+    *,
+    step: int | None = None,
+    data_dir: str | None = None,
+    up: str | None = None,
+) -> CoverageReport:
+    """Finds how well the images of a trained run cover its scene, and where further ones should be taken.
+
+    Args:
+        workdir: the folder that training wrote.
+        count: number of further images.
+        step: of the checkpoint; the newest when None.
+        data_dir: the dataset's folder in place of the config's.
+        up: the axis of the dataset's files that is up, such as "+z"; None: the run's option `data.up`, or as the
+            cameras are held.
+
+    Raises:
+        ValueError: if there is no such run or checkpoint, the scene moves, its grid has no occupied cell, or there are
+            fewer than two different cameras.
+    """
+    run = restore_run(workdir, data_dir=data_dir, settings={"bake_occupancy": True})
+    step = newest_step(run, workdir, step)
+    variables = run.variables(step)
+    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    if views.time is not None:
+        raise ValueError(
+            f"{workdir}: the scene moves, so that each image shows another instant, expected one that stays as it is; "
+            "coverage is not known here"
+        )
+    if not np.asarray(variables[1].occupied).any():
+        raise ValueError(f"{workdir}: no cell of its occupancy grid is occupied, expected a scene; train it for longer")
+    poses = np.asarray(views.cameras.to_world, np.float64)
+    direction = camera_path.up_direction(up or run.experiment.config.data.up or None, views)
+    direction = up_of(poses) if direction is None else direction
+    found = candidate_poses(poses, direction)
+    coverage = ViewCoverage(run, variables)
+    with stages.stage("finding what the cameras see, by images") as stage:
+        for index in range(len(poses)):
+            stage.update(index, len(poses))
+            coverage.add(views, index)
+    if found.kind == "around" and not run.experiment.config.data.ndc:
+        free = coverage.is_free(poses[found.nearest, :, 3], found.poses[:, :, 3])
+        found = found._replace(**{name: getattr(found, name)[free] for name in ("poses", "nearest", "group")})
+        if not free.any():
+            raise ValueError(
+                f"{workdir}: no straight line from a camera to a place around the scene is free of matter, expected "
+                "free space between the cameras; train it for longer"
+            )
+    path = _path_of(found.poses, views)
+    posed = camera_path.posed_views(views, path)
+    with stages.stage("comparing places for further images"):
+        angles = _angles(coverage, posed, found)
+        positions, directions = _shown_cells(variables[1], coverage, run.experiment.config.data.ndc)
+        counts = np.bincount(coverage.num_directions().ravel() + 1, minlength=66)[1:]
+        chosen = choose_views(coverage, posed, range(len(found.poses)), count)
+    proposals = [
+        Proposal(found.poses[index], _words(found, index, views, direction), score.angle) for index, score in chosen
+    ]
+    return CoverageReport(
+        step=step,
+        views=views,
+        up=direction,
+        candidates=found,
+        angles=angles,
+        positions=positions,
+        directions=directions,
+        counts=counts,
+        proposals=tuple(proposals),
+        path=_path_of(np.stack([each.pose for each in proposals]), views),
+    )
+
+
+def save_path(report: CoverageReport, workdir: str | os.PathLike) -> pathlib.Path:
+    """Writes the proposals to <workdir>/camera_paths/next_images.json, which jaxnerf-render and the viewer show."""
+    file = camera_path.file_of(workdir, NAME)
+    file.parent.mkdir(exist_ok=True)
+    camera_path.write_path_file(file, report.path, report.views)
+    return file
+
+
+def _angles(coverage, posed, candidates):
+    """Returns the mean angle [rows, columns] of the views of each group; NaN where there is none."""
+    shape = len(candidates.rows), len(candidates.columns)
+    total, number = np.zeros(shape), np.zeros(shape)
+    for index, group in enumerate(candidates.group):
+        total[tuple(group)] += coverage.score(posed, index).angle
+        number[tuple(group)] += 1
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+def _shown_cells(grid: OccupancyGrid, coverage, ndc):
+    """Returns the positions of cells that have been seen, and from how many directions; see `CoverageReport`."""
+    counts = coverage.num_directions()
+    places = np.argwhere(counts > 0)
+    if ndc or not len(places):
+        return np.zeros((0, 3)), np.zeros(0, int)
+    places = places[:: -(-len(places) // _MOST_CELLS)]
+    fractions = (places + 0.5) / counts.shape
+    if grid.contracted:
+        fractions = (np.asarray(contraction.expand(np.float32(4 * fractions - 2))) + 2) / 4
+    lower, upper = np.float64(grid.lower), np.float64(grid.upper)
+    return lower + fractions * (upper - lower), counts[tuple(places.T)]
+
+
+def _path_of(poses, views):
+    """Returns the CameraPath of cameras with the lens and the size of the first view, one frame a second."""
+    height, width = (int(side) for side in views.size[0])
+    focal, center = (
+        np.tile(np.float64(each)[:1], (len(poses), 1)) for each in (views.cameras.focal, views.cameras.center)
+    )
+    return CameraPath(NAME, NAME, poses, focal, center, width, height, fps=1.0)
+
+
+def _table(angles, candidates):
+    """Returns the lines of a table of the rows that have candidates."""
+    name = max(map(len, candidates.rows))
+    lines = [" " * name + "".join(f"{column:>8}" for column in candidates.columns)]
+    for row, found in zip(candidates.rows, angles, strict=True):
+        if np.isfinite(found).any():
+            cells = "".join(f"{angle:8.0f}" if np.isfinite(angle) else f"{'-':>8}" for angle in found)
+            lines.append(f"{row:{name}}{cells}")
+    return lines
+
+
+def _words(candidates, index, views, up):
+    """Returns where a candidate is, from the nearest image."""
+    near, pose = int(candidates.nearest[index]), candidates.poses[index]
+    poses = np.asarray(views.cameras.to_world, np.float64)
+    unit = 1.0 if views.to_file is None else unit_of(views.to_file)
+    name, old = _name(views, near), poses[near]
+    if candidates.kind == "around":
+        center = gaze_center(poses)
+        offset, before = pose[:, 3] - center, old[:, 3] - center
+        right = float(np.degrees(azimuth_to_right(offset[None], before, up)[0]))
+        height, old_height = (_height(each, up) for each in (offset, before))
+        moves = [_part(right, "to the right around the scene", "to the left around the scene")]
+        moves = [] if height > _ZENITH else moves
+        moves.append(_part(height - old_height, "up", "down"))
+        moves = [move for move in moves if move] or ["a little aside"]
+        distance = unit * np.linalg.norm(offset)
+        return f"from {name} {' and '.join(moves)}: {height:.0f} degrees high, at a distance of {distance:.3g}"
+    if candidates.kind == "beside":
+        x, y = unit * (pose[:, 3] - old[:, 3]) @ old[:, :2]
+        side, way = "right" if x > 0 else "left", "up" if y > 0 else "down"
+        return f"from {name} {abs(x):.3g} to the {side} and {abs(y):.3g} {way}"
+    right = float(np.degrees(-azimuth_to_right(-pose[None, :, 2], -old[:, 2], up)[0]))
+    pitch = _height(-pose[:, 2], up)
+    level = "level" if abs(pitch) < 1 else f"{abs(pitch):.0f} degrees {'up' if pitch > 0 else 'down'}"
+    turn = _part(right, "to the right", "to the left") or "0 degrees"
+    return f"at the place of {name}, turned {turn}, looking {level}"
+
+
+def _height(offset, up):
+    """Returns the angle of an offset above the plane perpendicular to up, degrees."""
+    return float(np.degrees(np.arcsin(np.clip(offset @ up / np.linalg.norm(offset), -1, 1))))
+
+
+def _part(angle, positive, negative):
+    """Returns an angle in words; "" if it is less than a degree."""
+    return f"{abs(angle):.0f} degrees {positive if angle > 0 else negative}" if abs(angle) >= 1 else ""
+
+
+def _name(views, index):
+    return views.names[index] if views.names else f"view {index}"
