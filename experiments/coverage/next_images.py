@@ -64,7 +64,7 @@ def config_of(scene: str, indices: list[int], seed: int):
     steps = _STEPS.value
     common_fields = {"train.max_steps": steps, "train.lr_steps": steps, "train.save_every": steps}
     more = {"data.view_indices": tuple(indices), "train.max_seconds": 0.0, "train.preview_every": 0.0}
-    return common.changed(config, {**common_fields, **more, "eval.at_end": False})
+    return common.changed(config, {**common_fields, **more, "eval.at_end": False, "eval.summary_seconds": 0.0})
 
 
 def psnr_of(run, variables, views: Views) -> float:
