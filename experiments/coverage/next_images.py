@@ -16,13 +16,16 @@ No method sees the images before it adds them. Finished runs in --out are not re
 
 import pathlib
 import statistics
+import sys
 from collections.abc import Callable
 
 import jax
 import numpy as np
 from absl import flags
 
-from experiments import common
+sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
+import common
+
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.evaluate import train_and_evaluate
@@ -32,7 +35,7 @@ from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.runtime import cli
 
 _SCENES = flags.DEFINE_list("scenes", ["lego"], "lego, room.")
-_ROOM = flags.DEFINE_string("room", "runs/room", "Folder that experiments/room/make_room.py wrote.")
+_CAPTURE = flags.DEFINE_string("room", "runs/room", "Folder that experiments/room/make_room.py wrote.")
 _SEEDS = flags.DEFINE_list("seeds", ["0", "1", "2", "3", "4"], "Of the first images, the random ones and the training.")
 _START = flags.DEFINE_integer("start", 10, "Images at first.", lower_bound=2)
 _ADD = flags.DEFINE_integer("add", 5, "Images that are added at a time.", lower_bound=1)
@@ -41,6 +44,7 @@ _STEPS = flags.DEFINE_integer("steps", 500, "Training steps of each run.", lower
 _OUT = flags.DEFINE_string("out", "runs/next_images", "Folder of the runs.")
 
 METHODS = ("coverage", "random", "farthest")
+BASE = ("random", "farthest")
 _MOST_TEST_VIEWS = 25
 # Of runs with all images, so that no program depends on which images there are.
 _LEGO = {
@@ -60,7 +64,7 @@ def config_of(scene: str, indices: list[int], seed: int):
     if scene == "lego":
         config = common.configuration("lego_fast", _LEGO, seed=seed)
     else:
-        config = common.configuration("capture", {"data.dir": _ROOM.value}, seed=seed)
+        config = common.configuration("capture", {"data.dir": _CAPTURE.value}, seed=seed)
     steps = _STEPS.value
     common_fields = {"train.max_steps": steps, "train.lr_steps": steps, "train.save_every": steps}
     more = {"data.view_indices": tuple(indices), "train.max_seconds": 0.0, "train.preview_every": 0.0}
@@ -86,7 +90,8 @@ def by_coverage(run, variables, pool: Views, indices: list[int], rest: list[int]
     coverage = ViewCoverage(run, variables)
     for index in indices:
         coverage.add(pool, index)
-    return [index for index, _ in choose_views(coverage, pool, rest, _ADD.value)]
+    scores = {index: coverage.score(pool, index) for index in rest}
+    return [index for index, _ in choose_views(coverage, pool, scores, _ADD.value)]
 
 
 def at_random(run, variables, pool: Views, indices: list[int], rest: list[int], rng) -> list[int]:
@@ -153,19 +158,24 @@ def area(psnr: dict[str, float]) -> float:
 def table(scene: str, results: dict[str, dict[int, dict[str, float]]]) -> list[str]:
     """Returns the lines of the table of a scene."""
     counts = list(next(iter(results["random"].values())))
+    areas = {method: {seed: area(psnr) for seed, psnr in by_seed.items()} for method, by_seed in results.items()}
     rows = []
     for method, by_seed in results.items():
         cells = [f"{statistics.fmean(psnr[count] for psnr in by_seed.values()):.2f}" for count in counts]
-        areas = {seed: area(psnr) for seed, psnr in by_seed.items()}
-        mean, deviation = common.spread(list(areas.values()))
-        others = {seed: area(psnr) for seed, psnr in results["random"].items()}
-        more = common.differences(areas, others)
-        versus = (
-            f"{statistics.fmean(more):+.2f} ({sum(d > 0 for d in more)} of {len(more)})" if method != "random" else "-"
-        )
-        rows.append([method, *cells, f"{mean:.2f} ± {deviation:.2f}", versus])
-    heads = [f"{scene}: images", *counts, "mean over them", "above random (seeds)"]
+        mean, deviation = common.spread(list(areas[method].values()))
+        versus = [
+            _versus(areas[method], areas[other]) if other != method else "-" for other in results if other in BASE
+        ]
+        rows.append([method, *cells, f"{mean:.2f} ± {deviation:.2f}", *versus])
+    versus = [f"above {other} (seeds)" for other in results if other in BASE]
+    heads = [f"{scene}: images", *counts, "mean over them", *versus]
     return common.markdown(heads, rows)
+
+
+def _versus(areas, others):
+    """Returns the mean difference over the seeds, and in how many of them it is positive."""
+    more = common.differences(areas, others)
+    return f"{statistics.fmean(more):+.2f} ({sum(each > 0 for each in more)} of {len(more)})"
 
 
 def main(argv):

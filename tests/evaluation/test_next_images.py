@@ -91,7 +91,7 @@ def test_masked_pixels_see_nothing(nothing_seen):
 def test_the_lazy_search_chooses_as_the_full_one(nothing_seen):
     coverage, views = nothing_seen
     coverage.add(views, 0)
-    lazy = choose_views(coverage, views, [1, 2, 3, 4], 3)
+    lazy = choose_views(coverage, views, {index: coverage.score(views, index) for index in (1, 2, 3, 4)}, 3)
     coverage.clear()
     coverage.add(views, 0)
     rest, full = [1, 2, 3, 4], []

@@ -1,7 +1,7 @@
 """The directions from which cameras have seen the cells of a trained run, and how familiar a further view is."""
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -149,7 +149,7 @@ class ViewCoverage:
 
 
 def choose_views(
-    coverage: ViewCoverage, views: Views, candidates: Sequence[int], count: int
+    coverage: ViewCoverage, views: Views, scores: Mapping[int, ViewScore], count: int
 ) -> list[tuple[int, ViewScore]]:
     """Chooses the least familiar views one after another; each is added to the coverage before the next is chosen.
 
@@ -159,13 +159,13 @@ def choose_views(
     Args:
         coverage: of the cameras that there are; it is changed.
         views: whose cameras are candidates.
-        candidates: indices of the views.
+        scores: by index of the views that are candidates, their present ones.
         count: number of views to choose.
 
     Returns:
         (index, ViewScore at the time of the choice) of each, in the order of choice.
     """
-    queue = [(coverage.score(views, index), index, 0) for index in candidates]
+    queue = [(found, index, 0) for index, found in scores.items()]
     heapq.heapify(queue)
     chosen = []
     while queue and len(chosen) < count:

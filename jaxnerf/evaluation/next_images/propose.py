@@ -24,6 +24,7 @@ NAME = "next_images"  # of the camera path
 _THIN = 30.0  # degrees: what has been seen from farther aside is thinly covered
 _MOST_THIN = 5  # groups that are named
 _MOST_CELLS = 6000  # that are plotted
+_FAR_IN_NDC = 0.8  # ten times as far away as the near plane, where 1 is at infinity
 _ZENITH = 85.0  # degrees, above which an azimuth says nothing
 
 
@@ -51,7 +52,7 @@ class CoverageReport(NamedTuple):
         candidates: those that were compared.
         angles: [rows, columns] of the candidates' groups, degrees: from how far aside what a camera there would show
             has been seen; NaN where there is no candidate.
-        positions: [M, 3] of cells that have been seen, world units, at most a few thousand; none in NDC.
+        positions: [M, 3] of cells that have been seen, world units, at most a few thousand; in NDC, of the near ones.
         directions: [M] from how many of the 64 directions.
         counts: [65] how many occupied cells have been seen from so many directions.
         proposals: the best first.
@@ -172,10 +173,10 @@ def propose_images(
     path = _path_of(found.poses, views)
     posed = camera_path.posed_views(views, path)
     with stages.stage("comparing places for further images"):
-        angles = _angles(coverage, posed, found)
-        positions, directions = _shown_cells(variables[1], coverage, run.experiment.config.data.ndc)
+        scores = {index: coverage.score(posed, index) for index in range(len(found.poses))}
+        positions, directions = _shown_cells(variables[1], coverage, views, run.experiment.config.data.ndc)
         counts = np.bincount(coverage.num_directions().ravel() + 1, minlength=66)[1:]
-        chosen = choose_views(coverage, posed, range(len(found.poses)), count)
+        chosen = choose_views(coverage, posed, scores, count)
     proposals = [
         Proposal(found.poses[index], _words(found, index, views, direction), score.angle) for index, score in chosen
     ]
@@ -184,7 +185,7 @@ def propose_images(
         views=views,
         up=direction,
         candidates=found,
-        angles=angles,
+        angles=_angles(scores, found),
         positions=positions,
         directions=directions,
         counts=counts,
@@ -201,28 +202,35 @@ def save_path(report: CoverageReport, workdir: str | os.PathLike) -> pathlib.Pat
     return file
 
 
-def _angles(coverage, posed, candidates):
+def _angles(scores, candidates):
     """Returns the mean angle [rows, columns] of the views of each group; NaN where there is none."""
     shape = len(candidates.rows), len(candidates.columns)
     total, number = np.zeros(shape), np.zeros(shape)
     for index, group in enumerate(candidates.group):
-        total[tuple(group)] += coverage.score(posed, index).angle
+        total[tuple(group)] += scores[index].angle
         number[tuple(group)] += 1
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
-def _shown_cells(grid: OccupancyGrid, coverage, ndc):
+def _shown_cells(grid: OccupancyGrid, coverage, views, ndc):
     """Returns the positions of cells that have been seen, and from how many directions; see `CoverageReport`."""
     counts = coverage.num_directions()
     places = np.argwhere(counts > 0)
-    if ndc or not len(places):
+    if not len(places):
         return np.zeros((0, 3)), np.zeros(0, int)
     places = places[:: -(-len(places) // _MOST_CELLS)]
     fractions = (places + 0.5) / counts.shape
     if grid.contracted:
         fractions = (np.asarray(contraction.expand(np.float32(4 * fractions - 2))) + 2) / 4
     lower, upper = np.float64(grid.lower), np.float64(grid.upper)
-    return lower + fractions * (upper - lower), counts[tuple(places.T)]
+    positions, counts = lower + fractions * (upper - lower), counts[tuple(places.T)]
+    if not ndc:
+        return positions, counts
+    near = positions[:, 2] < _FAR_IN_NDC
+    positions, counts = positions[near], counts[near]
+    depth = 2 / (1 - positions[:, 2:])  # Eq. 25 of arXiv:2003.08934 with n = 1, solved for the position
+    slopes = positions[:, :2] * views.size[0, ::-1] / (2 * np.float64(views.cameras.focal[0]))
+    return np.concatenate([slopes * depth, -depth], axis=1), counts
 
 
 def _path_of(poses, views):
@@ -261,7 +269,8 @@ def _words(candidates, index, views, up):
         moves.append(_part(height - old_height, "up", "down"))
         moves = [move for move in moves if move] or ["a little aside"]
         distance = unit * np.linalg.norm(offset)
-        return f"from {name} {' and '.join(moves)}: {height:.0f} degrees high, at a distance of {distance:.3g}"
+        place = f"{abs(height):.0f} degrees {'high' if height >= 0 else 'below the horizon'}"
+        return f"from {name} {' and '.join(moves)}: {place}, at a distance of {distance:.3g}"
     if candidates.kind == "beside":
         x, y = unit * (pose[:, 3] - old[:, 3]) @ old[:, :2]
         side, way = "right" if x > 0 else "left", "up" if y > 0 else "down"
