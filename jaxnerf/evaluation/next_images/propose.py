@@ -21,7 +21,7 @@ from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import stages
 
 NAME = "next_images"  # of the camera path
-_THIN = 30.0  # degrees: what has been seen from farther aside is thinly covered
+_THIN = 15.0  # degrees by which what is thinly covered has been seen from farther aside than the images themselves
 _MOST_THIN = 5  # groups that are named
 _MOST_CELLS = 6000  # that are plotted
 _FAR_IN_NDC = 0.8  # ten times as far away as the near plane, where 1 is at infinity
@@ -50,6 +50,7 @@ class CoverageReport(NamedTuple):
         views: of the split "train", with refined cameras.
         up: unit vector.
         candidates: those that were compared.
+        own_angle: the median over the images of the same for their own views: what rounding and thin fog leave.
         angles: [rows, columns] of the candidates' groups, degrees: from how far aside what a camera there would show
             has been seen; NaN where there is no candidate.
         positions: [M, 3] of cells that have been seen, world units, at most a few thousand; in NDC, of the near ones.
@@ -63,6 +64,7 @@ class CoverageReport(NamedTuple):
     views: Views
     up: Float[np.ndarray, "3"]
     candidates: Candidates
+    own_angle: float
     angles: Float[np.ndarray, "R C"]
     positions: Float[np.ndarray, "M 3"]
     directions: Int[np.ndarray, " M"]
@@ -86,7 +88,8 @@ class CoverageReport(NamedTuple):
             f"cameras  {self.candidates.kind}, as {self.candidates.reason}",
             "",
             "From how far aside what a camera would show has been seen, in degrees, by where it would be",
-            f"({_COLUMNS[self.candidates.kind].format(first=_name(self.views, 0))}):",
+            f"({_PLACES[self.candidates.kind].format(first=_name(self.views, 0))}).",
+            f"The images themselves have {self.own_angle:.0f} degrees, as directions are rounded:",
             *_table(self.angles, self.candidates),
             "",
             *self._thin(),
@@ -94,16 +97,15 @@ class CoverageReport(NamedTuple):
             "Next images, each as if those before it had been taken:",
         ]
         for number, each in enumerate(self.proposals, 1):
-            seen_from = (
-                "nothing of it has been seen" if each.angle > 179 else f"seen from {each.angle:.0f} degrees aside"
-            )
-            lines.append(f"{number:3}. {each.words}; {seen_from}")
+            seen = "nothing of it has been seen" if each.angle > 179 else f"seen from {each.angle:.0f} degrees aside"
+            lines.append(f"{number:3}. {each.words}; {seen}")
         return "\n".join(lines)
 
     def _thin(self):
-        rows, columns = np.nonzero(np.nan_to_num(self.angles) > _THIN)
+        most = self.own_angle + _THIN
+        rows, columns = np.nonzero(np.nan_to_num(self.angles) > most)
         if not len(rows):
-            return [f"thin     nowhere: everything has been seen from at most {_THIN:.0f} degrees aside"]
+            return [f"thin     nowhere: everything has been seen from at most {most:.0f} degrees aside"]
         order = np.argsort(-self.angles[rows, columns])[:_MOST_THIN]
         names = [
             f"{self.candidates.rows[row]}, {self.candidates.columns[column]} ({self.angles[row, column]:.0f})"
@@ -113,9 +115,9 @@ class CoverageReport(NamedTuple):
         return [f"thin     {'; '.join(names)}{more}"]
 
 
-_COLUMNS = {
+_PLACES = {
     "around": "columns: azimuth around the scene, degrees to the right of {first}",
-    "beside": "of the place of {first} and the other cameras",
+    "beside": "in the plane of the cameras",
     "turned": "columns: azimuth of the gaze, degrees to the right of that of {first}",
 }
 
@@ -173,6 +175,7 @@ def propose_images(
     path = _path_of(found.poses, views)
     posed = camera_path.posed_views(views, path)
     with stages.stage("comparing places for further images"):
+        own_angle = float(np.median([coverage.score(views, index).angle for index in range(len(poses))]))
         scores = {index: coverage.score(posed, index) for index in range(len(found.poses))}
         positions, directions = _shown_cells(variables[1], coverage, views, run.experiment.config.data.ndc)
         counts = np.bincount(coverage.num_directions().ravel() + 1, minlength=66)[1:]
@@ -185,6 +188,7 @@ def propose_images(
         views=views,
         up=direction,
         candidates=found,
+        own_angle=own_angle,
         angles=_angles(scores, found),
         positions=positions,
         directions=directions,
