@@ -8,6 +8,7 @@ import pytest
 
 import ball_runs
 from jaxnerf.data.geometry import candidate_poses
+from jaxnerf.evaluation.next_images import propose
 from jaxnerf.evaluation.next_images.coverage import ViewCoverage, choose_views
 from jaxnerf.evaluation.next_images.propose import propose_images, save_path
 from jaxnerf.evaluation.paths.camera_path import make_path
@@ -122,6 +123,16 @@ def test_proposals_are_what_has_not_been_seen_and_are_saved_as_a_path(ball, monk
     np.testing.assert_allclose(path.poses, [each.pose for each in report.proposals], atol=1e-5)
     assert path.fps == 1.0 and (path.width, path.height) == (32, 32)
     np.testing.assert_allclose(path.focal, report.path.focal, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_scene_that_moves_is_refused(ball, monkeypatch):
+    def moving(run, views, *_):
+        return dataclasses.replace(views, time=np.zeros(len(views.size), np.float32))
+
+    monkeypatch.setattr(propose, "refined_views", moving)
+    with pytest.raises(ValueError, match="the scene moves"):
+        propose_images(ball)
 
 
 @pytest.mark.slow

@@ -158,22 +158,14 @@ def propose_images(
     poses = np.asarray(views.cameras.to_world, np.float64)
     direction = camera_path.up_direction(up or run.experiment.config.data.up or None, views)
     direction = up_of(poses) if direction is None else direction
-    found = candidate_poses(poses, direction)
-    coverage = ViewCoverage(run, variables)
+    coverage, found = ViewCoverage(run, variables), candidate_poses(poses, direction)
+    if found.kind == "around":
+        found = _accessible(found, coverage, poses, workdir)
     with stages.stage("finding what the cameras see, by images") as stage:
         for index in range(len(poses)):
             stage.update(index, len(poses))
             coverage.add(views, index)
-    if found.kind == "around" and not run.experiment.config.data.ndc:
-        free = coverage.is_free(poses[found.nearest, :, 3], found.poses[:, :, 3])
-        found = found._replace(**{name: getattr(found, name)[free] for name in ("poses", "nearest", "group")})
-        if not free.any():
-            raise ValueError(
-                f"{workdir}: no straight line from a camera to a place around the scene is free of matter, expected "
-                "free space between the cameras; train it for longer"
-            )
-    path = _path_of(found.poses, views)
-    posed = camera_path.posed_views(views, path)
+    posed = camera_path.posed_views(views, _path_of(found.poses, views))
     with stages.stage("comparing places for further images"):
         own_angle = float(np.median([coverage.score(views, index).angle for index in range(len(poses))]))
         scores = {index: coverage.score(posed, index) for index in range(len(found.poses))}
@@ -204,6 +196,17 @@ def save_path(report: CoverageReport, workdir: str | os.PathLike) -> pathlib.Pat
     file.parent.mkdir(exist_ok=True)
     camera_path.write_path_file(file, report.path, report.views)
     return file
+
+
+def _accessible(candidates, coverage, poses, workdir):
+    """Returns the Candidates to which a straight line from the nearest camera passes no matter."""
+    free = coverage.is_free(poses[candidates.nearest, :, 3], candidates.poses[:, :, 3])
+    if not free.any():
+        raise ValueError(
+            f"{workdir}: no straight line from a camera to a place around the scene is free of matter, expected free "
+            "space between the cameras; train it for longer"
+        )
+    return candidates._replace(**{name: getattr(candidates, name)[free] for name in ("poses", "nearest", "group")})
 
 
 def _angles(scores, candidates):
