@@ -147,6 +147,7 @@ def test_the_program_reports_and_refuses(unoptimized, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "flags, message",
     [
