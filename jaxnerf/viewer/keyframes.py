@@ -1,22 +1,17 @@
 """Camera paths through keyframes, and the files that `jaxnerf-render --path` reads."""
 
-import json
 import os
 import pathlib
-import re
 from collections.abc import Sequence
 
 import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry.path_poses import poses_through
-from jaxnerf.data.geometry.world import poses_in_file
-from jaxnerf.runtime import atomic_files
+from jaxnerf.evaluation.paths.camera_path import CameraPath, file_of, make_path, write_path_file
 from jaxnerf.viewer.frame_renderer import MAX_SIDE, FrameCamera
 
-FOLDER = "camera_paths"  # in the workdir
 MAX_KEYFRAMES, MAX_FRAMES = 500, 10_000
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 
 
 def cameras_through(
@@ -61,20 +56,38 @@ def save_path(
     Raises:
         ValueError: on another name, a size beyond the limit, or a folder that is a link.
     """
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise ValueError(f"the name is {str(name)[:80]!r}, expected up to 64 letters, digits, '_', '.' and '-'")
     width, height = cameras[0].width, cameras[0].height
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"the frames have {width} x {height} px, expected sides of 1 to {MAX_SIDE}")
-    poses = poses_in_file(np.stack([camera.to_world for camera in cameras]), views.to_file)
-    poses[:, :, 3] += views.file_origin
-    frames = [
-        {"transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]], "fl_x": camera.focal}
-        for pose, camera in zip(poses, cameras, strict=True)
-    ]
-    folder = pathlib.Path(workdir) / FOLDER
-    atomic_files.check_tree(folder)
-    folder.mkdir(exist_ok=True)
-    path = folder / f"{name}.json"
-    atomic_files.write_text(path, json.dumps({"w": width, "h": height, "fps": fps, "frames": frames}, indent=1) + "\n")
-    return path
+    path = CameraPath(
+        name=name,
+        source="keyframes",
+        poses=np.stack([camera.to_world for camera in cameras]),
+        focal=np.float64([[camera.focal] * 2 for camera in cameras]),
+        center=np.tile(np.float64([[width / 2, height / 2]]), (len(cameras), 1)),
+        width=width,
+        height=height,
+        fps=fps,
+    )
+    file = file_of(workdir, name)
+    file.parent.mkdir(exist_ok=True)
+    write_path_file(file, path, views)
+    return file
+
+
+def load_keyframes(workdir: str | os.PathLike, name: str, views: Views) -> list[FrameCamera]:
+    """Returns the frames of <workdir>/camera_paths/<name>.json, to be used as keyframes.
+
+    Raises:
+        ValueError: on another name, no such file, too many frames, or a file that is no path.
+    """
+    file = file_of(workdir, name)
+    if not file.is_file():
+        known = ", ".join(sorted(path.stem for path in file.parent.glob("*.json"))[:20]) or "none"
+        raise ValueError(f"{file}: there is no such path, expected one of: {known}; correct the name")
+    path = make_path(file, views)
+    if len(path.poses) > MAX_KEYFRAMES:
+        raise ValueError(f"{file}: has {len(path.poses)} frames, expected at most {MAX_KEYFRAMES} keyframes")
+    width, height = (min(side, MAX_SIDE) for side in (path.width, path.height))
+    fovs = 2 * np.arctan(0.5 * path.height / path.focal[:, 1])
+    return [FrameCamera(pose, float(fov), width, height) for pose, fov in zip(path.poses, fovs, strict=True)]

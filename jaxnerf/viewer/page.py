@@ -16,7 +16,7 @@ from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import newest_step
 from jaxnerf.viewer.frame_renderer import MAX_SIDE, MODES, FrameCamera, frame_image
-from jaxnerf.viewer.keyframes import cameras_through, save_path
+from jaxnerf.viewer.keyframes import cameras_through, load_keyframes, save_path
 from jaxnerf.viewer.render_loop import Delivery, Request
 
 RESOLUTIONS = ("100", "200", "400", "800", "1600")  # px of the longer side
@@ -80,6 +80,7 @@ class Page:
             self._path_name = gui.add_text("Name", "path")
             self._overwrite = gui.add_checkbox("Replace earlier frames of this name", False)
             self._add(gui.add_button("Save"), self._save)
+            self._add(gui.add_button("Open as keyframes"), self._open)
             self._add(gui.add_button("Save and render video"), self._render_video)
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._path_status = gui.add_markdown("no keyframes")
@@ -366,6 +367,13 @@ class Page:
         path = save_path(self._viewer.workdir, self._path_name.value, frames, fps=fps, views=views)
         self._path_status.content = f"{len(frames)} frames saved to {path}"
         return path, len(frames)
+
+    def _open(self):
+        """Replaces the keyframes by the frames of a path in the workdir, and shows the first."""
+        self._keyframes = load_keyframes(self._viewer.workdir, self._path_name.value, self._viewer.views)
+        self._report_keyframes()
+        first = self._keyframes[0]
+        self._go_to(first.to_world, first.fov, first.to_world[:, 1])
 
     def _render_video(self):
         """Saves the path and renders its video with the newest checkpoint, in a thread."""

@@ -13,7 +13,7 @@ from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.synthetic import load_synthetic
 from jaxnerf.evaluation.paths.camera_path import make_path, read_path_file
 from jaxnerf.viewer.frame_renderer import FrameCamera
-from jaxnerf.viewer.keyframes import cameras_through, save_path
+from jaxnerf.viewer.keyframes import cameras_through, load_keyframes, save_path
 
 POSES = np.asarray(turntable(4, center=(0, 0, 0), radius=3.0, elevation=0.3))
 VIEWS = load_synthetic(size=8)
@@ -44,6 +44,12 @@ def test_render_reads_the_saved_path_in_the_world_of_the_run(tmp_path):
     assert (path.width, path.height, path.fps) == (64, 48, 10)
     np.testing.assert_allclose(path.focal[:, 1], [frame.focal for frame in frames])
     assert read_path_file(file).poses.shape == (4, 3, 4)
+    again = load_keyframes(tmp_path, "my.path-1", views)
+    np.testing.assert_allclose([frame.to_world for frame in again], path.poses)
+    np.testing.assert_allclose([frame.fov for frame in again], [frame.fov for frame in frames])
+    assert [(frame.width, frame.height) for frame in again] == [(64, 48)] * 4
+    with pytest.raises(ValueError, match="no such path, expected one of: my.path-1"):
+        load_keyframes(tmp_path, "other", views)
 
 
 @pytest.mark.parametrize("name", ["../up", "/etc/passwd", "", ".hidden", "a/b", "a b", "x" * 65, "a\0b", 5, None])

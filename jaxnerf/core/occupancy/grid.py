@@ -387,7 +387,7 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
 
     @functools.wraps(scene)
     def masked(x, viewdirs, **inputs):
-        index, inside = _cells_around(grid, x)
+        index, inside = cells_around(grid, x)
         kept = (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(x).any(axis=-1)
         flat = x.reshape(-1, 3)
         # Where the scene is undefined, the gradient of what is masked would be NaN.
@@ -419,7 +419,7 @@ def drop_thin_density(
     @functools.wraps(scene)
     def thinned(x, viewdirs, **inputs):
         density, rgb = scene(x, viewdirs, **inputs)
-        least = threshold.reshape(-1)[_cells_around(grid, x)[0]] if threshold.ndim else threshold
+        least = threshold.reshape(-1)[cells_around(grid, x)[0]] if threshold.ndim else threshold
         return jnp.where(density <= least, 0, density), rgb
 
     return thinned
@@ -449,8 +449,10 @@ def _cells_per_unit(grid, axis):
     return grid.occupied.shape[axis] / (grid.upper[axis] - grid.lower[axis])
 
 
-def _cells_around(grid, x):
-    """Returns _cells_of positions x [..., 3]."""
+def cells_around(
+    grid: OccupancyGrid, x: Float[ArrayLike, "*batch 3"]
+) -> tuple[Int[Array, "*batch"], Bool[Array, "*batch"]]:
+    """Returns the flat index of the cell around each position, and whether it is inside the box."""
     return _cells_of(grid, [(x[..., i] - grid.lower[i]) * _cells_per_unit(grid, i) for i in range(3)])
 
 

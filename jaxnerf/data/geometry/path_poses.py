@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxnerf.core import poses as core_poses
+from jaxnerf.core.occupancy.seen_directions import spread_directions
 from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 
 # Six cameras that are placed around an object by hand are nowhere farther apart. Halfway between two cameras, the
@@ -63,7 +64,7 @@ def coverage(poses: Float[Array | np.ndarray, "V 3 4"], up: Float[np.ndarray, "3
     """
     poses = np.asarray(poses, np.float64)
     center, up = gaze_center(poses), up_of(poses) if up is None else up
-    right, ahead = _level_axes(up)
+    right, ahead = level_axes(up)
     offset = poses[:, :, 3] - center
     distance = np.linalg.norm(offset, axis=1)
     elevation = np.arcsin(np.clip(offset @ up / np.maximum(distance, 1e-30), -1, 1))
@@ -238,19 +239,30 @@ def _eyes(cover, azimuth, lift=0.0):
     spread = np.sqrt(np.maximum(weights @ cover.elevation**2 - mean**2, 0))
     elevation = mean + lift * spread
     distance = weights @ cover.distance
-    right, ahead = _level_axes(cover.up)
+    right, ahead = level_axes(cover.up)
     level = np.cos(azimuth)[:, None] * right + np.sin(azimuth)[:, None] * ahead
     away = np.cos(elevation)[:, None] * level + np.sin(elevation)[:, None] * cover.up
     return cover.center + distance[:, None] * away
 
 
-def _spiral(poses, num_frames):
-    """Looks at what the cameras look at, or at a farther point, so that it turns no more than the cameras."""
+def forward_frame(
+    poses: Float[np.ndarray, "V 3 4"],
+) -> tuple[Float[np.ndarray, "3 4"], Float[np.ndarray, "3"], float]:
+    """Returns the mean of cameras that look one way, how far they spread along its axes, and the depth they look at.
+
+    The spread is the 90th percentile of the distances. The depth is that of the point that the cameras look at, or
+    larger, so that a camera which looks at it from within the spread turns no more than the cameras.
+    """
     pose = np.float64(_mean_pose(poses))
     radii = np.percentile(np.abs((poses[:, :, 3] - pose[:, 3]) @ pose[:, :3]), 90, axis=0)
     turns = np.arccos(np.clip(poses[:, :, 2] @ pose[:, 2], -1, 1))
     largest = max(np.tan(np.percentile(turns, 90)), 1e-3)  # 0 for parallel cameras
     focus = max((pose[:, 3] - gaze_center(poses)) @ pose[:, 2], radii[:2].max() / largest)
+    return pose, radii, float(focus)
+
+
+def _spiral(poses, num_frames):
+    pose, radii, focus = forward_frame(poses)
     eyes = np.asarray(_llff_spiral(num_frames, pose=pose, radii=radii, focus=focus))[:, :, 3]
     radii = radii * _scale_into_hull(eyes, pose[:, 3], poses[:, :, 3])
     return _llff_spiral(num_frames, pose=pose, radii=radii, focus=focus)
@@ -274,23 +286,15 @@ def _scale_into_hull(eyes, middle, positions):
 
     The hull is bounded in many directions, so that it may be a plane or a line.
     """
-    directions = _sphere()
+    directions = np.array(spread_directions(_DIRECTIONS))
     between = np.linalg.norm(positions[:, None] - positions, axis=-1) + np.diag(np.full(len(positions), np.inf))
     limit = ((positions - middle) @ directions.T).max(axis=0) + np.median(between.min(axis=1)) / 2
     reach = ((eyes - middle) @ directions.T).max(axis=0)
     return min(1.0, np.divide(limit, reach, where=reach > 1e-9 * reach.max(), out=np.ones_like(reach)).min())
 
 
-def _sphere():
-    """Returns directions [M, 3] that are evenly spread over the sphere."""
-    steps = np.arange(_DIRECTIONS)
-    height, azimuth = 1 - (2 * steps + 1) / _DIRECTIONS, np.pi * (3 - np.sqrt(5)) * steps
-    around = np.sqrt(1 - height**2)
-    return np.stack([around * np.cos(azimuth), around * np.sin(azimuth), height], axis=-1)
-
-
-def _level_axes(up):
-    """Returns two unit vectors perpendicular to up and to each other."""
+def level_axes(up: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Returns two unit vectors perpendicular to up and to each other, from which azimuth is counted."""
     right = np.cross(up, [1.0, 0.1, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.1])
     right /= np.linalg.norm(right)
     return right, np.cross(up, right)
