@@ -255,7 +255,7 @@ def _score_views(run, render, views, folder, shard, predictor):
     """Renders and scores those views of a shard that are not finished."""
     count = len(views.names)
     frames = shards.indices_of(range(count), shard)
-    files = [aggregate.view_files(folder, index, count=count) for index in frames]
+    files = [aggregate.view_files(folder, index, count=count, errors=predictor is not None) for index in frames]
     sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
     readable = output_images.readable(files, sizes, is_valid=aggregate.is_finished)
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]

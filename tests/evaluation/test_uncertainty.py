@@ -1,17 +1,25 @@
 """Predicted errors: calibration, sparsification, the deformation, and what is refused."""
 
+import dataclasses
+import time
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
 import imageio.v3 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
-from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.evaluation.uncertainty import calibration, laplace
+from jaxnerf.evaluation.restore import TrainedRun, restore_run
+from jaxnerf.evaluation.uncertainty import calibration, laplace, predict
+from jaxnerf.evaluation.uncertainty.base import Estimate
 from jaxnerf.evaluation.uncertainty.laplace import deform, interpolate
 from jaxnerf.evaluation.uncertainty.predict import make_predictor
 from jaxnerf.fields.base import Field
+from jaxnerf.registry import ESTIMATORS
 from runs import smoke_config
 
 pytest_plugins = ["run_fixtures"]
@@ -100,6 +108,30 @@ def test_a_deformed_field_is_the_field_until_it_is_moved(contracted):
     np.testing.assert_allclose(change, 1, rtol=1e-5)
 
 
+def test_one_of_several_processes_calibrates(tmp_path, monkeypatch):
+    """The others wait for it; threads stand for processes, as a lock belongs to what opened the file."""
+    calls, said = [], []
+
+    def calibrate(*args):
+        calls.append(args)
+        time.sleep(0.3)
+        return calibrated()
+
+    monkeypatch.setattr(predict, "_calibrate", calibrate)
+    monkeypatch.setitem(ESTIMATORS._parts, "fixed", lambda source: Estimate(lambda rays: rays.near, "fixed"))
+    config = SimpleNamespace(data=SimpleNamespace(hold_out=8))
+    views = Views(**dict.fromkeys(field.name for field in dataclasses.fields(Views)))
+    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split: views)
+    fields = dict.fromkeys(TrainedRun._fields) | {"experiment": experiment, "identity": "fixed"}
+    run = TrainedRun(**fields | {"steps": lambda: [5], "variables": lambda step: (np.ones(3), None)})
+    with ThreadPoolExecutor(3) as pool:
+        made = [pool.submit(make_predictor, run, tmp_path, "fixed", say=said.append) for _ in range(3)]
+        assert len({each.result().identity for each in made}) == 1
+    assert len(calls) == 1 and sum("waits for another process" in line for line in said) == 2
+    make_predictor(run, tmp_path, "fixed", coverage=0.8, say=said.append)
+    assert len(calls) == 2 and "calibrated for a coverage of 0.9, and is calibrated again" in said[-2]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("members, message", [((), "--members"), ("same", "another seed")])
 def test_an_ensemble_needs_other_runs(unoptimized, trained, members, message):
@@ -108,7 +140,7 @@ def test_an_ensemble_needs_other_runs(unoptimized, trained, members, message):
 
 
 @pytest.mark.slow
-def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path, monkeypatch):
+def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(laplace, "NUM_BATCHES", 4)
     monkeypatch.setattr(laplace, "NUM_PROBES", 2)
     config = smoke_config()
@@ -119,7 +151,11 @@ def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path,
     def predictor(run):
         return make_predictor(run, tmp_path, "laplace", coverage=0.8)
 
+    assert evaluate(tmp_path, predictor=predictor, shard=(0, 2)) is None
+    (damaged,) = (tmp_path / "eval").glob("*/uncertainty/000.tiff")
+    damaged.write_bytes(b"damaged")
     results = evaluate(tmp_path, predictor=predictor)
+    assert f"{damaged}: is damaged" in capsys.readouterr().err
     found = results["uncertainty"]
     assert found["estimator"] == "laplace" and found["target_coverage"] == 0.8
     assert found["coverage"] == pytest.approx(0.8, abs=0.1) and found["interval"] > 0

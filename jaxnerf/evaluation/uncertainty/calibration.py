@@ -137,9 +137,15 @@ def sparsification(error: ArrayLike, score: ArrayLike, *, num_fractions: int = 1
 
 
 def save(path: pathlib.Path, calibration: Calibration, key: str) -> None:
-    """Writes a calibration; key: text that is equal for the same checkpoint and estimate."""
+    """Writes a calibration unless there is one: of processes that share a folder, the first one decides for all.
+
+    Args:
+        path: of the file.
+        calibration: to write.
+        key: text that is equal for the same checkpoint and estimate.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_files.write_text(path, json.dumps({"key": key, **calibration._asdict()}, indent=1) + "\n")
+    atomic_files.write_text_once(path, json.dumps({"key": key, **calibration._asdict()}, indent=1) + "\n")
 
 
 def load(path: pathlib.Path, key: str) -> Calibration:

@@ -18,6 +18,7 @@ from jaxnerf.evaluation.uncertainty import calibration as calibrations
 from jaxnerf.evaluation.uncertainty.base import Score, UncertaintySource
 from jaxnerf.evaluation.uncertainty.calibration import Calibration, pixel_error, sparsification
 from jaxnerf.registry import ESTIMATORS
+from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
 
 
@@ -81,8 +82,9 @@ def make_predictor(
 ) -> Predictor:
     """Makes the Predictor of a checkpoint, calibrated on the views that `data.hold_out` kept from training.
 
-    The calibration is written to <workdir>/uncertainty/STEP/NAME.json, and read again if it fits. A run without
-    held-out views has no calibration, which is said.
+    The calibration is written to <workdir>/uncertainty/STEP/NAME.json, and read again if it fits. Of several processes,
+    such as the shards of an evaluation, one calibrates, and the others wait for it. A run without held-out views has no
+    calibration, which is said.
 
     Args:
         run: restored from the workdir.
@@ -102,17 +104,18 @@ def make_predictor(
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     folder = pathlib.Path(workdir) / "uncertainty" / str(step)
     key = fingerprint(run.identity, variables[0], *([] if variables[1] is None else [variables[1]]))
-    found = estimate(UncertaintySource(run, variables, views, tuple(members), folder, key, say))
-    key, path = fingerprint(key, found.identity), folder / f"{name}.json"
-    known = calibrations.load(path, key) if path.is_file() else None
-    if known is None or known.coverage != coverage:
-        if run.experiment.config.data.hold_out:
-            if known is not None:
-                say(f"{path}: was calibrated for a coverage of {known.coverage:g}, and is calibrated again")
-            known = _calibrate(run, variables, found.score, coverage)
-            calibrations.save(path, known, key)
-        else:
+    source = UncertaintySource(run, variables, views, tuple(members), folder, key, say)
+    with atomic_files.one_at_a_time(folder, lambda: say(f"uncertainty: waits for another process in {folder}")):
+        found = estimate(source)
+        key, path = fingerprint(key, found.identity), folder / f"{name}.json"
+        known = calibrations.load(path, key) if path.is_file() else None
+        if known is not None and known.coverage != coverage:
+            say(f"{path}: was calibrated for a coverage of {known.coverage:g}, and is calibrated again")
+            path.unlink()
             known = None
+        if known is None and run.experiment.config.data.hold_out:
+            calibrations.save(path, _calibrate(run, variables, found.score, coverage), key)
+            known = calibrations.load(path, key)
     if known is None:
         say(
             f"uncertainty: {name}, not calibrated, as no views were held out; "
