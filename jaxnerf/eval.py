@@ -14,8 +14,17 @@ def _option_names():
     return option_names()
 
 
+def _load_saved(path):
+    from jaxnerf.training.workdir import load_config_dict
+
+    return load_config_dict(path)
+
+
 _CONFIG = cli.define_config(
-    "A config that replaces the workdir's: a name, or the path of a file.", option_names=_option_names
+    "A config that replaces the workdir's: a name, or the path of a file. When it is not given, flags such as "
+    "--config.eval.chunk=4096 change the workdir's.",
+    load_saved=_load_saved,
+    option_names=_option_names,
 )
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.")
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
@@ -34,6 +43,12 @@ _BAKE_OCCUPANCY = flags.DEFINE_bool(
     None,
     "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
     "config.eval.bake_occupancy.",
+)
+_MAX_UNCERTAINTY = flags.DEFINE_float(
+    "max_uncertainty",
+    None,
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; 1: off. It overrides "
+    "config.eval.max_uncertainty.",
 )
 _ERROR_BUDGET = flags.DEFINE_float(
     "error_budget",
@@ -74,7 +89,11 @@ def main(argv):
 
     shard = shards.parse(_SHARD.value)
     _check_flags(is_sharded=shard != shards.WHOLE)
-    overrides = {"bake_occupancy": _BAKE_OCCUPANCY.value, "chunk": _CHUNK.value}
+    overrides = {
+        "bake_occupancy": _BAKE_OCCUPANCY.value,
+        "chunk": _CHUNK.value,
+        "max_uncertainty": _MAX_UNCERTAINTY.value,
+    }
     options = {
         "config": _CONFIG.value,
         "split": _SPLIT.value,
@@ -128,7 +147,11 @@ def _check_flags(is_sharded):
         "error_budget": _ERROR_BUDGET.value,
         "uncertainty": _UNCERTAINTY.value,
     }
-    of_a_run = of_one_checkpoint | {"chunk": _CHUNK.value, "bake_occupancy": _BAKE_OCCUPANCY.value}
+    of_a_run = of_one_checkpoint | {
+        "chunk": _CHUNK.value,
+        "bake_occupancy": _BAKE_OCCUPANCY.value,
+        "max_uncertainty": _MAX_UNCERTAINTY.value,
+    }
     unused = {
         "predictions": (_PREDICTIONS.value, of_a_run | {"watch": _WATCH.value or None}),
         "watch": (_WATCH.value, of_one_checkpoint | {"overwrite": _OVERWRITE.value or None}),
@@ -159,6 +182,7 @@ def _reference_config():
 
 def run():
     """Runs the program."""
+    cli.use_saved_config(only_for_fields=True)
     cli.run(main, stopped="between two views; the same command continues from there")
 
 

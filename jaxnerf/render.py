@@ -22,6 +22,12 @@ _BAKE_OCCUPANCY = flags.DEFINE_bool(
     "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
     "config.eval.bake_occupancy.",
 )
+_MAX_UNCERTAINTY = flags.DEFINE_float(
+    "max_uncertainty",
+    None,
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; 1: off. It overrides "
+    "config.eval.max_uncertainty.",
+)
 _PATH = flags.DEFINE_string(
     "path",
     None,
@@ -74,7 +80,11 @@ def main(argv):
     from jaxnerf.evaluation.paths.render_path import render_path
     from jaxnerf.runtime import shards
 
-    overrides = {"bake_occupancy": _BAKE_OCCUPANCY.value, "chunk": _CHUNK.value}
+    overrides = {
+        "bake_occupancy": _BAKE_OCCUPANCY.value,
+        "chunk": _CHUNK.value,
+        "max_uncertainty": _MAX_UNCERTAINTY.value,
+    }
     written = render_path(
         _WORKDIR.value,
         path=_PATH.value,

@@ -225,20 +225,20 @@ def _lock_folder(folder, missing=None):
 
 
 @contextlib.contextmanager
-def one_at_a_time(folder: str | os.PathLike, waiting: Callable[[], None]) -> Iterator[None]:
-    """Lets one process at a time into a folder, made if missing; the others wait.
+def one_at_a_time(path: str | os.PathLike, waiting: Callable[[], None]) -> Iterator[None]:
+    """Lets one process at a time do something; the others wait.
 
-    The lock is a flock on the file "lock", which stays and locks nobody out: the system releases it however the process
-    ends. Where there are no such locks, as on some network file systems, no process waits.
+    Where the system has no flock, as on some network file systems, no process waits.
 
     Args:
-        folder: any.
+        path: of a file, made if missing, with its folder. It stays and locks nobody out, as the system releases the
+            lock however the process ends.
         waiting: called once if this process has to wait.
 
     Raises:
         OSError: with the path, if nothing can be written there.
     """
-    path = pathlib.Path(folder) / "lock"
+    path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with open_regular(path, "a") as file:
         if fcntl is not None:

@@ -27,6 +27,7 @@ def view_run(
     *,
     data_dir: str | None = None,
     step: int | None = None,
+    max_uncertainty: float | None = None,
     host: str = HOST,
     port: int = PORT,
     ended: threading.Event | None = None,
@@ -37,6 +38,7 @@ def view_run(
         workdir: the folder that training wrote or writes.
         data_dir: see `restore_run`.
         step: of the only checkpoint to show; None: always the newest.
+        max_uncertainty: in place of the config's `eval.max_uncertainty`, unless it is None.
         host, port: see `Viewer.listen`.
         ended: set by another thread to stop.
 
@@ -45,7 +47,8 @@ def view_run(
     """
     import_viser()
     check_port(host, port)
-    run = restore_with_grid(workdir, data_dir=data_dir)
+    settings = {} if max_uncertainty is None else {"max_uncertainty": max_uncertainty}
+    run = restore_with_grid(workdir, data_dir=data_dir, settings=settings)
     first = newest_step(run, workdir, step)
     variables = run.variables(first)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])

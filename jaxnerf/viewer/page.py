@@ -383,7 +383,9 @@ class Page:
 
         def render():
             try:
+                limit = self._viewer.run.experiment.config.eval.max_uncertainty
                 options = {"step": step, "data_dir": self._viewer.data_dir, "overwrite": overwrite}
+                options["settings"] = {"max_uncertainty": limit}
                 written = render_path(self._viewer.workdir, path=str(path), **options)
                 self._path_status.content = f"video: {written[-1]}"
             finally:

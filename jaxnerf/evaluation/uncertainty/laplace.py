@@ -13,6 +13,7 @@ vjp for the first, a jvp for the second. Nothing needs to be known of the field 
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -65,7 +66,30 @@ def estimate_laplace(source: UncertaintySource) -> Estimate:
     def score(rays: Rays):
         return render((source.variables, posterior), rays).rgb[..., 0]
 
-    return Estimate(score, f"laplace, {RESOLUTION} cells, {NUM_BATCHES} x {BATCH_SIZE} rays, {NUM_PROBES} probes")
+    identity = f"laplace, {RESOLUTION} cells, {NUM_BATCHES} x {BATCH_SIZE} rays, {NUM_PROBES} probes"
+    config = source.run.experiment.config
+    return Estimate(score, identity, std_at(posterior, *_box_of(config), config.occupancy.contracted))
+
+
+def std_at(
+    posterior: Deformation, lower: Vector, upper: Vector, contracted: bool
+) -> Callable[[Float[ArrayLike, "*batch 3"]], Float[Array, "*batch"]]:
+    """Makes the function x [..., 3] -> [...], the standard deviation of the displacement at positions, in cells.
+
+    It is the RMS over the axes, in (0, 1]: 1, that of the prior, where the training rays do not fix the displacement,
+    as in free space and inside of what is opaque, but also within surfaces of one colour.
+
+    Args:
+        posterior: see `Deformation`.
+        lower, upper, contracted: see `deform`.
+    """
+    cells = posterior.std.shape[0] - 1
+
+    def std(x):
+        place, _ = _place_in_box(x, lower, upper, contracted)
+        return jnp.sqrt((interpolate(posterior.std, (place + 2) * (cells / 4)) ** 2).mean(axis=-1))
+
+    return std
 
 
 def load_deformation(source: UncertaintySource) -> Deformation:
@@ -129,25 +153,30 @@ def deform(lower: Vector, upper: Vector, contracted: bool):
         The function. The displacements are [R + 1, R + 1, R + 1, 3], at the vertices, in cells of the box; outside
         a box that is not contracted they are those of its faces.
     """
-    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
-    middle, quarter = (lower + upper) / 2, (upper - lower) / 4
 
     def wrap(field: Field) -> Field:
         @functools.wraps(field.apply)
         def apply(params, x, viewdirs, **inputs):
             params, displacement = params
             cells = displacement.shape[0] - 1
-            center, side = (each.reshape((1,) * (x.ndim - 1) + (3,)) for each in (middle, quarter))
-            place, scale = (x - center) / side, 1.0
-            if contracted:
-                scale = jnp.maximum(contraction.length_scale(place), _SMALLEST_SCALE)[..., None]
-                place = contraction.contract(place)
-            moved = interpolate(displacement, (place + 2) * (cells / 4)) / scale
-            return field.apply(params, x + moved * (4 * side / cells), viewdirs, **inputs)
+            place, unit = _place_in_box(x, lower, upper, contracted)
+            moved = interpolate(displacement, (place + 2) * (cells / 4)) * (4 / cells * unit)
+            return field.apply(params, x + moved, viewdirs, **inputs)
 
         return field._replace(apply=apply)
 
     return wrap
+
+
+def _place_in_box(x, lower, upper, contracted):
+    """Returns where positions [..., 3] are in a box that reaches from -2 to 2, and its unit there in world units."""
+    lower, upper = (jnp.asarray(corner).reshape((1,) * (x.ndim - 1) + (3,)) for corner in (lower, upper))
+    unit = (upper - lower) / 4
+    place = (x - (lower + upper) / 2) / unit
+    if not contracted:
+        return place, unit
+    scale = jnp.maximum(contraction.length_scale(place), _SMALLEST_SCALE)[..., None]
+    return contraction.contract(place), unit / scale
 
 
 def interpolate(values: Float[ArrayLike, "X Y Z C"], place: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch C"]:

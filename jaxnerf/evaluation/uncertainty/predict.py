@@ -2,7 +2,6 @@
 
 import functools
 import os
-import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -101,13 +100,14 @@ def make_predictor(
     estimate = ESTIMATORS.get(name)
     step = newest_step(run, workdir, step)
     variables = run.variables(step)
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
-    folder = pathlib.Path(workdir) / "uncertainty" / str(step)
+    source = UncertaintySource.of(run, workdir, step, variables, members=members, say=say)
     key = fingerprint(run.identity, variables[0], *([] if variables[1] is None else [variables[1]]))
-    source = UncertaintySource(run, variables, views, tuple(members), folder, key, say)
-    with atomic_files.one_at_a_time(folder, lambda: say(f"uncertainty: waits for another process in {folder}")):
+    path, limit = source.folder / f"{name}.json", run.experiment.config.eval.max_uncertainty
+    if limit < 1:
+        path = path.with_stem(f"{name}-max_uncertainty-{limit:g}")
+    with atomic_files.one_at_a_time(path.with_suffix(".lock"), lambda: say(f"{path}: waits for another process")):
         found = estimate(source)
-        key, path = fingerprint(key, found.identity), folder / f"{name}.json"
+        key = fingerprint(key, found.identity)
         known = calibrations.load(path, key) if path.is_file() else None
         if known is not None and known.coverage != coverage:
             say(f"{path}: was calibrated for a coverage of {known.coverage:g}, and is calibrated again")
