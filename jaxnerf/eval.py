@@ -85,10 +85,13 @@ def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation import evaluate, external, quality_search
+    from jaxnerf.evaluation.uncertainty.predict import requested
     from jaxnerf.runtime import shards
 
     shard = shards.parse(_SHARD.value)
     _check_flags(is_sharded=shard != shards.WHOLE)
+    errors = {"step": _STEP.value, "members": _MEMBERS.value, "coverage": _COVERAGE.value}
+    predictor = requested(_UNCERTAINTY.value, _WORKDIR.value, **errors)
     overrides = {
         "bake_occupancy": _BAKE_OCCUPANCY.value,
         "chunk": _CHUNK.value,
@@ -110,32 +113,14 @@ def main(argv):
         options |= {"step": _STEP.value, "data_dir": _DATA_DIR.value, "overwrite": _OVERWRITE.value}
         if _ERROR_BUDGET.value is not None:
             options["settings"] |= quality_search.choose(_WORKDIR.value, _ERROR_BUDGET.value, **options)
-        results = evaluate.evaluate(_WORKDIR.value, shard=shard, predictor=_predictor(), **options)
+        results = evaluate.evaluate(_WORKDIR.value, shard=shard, predictor=predictor, **options)
     if results is None:
         print(f"shard {_SHARD.value} is done; views of other shards are missing")
         return
     print(evaluate.summary(results))
 
 
-def _predictor():
-    """Returns the function that makes the Predictor of a run; None without --uncertainty."""
-    if _UNCERTAINTY.value is None:
-        return None
-    import functools
-
-    from jaxnerf.evaluation.uncertainty.predict import make_predictor
-    from jaxnerf.registry import ESTIMATORS
-
-    ESTIMATORS.get(_UNCERTAINTY.value)  # a wrong name is reported before anything is read
-    options = {"members": _MEMBERS.value or (), "coverage": _COVERAGE.value, "step": _STEP.value}
-    return functools.partial(make_predictor, workdir=_WORKDIR.value, name=_UNCERTAINTY.value, **options)
-
-
 def _check_flags(is_sharded):
-    if not 0 < _COVERAGE.value < 1:
-        raise ValueError(f"--coverage is {_COVERAGE.value}, expected a number between 0 and 1, such as 0.9; correct it")
-    if _MEMBERS.value and _UNCERTAINTY.value is None:
-        raise ValueError("--members is given without --uncertainty=ensemble; add that, or drop --members")
     if not (_WORKDIR.value or _PREDICTIONS.value):
         raise ValueError("there is nothing to score; give --workdir=DIR of a run, or --predictions=DIR of images")
     for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):

@@ -114,6 +114,12 @@ def depth_range(depths: Iterable[np.ndarray], fraction: float = 0.98) -> tuple[A
     return tuple(np.quantile(samples, [0.5 - fraction / 2, 0.5 + fraction / 2])) if samples.size else (1.0, 2.0)
 
 
+def largest_error(errors: Iterable[np.ndarray], fraction: float = 0.99) -> float:
+    """Returns what a fraction of all predicted errors stay below; 0 without any."""
+    samples = np.concatenate([np.ravel(error)[::17] for error in errors])
+    return float(np.quantile(samples, fraction)) if samples.size else 0.0
+
+
 def depth_image(depth: np.ndarray, near: ArrayLike, far: ArrayLike) -> np.ndarray:
     """Returns uint8 [H, W]: white at near, black at far and beyond, linear in 1 / depth as parallax is."""
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -36,8 +36,8 @@ class ViewOptions(Options):
     )
     max_uncertainty: float = option(
         1.0,
-        "with a grid: cells in which the standard deviation of the displacement that the training images leave open is "
-        "larger are empty, relative to that without any image, so that floaters go; 1: off",
+        "with a grid: cells that are more uncertain are empty, so that floaters go. The uncertainty of a cell is how "
+        "far the training images let it be displaced, over how far it could be without them; 1: off",
         range=FRACTION,
         changes=Changes.IMAGES,
     )

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_with_grid
+from jaxnerf.evaluation.uncertainty.laplace import stored_uncertainty
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import metric_log
 from jaxnerf.training.state import TrainState
@@ -53,7 +54,12 @@ def view_run(
     variables = run.variables(first)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     viewer = Viewer(workdir, run, views, data_dir=data_dir)
-    viewer.show(first, variables, score_of(workdir, first))  # compiles before anyone can connect
+
+    def show(step, variables):
+        uncertainty_at = stored_uncertainty(run, workdir, step, variables[0])
+        viewer.show(step, variables, score_of(workdir, step), uncertainty_at=uncertainty_at)
+
+    show(first, variables)  # compiles before anyone can connect
     port = viewer.listen(host, port)
     print(f"viewer        {address(host, port)} shows {workdir}, step {first}; Ctrl-C ends it", file=sys.stderr)
     failed = None
@@ -70,7 +76,7 @@ def view_run(
                     failed = newest[0]
                     print(f"viewer: {error}", file=sys.stderr)
                 continue
-            viewer.show(newest[0], variables, score_of(workdir, newest[0]))
+            show(newest[0], variables)
     finally:
         viewer.close()
 

@@ -92,6 +92,19 @@ def test_ause_is_zero_for_true_errors_and_larger_the_less_the_score_says():
     assert 0.05 < some < 0.8 * none
 
 
+def test_the_order_of_scores_is_that_on_the_object_too():
+    """A score that finds the object, and says nothing about it, has a small AUSE over the image only."""
+    rng = np.random.default_rng(0)
+    on_object = np.arange(60)[:, None] + np.zeros(60) < 20
+    error = np.where(on_object, rng.exponential(size=(60, 60)), 0.001)
+    kept = np.ones((60, 60), bool)
+    found = calibration.score_order(error, on_object * 1.0, kept, on_object)
+    alone = calibration.sparsification(error[on_object], np.zeros(on_object.sum()))
+    assert found["ause_rmse"] < 0.4 * found["ause_rmse_object"]
+    assert found["ause_rmse_object"] == pytest.approx(alone["ause_rmse"])
+    assert set(calibration.score_order(error, error, kept, ~kept)) == {"ause_rmse", "ause_mae"}
+
+
 def test_interpolation_is_exact_for_linear_functions_and_clipped():
     vertices = jnp.stack(jnp.meshgrid(*[jnp.arange(5.0)] * 3, indexing="ij"), axis=-1)
     x = jax.random.uniform(jax.random.key(0), (50, 3), maxval=4.0)

@@ -51,8 +51,18 @@ class UncertaintySource(NamedTuple):
         views, cameras = run.experiment.load_split("train"), run.experiment.cameras
         if cameras is not None:
             views = cameras.refined_views(variables[0], views, "train")
-        folder, key = pathlib.Path(workdir) / "uncertainty" / str(step), fingerprint(run.identity, variables[0])
-        return cls(run, variables, views, tuple(members), folder, key, say)
+        key = fingerprint_of(run, variables[0])
+        return cls(run, variables, views, tuple(members), folder_of(workdir, step), key, say)
+
+
+def folder_of(workdir: str | os.PathLike, step: int) -> pathlib.Path:
+    """Returns the folder of what belongs to the estimates of a checkpoint."""
+    return pathlib.Path(workdir) / "uncertainty" / str(step)
+
+
+def fingerprint_of(run: TrainedRun, params: Any) -> str:
+    """Returns the fingerprint of an `UncertaintySource`."""
+    return fingerprint(run.identity, params)
 
 
 class Estimate(NamedTuple):

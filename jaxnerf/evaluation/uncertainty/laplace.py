@@ -13,18 +13,20 @@ vjp for the first, a jvp for the second. Nothing needs to be known of the field 
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+import os
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxnerf.core import contraction
 from jaxnerf.core.types import Rays, Vector
 from jaxnerf.data.ray_batches import draw_batch
-from jaxnerf.evaluation.uncertainty.base import Estimate, UncertaintySource
+from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.evaluation.uncertainty.base import Estimate, UncertaintySource, fingerprint_of, folder_of
 from jaxnerf.fields.base import Field
 from jaxnerf.options import is_auto
 from jaxnerf.runtime import atomic_files
@@ -32,9 +34,12 @@ from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.memory import image_renderer
 
 RESOLUTION = 64  # cells of the deformation along each axis of the box
-NUM_BATCHES = 128  # each adds one random product; the precision then has a relative error of sqrt(2 / 128)
+# Each adds one random product: the precision then has a relative error of sqrt(2 / 32), and the standard deviation half
+# of it. AUSE on held-out views of lego and the embedded scene is no smaller with 128.
+NUM_BATCHES = 32
 BATCH_SIZE = 1024  # rays
 NUM_PROBES = 8  # deformations that a predicted variance is the mean of
+_FILE = "laplace.npz"
 _SMALLEST_SCALE = 1e-6  # of a contraction: at infinity it is 0
 _LEAST_NOISE = 1 / (12 * 255**2)  # the variance of rounding to 8 bits
 
@@ -71,9 +76,7 @@ def estimate_laplace(source: UncertaintySource) -> Estimate:
     return Estimate(score, identity, std_at(posterior, *_box_of(config), config.occupancy.contracted))
 
 
-def std_at(
-    posterior: Deformation, lower: Vector, upper: Vector, contracted: bool
-) -> Callable[[Float[ArrayLike, "*batch 3"]], Float[Array, "*batch"]]:
+def std_at(posterior: Deformation, lower: Vector, upper: Vector, contracted: bool) -> Partial:
     """Makes the function x [..., 3] -> [...], the standard deviation of the displacement at positions, in cells.
 
     It is the RMS over the axes, in (0, 1]: 1, that of the prior, where the training rays do not fix the displacement,
@@ -82,32 +85,59 @@ def std_at(
     Args:
         posterior: see `Deformation`.
         lower, upper, contracted: see `deform`.
+
+    Returns:
+        The function. It is a pytree, so that it may be an argument of a jitted function.
     """
-    cells = posterior.std.shape[0] - 1
+    return Partial(_contracted_std if contracted else _boxed_std, posterior.std, jnp.asarray(lower), jnp.asarray(upper))
 
-    def std(x):
-        place, _ = _place_in_box(x, lower, upper, contracted)
-        return jnp.sqrt((interpolate(posterior.std, (place + 2) * (cells / 4)) ** 2).mean(axis=-1))
 
-    return std
+def stored_uncertainty(run: TrainedRun, workdir: str | os.PathLike, step: int, params: Any) -> Partial | None:
+    """Returns `std_at` of a checkpoint whose posterior has been computed before; None where it has not."""
+    path = folder_of(workdir, step) / _FILE
+    posterior = _stored(path, _key_of(fingerprint_of(run, params)))
+    config = run.experiment.config
+    return None if posterior is None else std_at(posterior, *_box_of(config), config.occupancy.contracted)
+
+
+def _contracted_std(std, lower, upper, x):
+    return _std_there(std, _place_in_box(x, lower, upper, True)[0])
+
+
+def _boxed_std(std, lower, upper, x):
+    return _std_there(std, _place_in_box(x, lower, upper, False)[0])
+
+
+def _std_there(std, place):
+    return jnp.sqrt((interpolate(std, (place + 2) * ((std.shape[0] - 1) / 4)) ** 2).mean(axis=-1))
 
 
 def load_deformation(source: UncertaintySource) -> Deformation:
     """Returns the posterior of a checkpoint: from its file, or else computed and written there."""
-    path = source.folder / "laplace.npz"
-    key = fingerprint(source.fingerprint, RESOLUTION, NUM_BATCHES, BATCH_SIZE)
+    path, key = source.folder / _FILE, _key_of(source.fingerprint)
+    posterior = _stored(path, key, source.say)
+    if posterior is None:
+        posterior = fit_deformation(source)
+        source.folder.mkdir(parents=True, exist_ok=True)
+        with atomic_files.partial_file(path, ".tmp.npz") as partial:
+            np.savez(partial, key=key, **{name: np.asarray(value) for name, value in posterior._asdict().items()})
+    return posterior
+
+
+def _key_of(checkpoint):
+    return fingerprint(checkpoint, RESOLUTION, NUM_BATCHES, BATCH_SIZE)
+
+
+def _stored(path, key, say=lambda line: None):
+    """Returns the posterior in a file; None if there is none, it is damaged, or it has another key."""
     if path.is_file():
         try:
             with np.load(path, allow_pickle=False) as stored:
                 if str(stored["key"]) == key:
                     return Deformation(jnp.asarray(stored["std"]), jnp.asarray(stored["noise"]))
         except (ValueError, OSError, KeyError):
-            source.say(f"{path}: is damaged, and computed again")
-    posterior = fit_deformation(source)
-    source.folder.mkdir(parents=True, exist_ok=True)
-    with atomic_files.partial_file(path, ".tmp.npz") as partial:
-        np.savez(partial, key=key, **{name: np.asarray(value) for name, value in posterior._asdict().items()})
-    return posterior
+            say(f"{path}: is damaged, and computed again")
+    return None
 
 
 def fit_deformation(source: UncertaintySource) -> Deformation:
