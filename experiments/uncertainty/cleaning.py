@@ -1,7 +1,7 @@
 """Measures what cleaning does: PSNR near the training views and far from them against `eval.max_uncertainty`.
 
     JAXNERF_SCENES=... python experiments/uncertainty/cleaning.py [--folder=runs/uncertainty] \
-        [--scenes=room20,room70,lego8] [--limits=1,0.95,0.9,0.8,0.7,0.5] [--views=12] \
+        [--scenes=room20,room70,lego8,can] [--limits=1,0.95,0.9,0.8,0.7,0.5] [--views=12] \
         [--page=docs/results/uncertainty.md]
 
 It trains what it needs in --folder, see uncertainty_runs.py, and keeps it there. The views of room20 and room70 are
@@ -27,7 +27,8 @@ from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import cli
 
-SCENES = {"room20": {"val": "near", "test": "far"}, "room70": {"val": "near", "test": "far"}, "lego8": {"test": "far"}}
+_NEAR_AND_FAR = {"val": "near", "test": "far"}
+SCENES = {"room20": _NEAR_AND_FAR, "room70": _NEAR_AND_FAR, "lego8": {"test": "far"}, "can": {"test": "near"}}
 HEADS = ("scene", "limit", "cells removed, %", "PSNR near, dB", "change", "PSNR far, dB", "change", "s per frame")
 
 _FOLDER = flags.DEFINE_string("folder", "runs/uncertainty", "Of the runs, which are kept.")

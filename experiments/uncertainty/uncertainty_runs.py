@@ -20,12 +20,13 @@ def config_of(scene: str, folder: pathlib.Path, *, seed: int = 0) -> Any:
     """Returns the config of a scene.
 
     Args:
-        scene: "still", the embedded one; "lego"; "lego8" with 8 training views; "room20" or "room70", the embedded
-            room with so many training views, whose test views are far from them.
+        scene: "still", the embedded one; "lego"; "lego8" with 8 training views; "can", images of a phone; "room20" or
+            "room70", the embedded room with so many training views, whose test views are far from them.
         folder: of all runs, where the captures of the room are.
         seed: of the run.
     """
-    lego = {"data.dir": str(pathlib.Path(os.environ.get("JAXNERF_SCENES", "."), "lego"))}
+    scenes = pathlib.Path(os.environ.get("JAXNERF_SCENES", "."))
+    lego = {"data.dir": str(scenes / "lego")}
     if scene == "still":
         fields = {"data.size": 100, "data.hold_out": 5, "train.max_seconds": 20.0}
         return common.configuration("quickstart", fields, seed=seed)
@@ -34,7 +35,8 @@ def config_of(scene: str, folder: pathlib.Path, *, seed: int = 0) -> Any:
     if scene == "lego8":
         fields = {"data.view_indices": _LEGO_VIEWS, "train.max_seconds": 40.0}
         return common.configuration("lego_fast", {**lego, **fields}, seed=seed)
-    fields = {"data.dir": str(folder / f"{scene}_capture"), "train.max_seconds": 60.0}
+    dataset = scenes / scene if scene == "can" else folder / f"{scene}_capture"
+    fields = {"data.dir": str(dataset), "train.max_seconds": 60.0}
     return common.configuration("capture", fields, seed=seed)
 
 
