@@ -61,7 +61,8 @@ if _typing.TYPE_CHECKING:
     from jaxnerf.data.dataset import load_dataset
     from jaxnerf.data.ray_batches import draw_batch
     from jaxnerf.evaluation.evaluate import train_and_evaluate, train_many
-    from jaxnerf.evaluation.restore import TrainedRun, load_scene, restore_run
+    from jaxnerf.evaluation.restore import load_scene, restore_run
+    from jaxnerf.evaluation.trained_run import TrainedRun
     from jaxnerf.fields.hash_grid import hash_grid_field
     from jaxnerf.fields.mlp import mlp_field
     from jaxnerf.fields.still_life import still_life
@@ -76,7 +77,7 @@ _ON_DEMAND = {
     "still_life": "jaxnerf.fields.still_life",
     "load_scene": "jaxnerf.evaluation.restore",
     "restore_run": "jaxnerf.evaluation.restore",
-    "TrainedRun": "jaxnerf.evaluation.restore",
+    "TrainedRun": "jaxnerf.evaluation.trained_run",
     "train_and_evaluate": "jaxnerf.evaluation.evaluate",
     "train_many": "jaxnerf.evaluation.evaluate",
 }

@@ -14,8 +14,17 @@ def _option_names():
     return option_names()
 
 
+def _load_saved(path):
+    from jaxnerf.training.workdir import load_config_dict
+
+    return load_config_dict(path)
+
+
 _CONFIG = cli.define_config(
-    "A config that replaces the workdir's: a name, or the path of a file.", option_names=_option_names
+    "A config that replaces the workdir's: a name, or the path of a file. When it is not given, flags such as "
+    "--config.eval.chunk=4096 change the workdir's.",
+    load_saved=_load_saved,
+    option_names=_option_names,
 )
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.")
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
@@ -34,6 +43,12 @@ _BAKE_OCCUPANCY = flags.DEFINE_bool(
     None,
     "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
     "config.eval.bake_occupancy.",
+)
+_MAX_UNCERTAINTY = flags.DEFINE_float(
+    "max_uncertainty",
+    None,
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; 1: off. It overrides "
+    "config.eval.max_uncertainty.",
 )
 _ERROR_BUDGET = flags.DEFINE_float(
     "error_budget",
@@ -70,11 +85,18 @@ def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation import evaluate, external, quality_search
+    from jaxnerf.evaluation.uncertainty.predict import requested
     from jaxnerf.runtime import shards
 
     shard = shards.parse(_SHARD.value)
     _check_flags(is_sharded=shard != shards.WHOLE)
-    overrides = {"bake_occupancy": _BAKE_OCCUPANCY.value, "chunk": _CHUNK.value}
+    errors = {"step": _STEP.value, "members": _MEMBERS.value, "coverage": _COVERAGE.value}
+    predictor = requested(_UNCERTAINTY.value, _WORKDIR.value, **errors)
+    overrides = {
+        "bake_occupancy": _BAKE_OCCUPANCY.value,
+        "chunk": _CHUNK.value,
+        "max_uncertainty": _MAX_UNCERTAINTY.value,
+    }
     options = {
         "config": _CONFIG.value,
         "split": _SPLIT.value,
@@ -91,32 +113,14 @@ def main(argv):
         options |= {"step": _STEP.value, "data_dir": _DATA_DIR.value, "overwrite": _OVERWRITE.value}
         if _ERROR_BUDGET.value is not None:
             options["settings"] |= quality_search.choose(_WORKDIR.value, _ERROR_BUDGET.value, **options)
-        results = evaluate.evaluate(_WORKDIR.value, shard=shard, predictor=_predictor(), **options)
+        results = evaluate.evaluate(_WORKDIR.value, shard=shard, predictor=predictor, **options)
     if results is None:
         print(f"shard {_SHARD.value} is done; views of other shards are missing")
         return
     print(evaluate.summary(results))
 
 
-def _predictor():
-    """Returns the function that makes the Predictor of a run; None without --uncertainty."""
-    if _UNCERTAINTY.value is None:
-        return None
-    import functools
-
-    from jaxnerf.evaluation.uncertainty.predict import make_predictor
-    from jaxnerf.registry import ESTIMATORS
-
-    ESTIMATORS.get(_UNCERTAINTY.value)  # a wrong name is reported before anything is read
-    options = {"members": _MEMBERS.value or (), "coverage": _COVERAGE.value, "step": _STEP.value}
-    return functools.partial(make_predictor, workdir=_WORKDIR.value, name=_UNCERTAINTY.value, **options)
-
-
 def _check_flags(is_sharded):
-    if not 0 < _COVERAGE.value < 1:
-        raise ValueError(f"--coverage is {_COVERAGE.value}, expected a number between 0 and 1, such as 0.9; correct it")
-    if _MEMBERS.value and _UNCERTAINTY.value is None:
-        raise ValueError("--members is given without --uncertainty=ensemble; add that, or drop --members")
     if not (_WORKDIR.value or _PREDICTIONS.value):
         raise ValueError("there is nothing to score; give --workdir=DIR of a run, or --predictions=DIR of images")
     for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):
@@ -128,7 +132,11 @@ def _check_flags(is_sharded):
         "error_budget": _ERROR_BUDGET.value,
         "uncertainty": _UNCERTAINTY.value,
     }
-    of_a_run = of_one_checkpoint | {"chunk": _CHUNK.value, "bake_occupancy": _BAKE_OCCUPANCY.value}
+    of_a_run = of_one_checkpoint | {
+        "chunk": _CHUNK.value,
+        "bake_occupancy": _BAKE_OCCUPANCY.value,
+        "max_uncertainty": _MAX_UNCERTAINTY.value,
+    }
     unused = {
         "predictions": (_PREDICTIONS.value, of_a_run | {"watch": _WATCH.value or None}),
         "watch": (_WATCH.value, of_one_checkpoint | {"overwrite": _OVERWRITE.value or None}),
@@ -159,6 +167,7 @@ def _reference_config():
 
 def run():
     """Runs the program."""
+    cli.use_saved_config(only_for_fields=True)
     cli.run(main, stopped="between two views; the same command continues from there")
 
 

@@ -18,6 +18,12 @@ _KIND = flags.DEFINE_string(
 )
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is exported.")
+_MAX_UNCERTAINTY = flags.DEFINE_float(
+    "max_uncertainty",
+    None,
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; 1: off. It overrides "
+    "config.eval.max_uncertainty.",
+)
 _RESOLUTION = flags.DEFINE_integer("resolution", 256, "mesh: the voxels along the longest side of the box.")
 _BOX = flags.DEFINE_list(
     "box",
@@ -93,6 +99,7 @@ def main(argv):
             _KIND.value,
             step=_STEP.value,
             data_dir=_DATA_DIR.value,
+            max_uncertainty=_MAX_UNCERTAINTY.value,
             settings=settings,
             name=_NAME.value,
             overwrite=_OVERWRITE.value,

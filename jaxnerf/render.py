@@ -22,6 +22,12 @@ _BAKE_OCCUPANCY = flags.DEFINE_bool(
     "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
     "config.eval.bake_occupancy.",
 )
+_MAX_UNCERTAINTY = flags.DEFINE_float(
+    "max_uncertainty",
+    None,
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; 1: off. It overrides "
+    "config.eval.max_uncertainty.",
+)
 _PATH = flags.DEFINE_string(
     "path",
     None,
@@ -58,6 +64,16 @@ _VIDEO = flags.DEFINE_string(
 )
 _DEPTH = flags.DEFINE_bool("depth", False, "Whether to make a video of the depth, too.")
 _RGBA = flags.DEFINE_bool("rgba", False, "Whether to write rgba/0000.png, too: straight alpha, no background.")
+_UNCERTAINTY = flags.DEFINE_string(
+    "uncertainty",
+    None,
+    "An estimator of the error of each pixel: laplace, of one run, ensemble, of several, or a registered one. The "
+    "program writes uncertainty/0000.tiff, in units of colour, an image of it, and a video.",
+)
+_MEMBERS = flags.DEFINE_list("members", None, "ensemble: workdirs of the other runs, which differ in seed.")
+_COVERAGE = flags.DEFINE_float(
+    "coverage", 0.9, "The fraction of true errors that the intervals of a calibration are to hold, see jaxnerf-eval."
+)
 _NAME = flags.DEFINE_string("name", None, "The name of the folder and the video. It overrides the path's.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to delete the frames of an earlier call first.")
 _SHARD = flags.DEFINE_string(
@@ -72,9 +88,16 @@ def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation.paths.render_path import render_path
+    from jaxnerf.evaluation.uncertainty.predict import requested
     from jaxnerf.runtime import shards
 
-    overrides = {"bake_occupancy": _BAKE_OCCUPANCY.value, "chunk": _CHUNK.value}
+    errors = {"step": _STEP.value, "members": _MEMBERS.value, "coverage": _COVERAGE.value}
+
+    overrides = {
+        "bake_occupancy": _BAKE_OCCUPANCY.value,
+        "chunk": _CHUNK.value,
+        "max_uncertainty": _MAX_UNCERTAINTY.value,
+    }
     written = render_path(
         _WORKDIR.value,
         path=_PATH.value,
@@ -89,6 +112,7 @@ def main(argv):
         name=_NAME.value,
         rgba=_RGBA.value,
         depth=_DEPTH.value,
+        predictor=requested(_UNCERTAINTY.value, _WORKDIR.value, **errors),
         kind=_VIDEO.value,
         overwrite=_OVERWRITE.value,
         shard=shards.parse(_SHARD.value),

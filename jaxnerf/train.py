@@ -14,12 +14,9 @@ from jaxnerf.runtime import cli
 
 
 def _load_saved(path):
-    from jaxnerf.training.config import to_config_dict
-    from jaxnerf.training.workdir import load_config
+    from jaxnerf.training.workdir import load_config_dict
 
-    if os.path.basename(path) != "config.json":
-        raise ValueError(f"--config={path} is not a run's config.json; give that, a name, or a Python file")
-    return to_config_dict(load_config(os.path.dirname(path)))
+    return load_config_dict(path)
 
 
 def _describe_options():

@@ -10,6 +10,12 @@ from jaxnerf.runtime import cli
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is shown.")
+_MAX_UNCERTAINTY = flags.DEFINE_float(
+    "max_uncertainty",
+    None,
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; 1: off. It overrides "
+    "config.eval.max_uncertainty.",
+)
 _HOST = flags.DEFINE_string(
     "host", "127.0.0.1", "The address to listen on. 0.0.0.0 lets other machines connect, without a password."
 )
@@ -21,7 +27,14 @@ def main(argv):
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.viewer.live import view_run
 
-    view_run(_WORKDIR.value, data_dir=_DATA_DIR.value, step=_STEP.value, host=_HOST.value, port=_PORT.value)
+    view_run(
+        _WORKDIR.value,
+        data_dir=_DATA_DIR.value,
+        step=_STEP.value,
+        max_uncertainty=_MAX_UNCERTAINTY.value,
+        host=_HOST.value,
+        port=_PORT.value,
+    )
 
 
 def run():

@@ -93,7 +93,7 @@ def solid_run():
         return Rendering(rgb=rgb, opacity=hit.astype(jnp.float32), depth=depth, disparity=zero, **options)
 
     model = Model(init=None, render=None, view=view, scene=None, samples_per_ray=1.0)
-    experiment = SimpleNamespace(model=model, config=RunConfig(), cameras=None)
+    experiment = SimpleNamespace(model=model, config=RunConfig(), cameras=None, background=(1.0, 1.0, 1.0))
     run = SimpleNamespace(experiment=experiment, model_with=lambda settings: model, steps=lambda: [20])
     return run, solid_views()
 

@@ -57,10 +57,12 @@ def mark_finished(
         partial.write_text(json.dumps(content))
 
 
-def view_files(folder: pathlib.Path, index: int, *, count: int) -> list[pathlib.Path]:
-    """Returns the files of a finished view, one of `count`: its images, and its row."""
-    sheet = [_contact_sheet_file(folder, index)] if index in _on_contact_sheet(count) else []
-    return [*output_images.view_files(folder, f"{index:03d}"), *sheet, _row_file(folder, index)]
+def view_files(folder: pathlib.Path, index: int, *, count: int, errors: bool) -> list[pathlib.Path]:
+    """Returns the files of a finished view, one of `count`: its images, with `errors` predicted ones, and its row."""
+    files = output_images.view_files(folder, f"{index:03d}")
+    files += [output_images.error_file(folder, f"{index:03d}")] if errors else []
+    files += [_contact_sheet_file(folder, index)] if index in _on_contact_sheet(count) else []
+    return [*files, _row_file(folder, index)]
 
 
 def is_finished(content: Any) -> bool:
@@ -107,7 +109,8 @@ def merge(
         OSError: if another process does the same and was faster.
     """
     count = len(views.names)
-    if not all(file.is_file() for index in range(count) for file in view_files(partial, index, count=count)):
+    options = {"count": count, "errors": predictor is not None}
+    if not all(file.is_file() for index in range(count) for file in view_files(partial, index, **options)):
         return None
     finished = [atomic_files.read_json(_row_file(partial, index), _AGAIN) for index in range(count)]
     results = _results(run, workdir, views, variables, finished, provenance)

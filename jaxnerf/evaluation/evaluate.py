@@ -20,7 +20,7 @@ import jax
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation import aggregate, output_images
-from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
+from jaxnerf.evaluation.metrics import image_metrics, object_mask, pixel_mask
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
 from jaxnerf.runtime import atomic_files, processes, shards
@@ -244,6 +244,8 @@ def summary(results: dict[str, Any]) -> str:
     paired = "" if results.get("paired_by", "name") == "name" else f", paired by {results['paired_by']}"
     found = results.get("uncertainty", {})
     errors = f"; AUSE {found['ause_rmse']:.3f} (RMSE), {found['ause_mae']:.3f} (MAE)" if found else ""
+    if "ause_rmse_object" in found:
+        errors += f", on the object {found['ause_rmse_object']:.3f}, {found['ause_mae_object']:.3f}"
     if "coverage" in found:
         errors += (
             f", {100 * found['coverage']:.1f} % of errors within intervals for {100 * found['target_coverage']:g} %"
@@ -255,7 +257,7 @@ def _score_views(run, render, views, folder, shard, predictor):
     """Renders and scores those views of a shard that are not finished."""
     count = len(views.names)
     frames = shards.indices_of(range(count), shard)
-    files = [aggregate.view_files(folder, index, count=count) for index in frames]
+    files = [aggregate.view_files(folder, index, count=count, errors=predictor is not None) for index in frames]
     sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
     readable = output_images.readable(files, sizes, is_valid=aggregate.is_finished)
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
@@ -271,7 +273,8 @@ def _score_views(run, render, views, folder, shard, predictor):
         row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
         depth = run.experiment.world_depth(views, index, pixels, image.depth)
         if predictor is not None:
-            error, figures = predictor.scored(rays, image.rgb, truth, pixel_mask(views, index))
+            masks = pixel_mask(views, index), object_mask(views, index)
+            error, figures = predictor.scored(rays, image.rgb, truth, *masks)
             output_images.write_error(folder, f"{index:03d}", error)
             row |= figures
         output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)

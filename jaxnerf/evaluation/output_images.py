@@ -17,7 +17,8 @@ from jaxnerf.runtime import atomic_files
 
 CONTACT_SHEET_ROWS = 4
 _VIEW_FILES = {"color": "png", "gt-color": "png", "depth": "tiff"}
-_CHANNELS = {"depth": (), "rgba": (4,)}  # of the images in a folder of that name; all others have (3,)
+_CHANNELS = {"depth": (), "uncertainty": (), "rgba": (4,)}  # of images in a folder of that name; all others have (3,)
+_FLOATS = ("depth", "uncertainty")  # folders whose images are float32; all others are uint8
 
 
 def to_8_bits(image: ArrayLike) -> np.ndarray:
@@ -34,8 +35,14 @@ def write_view(folder: pathlib.Path, name: str, rgb: ArrayLike, truth: ArrayLike
 
 def write_error(folder: pathlib.Path, name: str, error: ArrayLike) -> None:
     """Writes uncertainty/NAME.tiff, the predicted error of each pixel in units of colour, float32."""
-    (pathlib.Path(folder) / "uncertainty").mkdir(exist_ok=True)
-    write_image(pathlib.Path(folder) / "uncertainty" / f"{name}.tiff", np.asarray(error, np.float32))
+    path = error_file(folder, name)
+    path.parent.mkdir(exist_ok=True)
+    write_image(path, np.asarray(error, np.float32))
+
+
+def error_file(folder: pathlib.Path, name: str) -> pathlib.Path:
+    """Returns the path that `write_error` writes."""
+    return pathlib.Path(folder) / "uncertainty" / f"{name}.tiff"
 
 
 def view_files(folder: pathlib.Path, name: str) -> list[pathlib.Path]:
@@ -65,7 +72,7 @@ def readable(
                 else:
                     pixels, kind = read_stored(file), file.parent.name
                     shape = (*(pixels.shape[:2] if kind == "contact_sheet" else size), *_CHANNELS.get(kind, (3,)))
-                    valid = pixels.shape == shape and pixels.dtype == (np.float32 if kind == "depth" else np.uint8)
+                    valid = pixels.shape == shape and pixels.dtype == (np.float32 if kind in _FLOATS else np.uint8)
                 if not valid:
                     raise ValueError("unexpected content")
             except (ValueError, OSError):
@@ -105,6 +112,12 @@ def depth_range(depths: Iterable[np.ndarray], fraction: float = 0.98) -> tuple[A
     samples = np.concatenate([np.ravel(depth)[::17] for depth in depths])  # enough to estimate the range
     samples = samples[np.isfinite(samples) & (samples > 0)]
     return tuple(np.quantile(samples, [0.5 - fraction / 2, 0.5 + fraction / 2])) if samples.size else (1.0, 2.0)
+
+
+def largest_error(errors: Iterable[np.ndarray], fraction: float = 0.99) -> float:
+    """Returns what a fraction of all predicted errors stay below; 0 without any."""
+    samples = np.concatenate([np.ravel(error)[::17] for error in errors])
+    return float(np.quantile(samples, fraction)) if samples.size else 0.0
 
 
 def depth_image(depth: np.ndarray, near: ArrayLike, far: ArrayLike) -> np.ndarray:

@@ -75,7 +75,7 @@ class Previews:
 
     @functools.cached_property
     def _run(self):
-        return restore_run(self._workdir, settings={"bake_occupancy": False})
+        return restore_run(self._workdir, settings={"bake_occupancy": False, "max_uncertainty": 1.0})
 
     @functools.cached_property
     def _held_out(self):

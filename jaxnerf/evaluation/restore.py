@@ -3,7 +3,7 @@
 import functools
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -11,7 +11,8 @@ from jaxnerf.core.types import Rays, Rendering, SceneFn
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
-from jaxnerf.models.base import Model
+from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.evaluation.uncertainty.cleaning import cleaned
 from jaxnerf.options import Changes, changing, is_auto, replaced
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import auto_config, build
@@ -20,32 +21,6 @@ from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, ide
 from jaxnerf.training.optimizer import averaged_params
 from jaxnerf.training.state import PROGRESS, TrainState, create_state
 from jaxnerf.training.workdir import load_config
-
-
-class TrainedRun(NamedTuple):
-    """A run's experiment and the functions that read and render its checkpoints.
-
-    Attributes:
-        experiment: what its config describes, see `build.Experiment`.
-        steps: () -> the steps of the finished checkpoints, ascending.
-        variables: step -> (params, grid) of that checkpoint; the grid is None where the model has none.
-        render: (variables, Rays [...]) -> Rendering [...] without weights, jitted.
-        identity: text that is equal for configs that render alike, see `config.identity`.
-        render_image: (variables, Rays [...], chunk=None, median_depth=False) -> Rendering [...] as `render`, in
-            chunks that fit into memory.
-        variables_of: (`image_params`, grid) of a state of training -> (params, grid) as `variables` returns them.
-        model_with: (settings of the section `eval`, by name; wrap=None) -> the Model that renders with these in place
-            of the run's own, and whose field is wrapped as `build_model` does. It takes the same variables.
-    """
-
-    experiment: build.Experiment
-    steps: Callable[[], list[int]]
-    variables: Callable[[int], tuple]
-    render: Callable[[tuple, Rays], Rendering]
-    identity: str
-    render_image: Callable[..., Rendering]
-    variables_of: Callable[[Any, Any], tuple]
-    model_with: Callable[..., Model]
 
 
 def restore_run(
@@ -72,12 +47,14 @@ def restore_run(
     return _restore(workdir, config, data_dir, settings or {}, crop=True)
 
 
-def restore_with_grid(workdir: str | os.PathLike, *, data_dir: str | None = None) -> TrainedRun:
+def restore_with_grid(
+    workdir: str | os.PathLike, *, data_dir: str | None = None, settings: dict[str, Any] | None = None
+) -> TrainedRun:
     """Restores the run in a workdir so that every model renders through an occupancy grid, and all have one shape.
 
     A model that was trained without a grid renders as with `eval.bake_occupancy`; see `restore_run`.
     """
-    return _restore(workdir, None, data_dir, {"bake_occupancy": True}, crop=False)
+    return _restore(workdir, None, data_dir, {**(settings or {}), "bake_occupancy": True}, crop=False)
 
 
 def _restore(workdir, config, data_dir, settings, *, crop):
@@ -134,7 +111,7 @@ def _restore(workdir, config, data_dir, settings, *, crop):
     def render_image(variables, rays, chunk=None, median_depth=False):
         return renderer(**{"median_depth": True} if median_depth else {})(variables, rays, chunk)
 
-    return TrainedRun(
+    run = TrainedRun(
         experiment,
         checkpoints.steps,
         variables,
@@ -144,6 +121,7 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         variables_of,
         model_with,
     )
+    return cleaned(run, workdir)
 
 
 def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:

@@ -86,6 +86,7 @@ def export_run(
     *,
     step: int | None = None,
     data_dir: str | None = None,
+    max_uncertainty: float | None = None,
     settings: ExportSettings | None = None,
     name: str | None = None,
     overwrite: bool = False,
@@ -98,6 +99,7 @@ def export_run(
         kind: the name of an exporter.
         step: of the checkpoint; the newest when None.
         data_dir: see `restore_run`.
+        max_uncertainty: in place of the config's `eval.max_uncertainty`, unless it is None.
         settings: its defaults when None.
         name: of the folder; KIND-STEP when None.
         overwrite: whether an existing folder of that name is replaced.
@@ -114,14 +116,15 @@ def export_run(
     _check_settings(settings)
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
-    run = restore_run(workdir, data_dir=data_dir)
+    rendered: dict[str, Any] = {} if max_uncertainty is None else {"max_uncertainty": max_uncertainty}
+    run = restore_run(workdir, data_dir=data_dir, settings=rendered)
     step = newest_step(run, workdir, step)
     target = pathlib.Path(workdir) / "exports" / (name or f"{kind}-{step}")
     atomic_files.check_tree(target.parent)
     if target.exists() and not overwrite:
         raise ValueError(f"{target}: exists already; give --overwrite to replace it, or another --name")
     if run.experiment.model.grid_schedule is None:  # whole rays through a dense network would take hours
-        run = restore_run(workdir, data_dir=data_dir, settings={"bake_occupancy": True})
+        run = restore_run(workdir, data_dir=data_dir, settings={**rendered, "bake_occupancy": True})
     variables = run.variables(step)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     target.parent.mkdir(exist_ok=True)

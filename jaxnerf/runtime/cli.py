@@ -125,9 +125,15 @@ def define_config(
     return config
 
 
-def use_saved_config() -> None:
-    """Adds --config=<workdir>/config.json to the command line if it has --workdir and no --config."""
+def use_saved_config(*, only_for_fields: bool = False) -> None:
+    """Adds --config=<workdir>/config.json to the command line if it has --workdir and no --config.
+
+    Args:
+        only_for_fields: whether to do so only if the command line sets a field, by --config.SECTION.FIELD=VALUE.
+    """
     path = pathlib.Path(_given_flag("workdir")) / "config.json"
+    if only_for_fields and not any(re.match(r"--?(no)?config\.", argument) for argument in sys.argv[1:]):
+        return
     if not _given_flag("config") and _given_flag("workdir") and path.exists():
         sys.argv.insert(1, f"--config={path}")  # before the flags that set its fields
 

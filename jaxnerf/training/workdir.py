@@ -10,11 +10,13 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from ml_collections import ConfigDict
+
 from jaxnerf.options import Changes, values_of
 from jaxnerf.registry import LOSSES
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training.camera_parameters import CameraOptions
-from jaxnerf.training.config import RunConfig, changed, declared, flatten, read_config
+from jaxnerf.training.config import RunConfig, changed, declared, flatten, read_config, to_config_dict
 
 try:
     import fcntl
@@ -109,6 +111,18 @@ def load_config(workdir: str | os.PathLike, **values: Any) -> RunConfig:
         where = pathlib.Path(workdir) / "config.json"
         raise ValueError(f"{where}: {str(error).removeprefix('--config.')}, or use the version that wrote it") from None
     return changed(config, flatten(values)) if values else config
+
+
+def load_config_dict(path: str | os.PathLike) -> ConfigDict:
+    """Reads the config.json of a run as a ConfigDict, whose fields flags may set.
+
+    Raises:
+        ValueError: if the file has another name, or is none.
+    """
+    path = pathlib.Path(path)
+    if path.name != "config.json":
+        raise ValueError(f"--config={path} is not a run's config.json; give that, a name, or a Python file")
+    return to_config_dict(load_config(path.parent))
 
 
 def _content(workdir):

@@ -23,7 +23,8 @@ from jaxnerf.data.ray_batches import with_needs
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.restore import TrainedRun
 
-MODES = ("colour", "depth", "opacity", "normals")
+UNCERTAINTY = "uncertainty"
+MODES = ("colour", "depth", "opacity", "normals", UNCERTAINTY)
 MAX_SIDE = 4096  # px
 _CHUNK = {"cpu": 4096}  # rays; more take longer to abandon, fewer use the device worse
 _CHUNK_ELSEWHERE = 2**15
@@ -64,12 +65,14 @@ class SceneState(NamedTuple):
         params: of the model.
         grid: OccupancyGrid; None where the model has none.
         box: [2, 3] corners of the box that holds all matter, world units; in NDC where the rays are.
+        uncertainty_at: see `Estimate`, a pytree; None where the run has no estimate.
     """
 
     step: int
     params: Any
     grid: Any
     box: np.ndarray
+    uncertainty_at: Any = None
 
 
 class Frame(NamedTuple):
@@ -80,12 +83,14 @@ class Frame(NamedTuple):
         rgb: [H, W, 3] in [0, 1].
         opacity: [H, W].
         distance: [H, W] along the ray to what is seen, in the run's world units; infinite where nothing is.
+        uncertain: whether rgb is, in grey, the mean uncertainty of what is seen, 0 where nothing is.
     """
 
     camera: FrameCamera
     rgb: Float[np.ndarray, "H W 3"]
     opacity: Float[np.ndarray, "H W"]
     distance: Float[np.ndarray, "H W"]
+    uncertain: bool = False
 
 
 class FrameRenderer:
@@ -105,6 +110,8 @@ class FrameRenderer:
             "early_stop_eps": max(options.early_stop_eps, _FAST_STOP),
         }
         models = {False: run.model_with({}), True: run.model_with(fast)}
+        self._uncertain = functools.cache(lambda quick: run.model_with(fast if quick else {}, _with_uncertainty))
+        self._background = np.float32([run.experiment.background or (0.0, 0.0, 0.0)])
         self._baked, self._cull = models[False].grid_schedule is None, models[False].cull
         self._chunk = chunk or _CHUNK.get(jax.default_backend(), _CHUNK_ELSEWHERE)
         self._ndc, self._offset = run.experiment.config.data.ndc, run.experiment.config.data.pixel_offset
@@ -116,21 +123,23 @@ class FrameRenderer:
         self._lens = Camera(to_world=first.to_world, focal=first.focal, center=first.center, height=height, width=width)
         self._may_hit = jax.jit(self._culled)
         self._parts = {fast: jax.jit(functools.partial(self._planes, model.view)) for fast, model in models.items()}
+        self._uncertain_parts = {fast: jax.jit(functools.partial(self._grey_planes, fast)) for fast in models}
 
     @property
     def num_compiled(self) -> int:
-        """How many programs have been compiled: at most three."""
-        return sum(function._cache_size() for function in (self._may_hit, *self._parts.values()))
+        """How many programs have been compiled: at most three, and two more once uncertainty is shown."""
+        functions = (self._may_hit, *self._parts.values(), *self._uncertain_parts.values())
+        return sum(function._cache_size() for function in functions)
 
-    def scene_state(self, step: int, variables: tuple) -> SceneState:
-        """Returns the SceneState of variables (params, grid) of a step."""
+    def scene_state(self, step: int, variables: tuple, uncertainty_at: Any = None) -> SceneState:
+        """Returns the SceneState of variables (params, grid) of a step, and of its estimate, see `SceneState`."""
         # Where an array lies is part of what is compiled.
-        params, grid = jax.device_put(variables, jax.local_devices()[0])
+        (params, grid), uncertainty_at = jax.device_put((variables, uncertainty_at), jax.local_devices()[0])
         box = np.float32([[-np.inf] * 3, [np.inf] * 3])
         if grid is not None and not grid.contracted:
             tight = crop_grid(grid) if self._baked else grid
             box = np.stack([np.asarray(tight.lower), np.asarray(tight.upper)])
-        return SceneState(step, params, grid, box)
+        return SceneState(step, params, grid, box, uncertainty_at)
 
     def compile(self, state: SceneState) -> None:
         """Compiles both qualities, so that the first frame does not wait for it."""
@@ -147,6 +156,7 @@ class FrameRenderer:
         *,
         fast: bool = False,
         crop: np.ndarray | None = None,
+        uncertain: bool = False,
         abandoned: Callable[[], bool] = lambda: False,
     ) -> Frame | None:
         """Renders a frame.
@@ -160,6 +170,7 @@ class FrameRenderer:
             camera: FrameCamera.
             fast: whether to render with fewer samples.
             crop: [2, 3] corners in the run's world; what is outside is not shown.
+            uncertain: whether uncertainty takes the place of colour, where the state has an estimate.
             abandoned: called between chunks; where it returns True, the frame is not finished.
 
         Returns:
@@ -171,6 +182,9 @@ class FrameRenderer:
         if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
             raise ValueError(f"a frame has {camera.width} x {camera.height} px, expected sides of 1 to {MAX_SIDE}")
         count = camera.width * camera.height
+        uncertain = uncertain and state.uncertainty_at is not None
+        parts = self._uncertain_parts if uncertain else self._parts
+        params = (state.params, state.uncertainty_at) if uncertain else state.params
         arrays = self._arrays(camera, state, crop)
         hits, pixels = [], np.arange(count, dtype=np.int32)
         for start in range(0, count, self._chunk):
@@ -183,12 +197,12 @@ class FrameRenderer:
             if abandoned():
                 return None
             ids = hit[start : start + self._chunk]
-            part = np.asarray(self._parts[fast](state.params, state.grid, arrays, self._padded(ids)))
+            part = np.asarray(parts[fast](params, state.grid, arrays, self._padded(ids)))
             if planes is None:  # the row after the chunk's is that of a ray that hits nothing
                 planes = np.repeat(part[-1:], count, axis=0)
             planes[ids] = part[: len(ids)]
         planes = planes.reshape(camera.height, camera.width, 5)
-        return Frame(camera, planes[..., :3], planes[..., 3], planes[..., 4])
+        return Frame(camera, planes[..., :3], planes[..., 3], planes[..., 4], uncertain)
 
     def _padded(self, ids):
         """Returns ids [chunk + 1]; -1, a ray of length 0, where there are none."""
@@ -242,6 +256,27 @@ class FrameRenderer:
         distance = jnp.where(seen, t * norm(world.directions), jnp.inf)
         return jnp.concatenate([image.rgb, image.opacity[:, None], distance[:, None]], axis=-1)
 
+    def _grey_planes(self, fast, params, grid, arrays, ids):
+        """Returns _planes with the mean uncertainty of what is seen in place of colour."""
+        params, uncertainty_at = params
+        params = {**params, "fine": (params["fine"], uncertainty_at)}
+        planes = self._planes(self._uncertain(fast).view, params, grid, arrays, ids)
+        opacity = planes[:, 3:4]
+        mean = (planes[:, :3] - (1 - opacity) * self._background) / jnp.maximum(opacity, _SEEN)
+        return planes.at[:, :3].set(jnp.where(opacity >= _SEEN, mean, 0))
+
+
+def _with_uncertainty(field):
+    """Returns a field whose colour is an uncertainty in grey; its params are a pair, with the function of positions."""
+
+    @functools.wraps(field.apply)
+    def apply(params, x, viewdirs, **inputs):
+        params, uncertainty_at = params
+        density, rgb = field.apply(params, x, viewdirs, **inputs)
+        return density, jnp.broadcast_to(uncertainty_at(x)[..., None], rgb.shape)
+
+    return field._replace(apply=apply)
+
 
 def _t_in_ndc(rays, t):
     """Returns t of the NDC rays at the points t of world rays, the inverse of `ndc_to_t`; the near plane is at 1."""
@@ -249,15 +284,16 @@ def _t_in_ndc(rays, t):
 
 
 def frame_image(frame: Frame, mode: str) -> UInt8[np.ndarray, "H W 3"]:
-    """Returns an image of a frame: its colour, its depth (near is white), its opacity, or its normals.
+    """Returns an image of a frame: its colour, depth (near is white), opacity, normals or uncertainty (1 is white).
 
-    Normals are those of the surface through the points that neighbouring pixels see, in the world's axes: red, green
-    and blue are x, y and z from -1 to 1. What is not opaque is black.
+    Only a frame that was rendered with uncertainty has it; others show their colour. Normals are those of the surface
+    through the points that neighbouring pixels see, in the world's axes: red, green and blue are x, y and z from -1 to
+    1. What is not opaque is black.
 
     Raises:
         ValueError: on another mode.
     """
-    if mode == "colour":
+    if mode in ("colour", UNCERTAINTY):
         return output_images.to_8_bits(frame.rgb)
     if mode == "normals":
         return output_images.to_8_bits(np.where(np.isfinite(frame.distance)[..., None], (_normals(frame) + 1) / 2, 0))

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_with_grid
+from jaxnerf.evaluation.uncertainty.laplace import stored_uncertainty
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import metric_log
 from jaxnerf.training.state import TrainState
@@ -27,6 +28,7 @@ def view_run(
     *,
     data_dir: str | None = None,
     step: int | None = None,
+    max_uncertainty: float | None = None,
     host: str = HOST,
     port: int = PORT,
     ended: threading.Event | None = None,
@@ -37,6 +39,7 @@ def view_run(
         workdir: the folder that training wrote or writes.
         data_dir: see `restore_run`.
         step: of the only checkpoint to show; None: always the newest.
+        max_uncertainty: in place of the config's `eval.max_uncertainty`, unless it is None.
         host, port: see `Viewer.listen`.
         ended: set by another thread to stop.
 
@@ -45,12 +48,18 @@ def view_run(
     """
     import_viser()
     check_port(host, port)
-    run = restore_with_grid(workdir, data_dir=data_dir)
+    settings = {} if max_uncertainty is None else {"max_uncertainty": max_uncertainty}
+    run = restore_with_grid(workdir, data_dir=data_dir, settings=settings)
     first = newest_step(run, workdir, step)
     variables = run.variables(first)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     viewer = Viewer(workdir, run, views, data_dir=data_dir)
-    viewer.show(first, variables, score_of(workdir, first))  # compiles before anyone can connect
+
+    def show(step, variables):
+        uncertainty_at = stored_uncertainty(run, workdir, step, variables[0])
+        viewer.show(step, variables, score_of(workdir, step), uncertainty_at=uncertainty_at)
+
+    show(first, variables)  # compiles before anyone can connect
     port = viewer.listen(host, port)
     print(f"viewer        {address(host, port)} shows {workdir}, step {first}; Ctrl-C ends it", file=sys.stderr)
     failed = None
@@ -67,7 +76,7 @@ def view_run(
                     failed = newest[0]
                     print(f"viewer: {error}", file=sys.stderr)
                 continue
-            viewer.show(newest[0], variables, score_of(workdir, newest[0]))
+            show(newest[0], variables)
     finally:
         viewer.close()
 

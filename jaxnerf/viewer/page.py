@@ -15,7 +15,7 @@ from jaxnerf.data.geometry.world import direction_in_run
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import newest_step
-from jaxnerf.viewer.frame_renderer import MAX_SIDE, MODES, FrameCamera, frame_image
+from jaxnerf.viewer.frame_renderer import MAX_SIDE, MODES, UNCERTAINTY, FrameCamera, frame_image
 from jaxnerf.viewer.keyframes import cameras_through, load_keyframes, save_path
 from jaxnerf.viewer.render_loop import Delivery, Request
 
@@ -55,7 +55,7 @@ class Page:
         """Adds the controls, sets the first view and requests the first frame."""
         gui, wide = self._client.gui, self._width_over_height(1.0) >= _NARROW
         with gui.add_folder("Rendering", expand_by_default=wide):
-            self._mode = self._add(gui.add_dropdown("Show", MODES), lambda: self._redraw())
+            self._mode = self._add(gui.add_dropdown("Show", self._modes()), self._change_mode)
             self._resolution = self._add(gui.add_dropdown("Resolution (px)", RESOLUTIONS, initial_value="800"))
             self._crop = self._add(gui.add_checkbox("Crop", False))
             lower, upper = self._crop_range()
@@ -174,7 +174,8 @@ class Page:
         except (TypeError, ValueError):
             return
         if camera is not None and not self._closed.is_set():
-            self._viewer.loop.submit(self._client.client_id, Request(camera, crop))
+            uncertain = self._mode.value == UNCERTAINTY
+            self._viewer.loop.submit(self._client.client_id, Request(camera, crop, uncertain))
 
     def _crop_box(self):
         if self._crop.value is not True:
@@ -183,6 +184,20 @@ class Page:
         if any(len(pair) != 2 for pair in ends):
             raise ValueError("a crop has not two ends")
         return np.float32(ends).T
+
+    def _modes(self):
+        """Returns what the page can show: uncertainty where the run has the estimate."""
+        state = self._viewer.state
+        return MODES if state is not None and state.uncertainty_at is not None else MODES[: MODES.index(UNCERTAINTY)]
+
+    def _change_mode(self):
+        """Shows the last frame in the new mode, or requests another where it does not hold what the mode shows."""
+        delivery, mode = self._delivery, self._mode.value
+        shown = None if delivery is None else UNCERTAINTY if delivery.frame.uncertain else "colour"
+        if mode in ("colour", UNCERTAINTY) and mode != shown:
+            self._request()
+        else:
+            self._redraw()
 
     def _redraw(self):
         """Sends the last frame as the selected picture."""
@@ -391,7 +406,9 @@ class Page:
 
         def render():
             try:
+                limit = self._viewer.run.experiment.config.eval.max_uncertainty
                 options = {"step": step, "data_dir": self._viewer.data_dir, "overwrite": overwrite}
+                options["settings"] = {"max_uncertainty": limit}
                 written = render_path(self._viewer.workdir, path=str(path), **options)
                 self._path_status.content = f"video: {written[-1]}"
             finally:

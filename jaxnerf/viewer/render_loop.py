@@ -25,10 +25,12 @@ class Request(NamedTuple):
     Attributes:
         camera: FrameCamera of the full size.
         crop: [2, 3] corners in the run's world, or None.
+        uncertain: whether to show uncertainty in place of colour.
     """
 
     camera: FrameCamera
     crop: np.ndarray | None = None
+    uncertain: bool = False
 
 
 class Delivery(NamedTuple):
@@ -175,7 +177,8 @@ class RenderLoop:
             large = camera.width * camera.height > 2 * _MIN_PIXELS
             return large and time.perf_counter() - started > _PATIENCE / FRAMES_PER_SECOND
 
-        frame = self._renderer.render(state, camera, fast=not final, crop=request.crop, abandoned=abandoned)
+        options = {"crop": request.crop, "uncertain": request.uncertain, "abandoned": abandoned}
+        frame = self._renderer.render(state, camera, fast=not final, **options)
         now = time.perf_counter()
         with self._lock:
             client.served = now

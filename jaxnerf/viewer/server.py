@@ -10,6 +10,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
+from typing import Any
 from urllib.parse import urlsplit
 
 from jaxnerf.core.views import Views
@@ -97,15 +98,16 @@ class Viewer:
         """The number of pages that are open."""
         return len(self._pages)
 
-    def show(self, step: int, variables: tuple, score: str = "") -> None:
+    def show(self, step: int, variables: tuple, score: str = "", *, uncertainty_at: Any = None) -> None:
         """Replaces the scene.
 
         Args:
             step: of training.
             variables: (params, grid), see `TrainedRun.variables`.
             score: what is known of its quality, for the page.
+            uncertainty_at: see `SceneState`.
         """
-        state = self.renderer.scene_state(step, variables)
+        state = self.renderer.scene_state(step, variables, uncertainty_at)
         if self.state is None:
             self._each(lambda page: page.report("compiling the renderer"))
             self.renderer.compile(state)

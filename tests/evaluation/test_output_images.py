@@ -49,12 +49,13 @@ def test_a_contact_sheet_of_infinite_depths_is_black(tmp_path):
 def test_images_of_another_size_or_kind_are_damaged(tmp_path, capsys):
     """They would be shown as frames, or end the evaluation each time without a name."""
     good = {"color": np.zeros((4, 6, 3), np.uint8), "depth": np.zeros((4, 6), np.float32)}
+    good["uncertainty"] = good["depth"]
     good |= {"rgba": np.zeros((4, 6, 4), np.uint8), "contact_sheet": np.zeros((3, 9, 3), np.uint8)}
     wrong = {name: [pixels[:3], pixels[..., 0], np.zeros((4, 6), np.uint8)] for name, pixels in good.items()}
-    wrong["depth"] = [good["depth"][:3], good["color"]]
+    wrong["depth"] = wrong["uncertainty"] = [good["depth"][:3], good["color"]]
     wrong["contact_sheet"] = [good["rgba"], good["depth"]]
     for kind, pixels in good.items():
-        suffix = "tiff" if kind == "depth" else "png"
+        suffix = "tiff" if kind in ("depth", "uncertainty") else "png"
         files = [tmp_path / kind / f"{index}.{suffix}" for index in range(len(wrong[kind]) + 1)]
         (tmp_path / kind).mkdir()
         for file, content in zip(files, [pixels, *wrong[kind]], strict=True):

@@ -4,6 +4,7 @@ import importlib.util
 import json
 import os
 import shutil
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -55,6 +56,28 @@ def test_frames_videos_and_the_path_are_written_where_the_docstring_says(rendere
     ]
     for file in videos:
         assert iio.imread(file, index=...).shape[-3:] == (17, 25, 3)
+
+
+def test_predicted_errors_are_written_with_one_range_for_the_path(run, path_file):
+    """A frame without its error is rendered again, and other errors are those of another provenance."""
+
+    def predictor(restored):
+        return SimpleNamespace(identity="fixed", error=lambda rays: 0.1 * np.abs(np.asarray(rays.viewdirs)[..., 0]))
+
+    options = {"path": str(path_file), "name": "errors", "kind": "gif", "settings": {"chunk": 100}}
+    folder, *videos = render_path(run, predictor=predictor, **options)
+    assert [file.name for file in videos] == ["errors-20.gif", "errors-20-uncertainty.gif"]
+    errors, shown = (
+        [iio.imread(folder / "uncertainty" / f"{i}.{end}") for i in ("0000", "0001")] for end in ("tiff", "png")
+    )
+    assert errors[0].dtype == np.float32 and errors[0].shape == (17, 25) and np.ptp(errors[0]) > 0.01
+    largest = np.quantile(np.concatenate([np.ravel(error)[::17] for error in errors]), 0.99)
+    np.testing.assert_allclose(shown[1] / 255, np.minimum(errors[1] / largest, 1), atol=0.003)
+    (folder / "uncertainty" / "0000.tiff").write_bytes(b"damaged")
+    render_path(run, predictor=predictor, **options)
+    np.testing.assert_array_equal(iio.imread(folder / "uncertainty" / "0000.tiff"), errors[0])
+    with pytest.raises(ValueError, match="uncertainty 'fixed', not None"):
+        render_path(run, **options)
 
 
 def test_frames_show_the_model_and_its_depth_through_the_lens_of_the_path_file(rendered, run):

@@ -1,18 +1,31 @@
 """Predicted errors: calibration, sparsification, the deformation, and what is refused."""
 
+import dataclasses
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
 import imageio.v3 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnerf.core.occupancy.grid import create_grid, is_occupied
+from jaxnerf.core.types import Rays
+from jaxnerf.core.views import Views
 from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
-from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.evaluation.uncertainty import calibration, laplace
+from jaxnerf.evaluation.restore import TrainedRun, restore_run
+from jaxnerf.evaluation.uncertainty import calibration, laplace, predict
+from jaxnerf.evaluation.uncertainty.base import Estimate
+from jaxnerf.evaluation.uncertainty.cleaning import cell_centers, cleaned
 from jaxnerf.evaluation.uncertainty.laplace import deform, interpolate
 from jaxnerf.evaluation.uncertainty.predict import make_predictor
 from jaxnerf.fields.base import Field
-from runs import smoke_config
+from jaxnerf.models.base import ViewOptions
+from jaxnerf.registry import ESTIMATORS
+from runs import PACKED, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 
@@ -79,6 +92,19 @@ def test_ause_is_zero_for_true_errors_and_larger_the_less_the_score_says():
     assert 0.05 < some < 0.8 * none
 
 
+def test_the_order_of_scores_is_that_on_the_object_too():
+    """A score that finds the object, and says nothing about it, has a small AUSE over the image only."""
+    rng = np.random.default_rng(0)
+    on_object = np.arange(60)[:, None] + np.zeros(60) < 20
+    error = np.where(on_object, rng.exponential(size=(60, 60)), 0.001)
+    kept = np.ones((60, 60), bool)
+    found = calibration.score_order(error, on_object * 1.0, kept, on_object)
+    alone = calibration.sparsification(error[on_object], np.zeros(on_object.sum()))
+    assert found["ause_rmse"] < 0.4 * found["ause_rmse_object"]
+    assert found["ause_rmse_object"] == pytest.approx(alone["ause_rmse"])
+    assert set(calibration.score_order(error, error, kept, ~kept)) == {"ause_rmse", "ause_mae"}
+
+
 def test_interpolation_is_exact_for_linear_functions_and_clipped():
     vertices = jnp.stack(jnp.meshgrid(*[jnp.arange(5.0)] * 3, indexing="ij"), axis=-1)
     x = jax.random.uniform(jax.random.key(0), (50, 3), maxval=4.0)
@@ -100,6 +126,72 @@ def test_a_deformed_field_is_the_field_until_it_is_moved(contracted):
     np.testing.assert_allclose(change, 1, rtol=1e-5)
 
 
+def test_the_uncertainty_at_a_position_is_the_standard_deviation_there():
+    std = np.ones((5, 5, 5, 3))
+    std[1:] = 0.5, 0.1, 0.1
+    at = laplace.std_at(laplace.Deformation(jnp.asarray(std), jnp.ones(())), [-2.0] * 3, [2.0] * 3, True)
+    inside = np.sqrt(0.27 / 3)
+    np.testing.assert_allclose(at(jnp.array([[0.0, 0.5, 0.0], [1e9, 0.0, 0.0]])), inside, rtol=1e-5)
+    np.testing.assert_allclose(at(jnp.array([-1e9, 0.0, 0.0])), 1, rtol=1e-5)
+
+
+def stub_run(grid, limit, hold_out=0):
+    """Returns a TrainedRun that has nothing but a checkpoint of step 5, with a grid."""
+    config = SimpleNamespace(data=SimpleNamespace(hold_out=hold_out), eval=SimpleNamespace(max_uncertainty=limit))
+    views = Views(**dict.fromkeys(field.name for field in dataclasses.fields(Views)))
+    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split: views)
+    fields = dict.fromkeys(TrainedRun._fields) | {"experiment": experiment, "identity": "fixed"}
+    return TrainedRun(**fields | {"steps": lambda: [5], "variables": lambda step: (np.ones(3), grid)})
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_cells_that_are_more_uncertain_than_the_limit_are_empty(tmp_path, monkeypatch, capsys, contracted):
+    grid = create_grid([-1.0] * 3, [3.0] * 3, np.ones((8, 4, 4), bool), initial_density=1.0, contracted=contracted)
+    estimate = Estimate(None, "fixed", lambda x: jnp.where(x[..., 0] > 2, 0.7, 0.3))
+    monkeypatch.setitem(ESTIMATORS._parts, "laplace", lambda source: estimate)
+    _, found = cleaned(stub_run(grid, 0.5), tmp_path).variables(5)
+    # The box is [-1, 3]; where it is contracted its inner half is [0, 2], and its outer quarters hold the rest.
+    kept = 6
+    assert np.asarray(found.occupied).all(axis=(1, 2)).tolist() == [True] * kept + [False] * (8 - kept)
+    np.testing.assert_array_equal(found.valid, found.occupied)
+    np.testing.assert_array_equal(np.asarray(found.density_mean) < 0, ~np.asarray(found.occupied))
+    assert "25.0 % of the occupied cells" in capsys.readouterr().err
+    centers = cell_centers(grid).reshape(-1, 3)
+    ends = jnp.zeros(len(centers))
+    ray = Rays(origins=centers, directions=jnp.ones_like(centers), viewdirs=centers, near=ends, far=ends)
+    np.testing.assert_array_equal(is_occupied(found, ray, jnp.zeros((128, 1)))[:, 0], found.occupied.reshape(-1))
+
+
+def test_cleaning_is_off_by_default_and_needs_a_grid(tmp_path):
+    run = stub_run(None, 1.0)
+    assert cleaned(run, tmp_path) is run and ViewOptions().max_uncertainty == 1
+    with pytest.raises(ValueError, match="without an occupancy grid"):
+        cleaned(stub_run(None, 0.5), tmp_path).variables(5)
+
+
+def test_one_of_several_processes_calibrates(tmp_path, monkeypatch):
+    """The others wait for it; threads stand for processes, as a lock belongs to what opened the file."""
+    calls, said = [], []
+
+    def calibrate(*args):
+        calls.append(args)
+        time.sleep(0.3)
+        return calibrated()
+
+    monkeypatch.setattr(predict, "_calibrate", calibrate)
+    monkeypatch.setitem(ESTIMATORS._parts, "fixed", lambda source: Estimate(lambda rays: rays.near, "fixed"))
+    run = stub_run(None, 1.0, hold_out=8)
+    with ThreadPoolExecutor(3) as pool:
+        made = [pool.submit(make_predictor, run, tmp_path, "fixed", say=said.append) for _ in range(3)]
+        assert len({each.result().identity for each in made}) == 1
+    assert len(calls) == 1 and sum("waits for another process" in line for line in said) == 2
+    make_predictor(run, tmp_path, "fixed", coverage=0.8, say=said.append)
+    assert len(calls) == 2 and "calibrated for a coverage of 0.9, and is calibrated again" in said[-2]
+    make_predictor(stub_run(None, 0.25, hold_out=8), tmp_path, "fixed", say=said.append)  # renders other images
+    assert len(calls) == 3
+    assert {path.name for path in tmp_path.rglob("*.json")} == {"fixed.json", "fixed-max_uncertainty-0.25.json"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("members, message", [((), "--members"), ("same", "another seed")])
 def test_an_ensemble_needs_other_runs(unoptimized, trained, members, message):
@@ -108,10 +200,12 @@ def test_an_ensemble_needs_other_runs(unoptimized, trained, members, message):
 
 
 @pytest.mark.slow
-def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path, monkeypatch):
+def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(laplace, "NUM_BATCHES", 4)
     monkeypatch.setattr(laplace, "NUM_PROBES", 2)
+    monkeypatch.setattr(laplace, "RESOLUTION", 12)
     config = smoke_config()
+    config.update_from_flattened_dict(PACKED)
     config.data.hold_out = 10
     config.eval.at_end = False
     assert train_and_evaluate(config, tmp_path)
@@ -119,7 +213,11 @@ def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path,
     def predictor(run):
         return make_predictor(run, tmp_path, "laplace", coverage=0.8)
 
+    assert evaluate(tmp_path, predictor=predictor, shard=(0, 2)) is None
+    (damaged,) = (tmp_path / "eval").glob("*/uncertainty/000.tiff")
+    damaged.write_bytes(b"damaged")
     results = evaluate(tmp_path, predictor=predictor)
+    assert f"{damaged}: is damaged" in capsys.readouterr().err
     found = results["uncertainty"]
     assert found["estimator"] == "laplace" and found["target_coverage"] == 0.8
     assert found["coverage"] == pytest.approx(0.8, abs=0.1) and found["interval"] > 0
@@ -127,3 +225,10 @@ def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path,
     errors = [imageio.imread(path) for path in sorted(folder.glob("*.tiff"))]
     assert len(errors) == len(results["images"])
     assert all(np.isfinite(error).all() and error.min() > 0 and np.ptp(error) > 0 for error in errors)
+
+    with np.load(tmp_path / "uncertainty" / "20" / "laplace.npz") as stored:
+        limit = float(np.median(np.sqrt((stored["std"] ** 2).mean(axis=-1))))
+    clean = evaluate(tmp_path, settings={"max_uncertainty": limit}, overwrite=True)
+    assert clean["settings"]["max_uncertainty"] == limit and clean["psnr"] != results["psnr"]
+    said = re.findall(r"cleaning +([\d.]+) % of the occupied cells", capsys.readouterr().err)
+    assert len(said) == 1 and 10 < float(said[0]) < 90

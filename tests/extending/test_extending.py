@@ -1,11 +1,13 @@
 """The examples of this folder: each adds a part from one file outside the package, and trains with it by name."""
 
+import dataclasses
 import shutil
 import sys
 
 import density_exporter
 import gabor_field  # noqa: F401
 import mask_loss  # noqa: F401
+import novelty_estimator
 import numpy as np
 import pytest
 import tum_reader
@@ -17,8 +19,9 @@ from scipy.spatial.transform import Rotation
 import captures
 import export_sources
 import jaxnerf
+from jaxnerf.evaluation.uncertainty.base import UncertaintySource
 from jaxnerf.options import Options, option
-from jaxnerf.registry import EXPORTERS, FIELDS, Part
+from jaxnerf.registry import ESTIMATORS, EXPORTERS, FIELDS, Part
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.config_fields import typed
 from jaxnerf.training import auto_config
@@ -121,6 +124,22 @@ def test_an_exporter(tmp_path):
     center = (content["upper"] + content["lower"]) / 2
     assert content["density"].shape == (16, 16, 16) and content["density"][8, 8, 8] > 100
     assert content["density"][0, 0, 0] < 1 and (center == 0).all()
+
+
+def test_an_estimator(tmp_path):
+    assert ESTIMATORS.get("novelty") is novelty_estimator.estimate_novelty
+    run, _, variables, views, *_ = export_sources.source_of(num_samples=32)
+    source = UncertaintySource.of(run, tmp_path, 7, variables)
+    estimate = ESTIMATORS.get("novelty")(source)
+    known = views.rays(3)
+    # The pixels of a training view are known. Seen from the other side, the ball's middle is at least 0.2 rad away.
+    np.testing.assert_allclose(estimate.score(known), 0, atol=1e-3)
+    turned = {name: -getattr(known, name) for name in ("origins", "directions", "viewdirs")}
+    opposite = dataclasses.replace(known, **turned)
+    middle = np.asarray(estimate.score(opposite))[23:25, 23:25]
+    to_world = np.asarray(views.cameras.to_world)
+    nearest = np.arccos((to_world[:, :, 3] @ -to_world[3, :, 3] / 9).max()) / np.pi
+    assert (middle > 0.5 * nearest).all() and nearest > 0.05
 
 
 @pytest.mark.slow

@@ -110,6 +110,24 @@ def test_the_saved_config_is_used_without_another_one(tmp_path, monkeypatch, fla
     assert sys.argv == ["program", *(["--config=run/config.json"] if added else []), *flags]
 
 
+@pytest.mark.parametrize(
+    "flags, added",
+    [
+        (["--workdir=run"], False),
+        (["--workdir=run", "--config.eval.chunk=3"], True),
+        (["--noconfig.eval.bake_occupancy", "-workdir=run"], True),
+        (["--workdir=run", "--config=smoke", "--config.eval.chunk=3"], False),
+    ],
+)
+def test_the_saved_config_may_be_used_for_fields_only(tmp_path, monkeypatch, flags, added):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text("{}")
+    monkeypatch.setattr(sys, "argv", ["program", *flags])
+    cli.use_saved_config(only_for_fields=True)
+    assert ("--config=run/config.json" in sys.argv) == added
+
+
 def test_a_plugin_registers_a_field(tmp_path):
     plugin = "import jaxnerf\n\njaxnerf.register_field('mine', lambda options, box: None)\n"
     (tmp_path / "my_plugin.py").write_text(plugin)

@@ -4,6 +4,8 @@ import json
 import types
 
 import imageio.v3 as iio
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -75,6 +77,8 @@ def test_a_frame_equals_that_of_render(kind, tmp_path):
     assert solid.any()
     np.testing.assert_allclose(frame.distance[solid], distance[solid], rtol=1e-3)
     check_crop(it)
+    if kind in ("packed", "dense"):
+        check_uncertainty(it, frame)
     compiled = it.renderer.num_compiled
     it.renderer.render(it.renderer.scene_state(40, it.run.variables(20)), it.camera(70, 9, view=2), crop=None)
     assert it.renderer.num_compiled == compiled
@@ -127,6 +131,21 @@ def check_crop(it):
     assert found[shown][:, 0].max() < middle[0] + 0.1
     nothing = it.renderer.render(it.state, camera, crop=np.array([[50.0] * 3, [51.0] * 3]))
     assert not nothing.opacity.any() and (nothing.rgb == 1).all(), "the background is white"
+
+
+def check_uncertainty(it, frame):
+    """The ball's red is a function of position, which an estimate may have, too."""
+    red = jax.tree_util.Partial(lambda factor, x: 1 / (1 + jnp.exp(factor * x[..., 0])), jnp.float32(-3))
+    state = it.renderer.scene_state(20, it.run.variables(20), red)
+    for fast in (False, True):
+        found = it.renderer.render(state, frame.camera, uncertain=True, fast=fast)
+        solid = frame.opacity > 0.999
+        np.testing.assert_allclose(
+            found.rgb[solid], frame.rgb[solid][:, :1].repeat(3, axis=1), atol=0.2 if fast else 1e-3
+        )
+        assert found.uncertain and (found.rgb[frame.opacity < 0.3] == 0).all()
+    np.testing.assert_array_equal(frame_image(found, "uncertainty"), frame_image(found, "colour"))
+    assert not it.renderer.render(it.state, frame.camera, uncertain=True).uncertain, "without an estimate it is colour"
 
 
 def test_a_camera_far_away_sees_the_whole_scene(solid):

@@ -18,3 +18,26 @@ def test_the_crop_limits_are_those_of_the_grid_that_will_be_trained(contracted, 
     page = SimpleNamespace(_viewer=viewer, _size=4.0, _target=np.zeros(3))
     lower, upper = Page._crop_range(page)
     np.testing.assert_allclose([lower, upper], [[-expected] * 3, [expected] * 3], rtol=1e-6)
+
+
+def test_uncertainty_is_offered_where_the_run_has_it():
+    for state, last in ((None, "normals"), (state_with(None), "normals"), (state_with(abs), "uncertainty")):
+        assert Page._modes(SimpleNamespace(_viewer=SimpleNamespace(state=state)))[-1] == last
+
+
+def state_with(uncertainty_at):
+    return SimpleNamespace(uncertainty_at=uncertainty_at)
+
+
+@pytest.mark.parametrize(
+    "mode, uncertain, requests",
+    [("uncertainty", False, 1), ("uncertainty", True, 0), ("colour", True, 1), ("depth", True, 0), ("colour", None, 1)],
+)
+def test_a_frame_is_requested_where_the_last_one_does_not_hold_the_mode(mode, uncertain, requests):
+    calls = []
+    page = SimpleNamespace(_mode=SimpleNamespace(value=mode), _delivery=None)
+    if uncertain is not None:
+        page._delivery = SimpleNamespace(frame=SimpleNamespace(uncertain=uncertain))
+    page._request, page._redraw = (lambda name=name: calls.append(name) for name in ("request", "redraw"))
+    Page._change_mode(page)
+    assert calls == ["request"] * requests or (calls == ["redraw"] and not requests)

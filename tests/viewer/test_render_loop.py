@@ -20,7 +20,7 @@ class FakeRenderer:
         self.calls, self.seconds, self.hold = [], chunk_seconds, threading.Event()
         self.hold.set()
 
-    def render(self, state, camera, *, fast, crop, abandoned):
+    def render(self, state, camera, *, fast, crop, uncertain, abandoned):
         call = SimpleNamespace(state=state, camera=camera, fast=fast, crop=crop, chunks=0, abandoned=False)
         self.calls.append(call)
         for _ in range(-(-camera.width * camera.height // CHUNK)):

@@ -8,7 +8,7 @@ import pathlib
 import sys
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import imageio.v2
@@ -19,6 +19,7 @@ from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import newest_step, refined_views, render_settings, restore_run
+from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.metric_log import Progress, minutes
@@ -41,6 +42,7 @@ def render_path(
     name: str | None = None,
     rgba: bool = False,
     depth: bool = False,
+    predictor: Callable[[TrainedRun], Any] | None = None,
     kind: str = "auto",
     overwrite: bool = False,
     shard: tuple[int, int] = shards.WHOLE,
@@ -63,6 +65,9 @@ def render_path(
         name: in place of the path's in the names of folder and video.
         rgba: whether rgba/0000.png is written, too: straight alpha, without the background.
         depth: whether there is a video of the depth, too.
+        predictor: TrainedRun -> `uncertainty.predict.Predictor`. The predicted errors are then written, too, as
+            uncertainty/0000.tiff, float32, in units of colour, and uncertainty/0000.png, black where they are 0 and
+            white where they are largest in the whole path, apart from a hundredth of its pixels; and a video of these.
         kind: of video, see `video_suffix`.
         overwrite: whether frames of that name are deleted first.
         shard: (index, count): only every count-th frame, from frame `index` on. The process that finds all
@@ -87,27 +92,32 @@ def render_path(
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
     atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(overwrite, shard, target)
-    shards.make_folder(target, _provenance(run, step, variables, views, path, closed), overwrite=overwrite)
-    missing = _write_frames(target, run, variables, views, path, rgba=rgba, shard=shard)
+    found = predictor and predictor(run)
+    provenance = _provenance(run, step, variables, views, path, closed)
+    provenance |= {"uncertainty": found.identity} if found else {}
+    shards.make_folder(target, provenance, overwrite=overwrite)
+    missing = _write_frames(target, run, variables, views, path, rgba=rgba, predictor=found, shard=shard)
     written = [target]
     if missing:
         print(f"shard {shard[0]}/{shard[1]} is done, {missing} frames of others are missing", file=sys.stderr)
         return written
-    for folder, end in (("color", ""), ("depth", "-depth")) if depth else (("color", ""),):
-        if suffix:
+    for folder, wanted in (("color", True), ("depth", depth), ("uncertainty", found)):
+        if wanted and suffix:
+            end = "" if folder == "color" else f"-{folder}"
             written.append(target.with_name(f"{target.name}{end}{suffix}"))
             files = [target / folder / f"{index:04d}.png" for index in range(len(path.poses))]
             write_video(written[-1], files, fps or path.fps or 24.0)
     return written
 
 
-def _write_frames(target, run, variables, views, path, *, rgba, shard):
+def _write_frames(target, run, variables, views, path, *, rgba, predictor, shard):
     """Renders those frames of a shard that are not in a folder yet; see `render_path`.
 
     Returns:
-        How many frames of other shards are missing; 0 when the depth images are written, too.
+        How many frames of other shards are missing; 0 when the images of depths and errors are written, too.
     """
     kinds = {"depth": "tiff", "color": "png", **({"rgba": "png"} if rgba else {})}
+    kinds |= {"uncertainty": "tiff"} if predictor else {}
     files = [[target / kind / f"{index:04d}.{end}" for kind, end in kinds.items()] for index in range(len(path.poses))]
     for kind in kinds:
         (target / kind).mkdir(parents=True, exist_ok=True)
@@ -130,6 +140,8 @@ def _write_frames(target, run, variables, views, path, *, rgba, shard):
             planes = [np.asarray(distance, np.float32), output_images.to_8_bits(image.rgb)]
             if rgba:
                 planes.append(output_images.straight_alpha(image.rgb, image.opacity, run.experiment.background))
+            if predictor:
+                planes.append(predictor.error(rays))
             for file, plane in zip(files[index], planes, strict=True):
                 output_images.write_image(file, plane)
             compiled, left = compiled or (time.monotonic(), done), ""
@@ -140,6 +152,8 @@ def _write_frames(target, run, variables, views, path, *, rgba, shard):
         progress.close()
     if not missing():
         _write_depth_images([group[0] for group in files])
+        if predictor:
+            _write_error_images([group[-1] for group in files])
         atomic_files.sweep(target)
     return len(missing())
 
@@ -176,6 +190,12 @@ def _write_depth_images(files):
     near, far = output_images.depth_range(map(read_stored, files))
     for file in files:
         output_images.write_image(file.with_suffix(".png"), output_images.depth_image(read_stored(file), near, far))
+
+
+def _write_error_images(files):
+    largest = max(output_images.largest_error(map(read_stored, files)), 1e-12)
+    for file in files:
+        output_images.write_image(file.with_suffix(".png"), output_images.to_8_bits(read_stored(file) / largest))
 
 
 def video_suffix(kind: str) -> str | None:

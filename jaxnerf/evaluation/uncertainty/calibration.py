@@ -13,6 +13,7 @@ from jaxnerf.runtime import atomic_files
 
 _NUM_BINS = 50
 _LEAST_ERROR = 1 / (255 * 12**0.5)  # the standard deviation of rounding to 8 bits
+_FIGURES = ("coverage", "interval", "ause_rmse", "ause_mae", "ause_rmse_object", "ause_mae_object")
 _AGAIN = "remove it, and the same command calibrates again"
 
 
@@ -136,10 +137,39 @@ def sparsification(error: ArrayLike, score: ArrayLike, *, num_fractions: int = 1
     return found
 
 
+def score_order(
+    error: ArrayLike, score: ArrayLike, kept: ArrayLike, on_object: ArrayLike | None = None
+) -> dict[str, float]:
+    """Computes the figures of `sparsification` of an image, and of its object alone.
+
+    Around an object the background is known, so that any score that finds the object has a small AUSE.
+
+    Args:
+        error, score: [H, W].
+        kept: [H, W] bool, the pixels that count.
+        on_object: [H, W] bool, those of them that show the object; None: unknown.
+
+    Returns:
+        "ause_rmse" and "ause_mae"; and "ause_rmse_object" and "ause_mae_object" where at least two pixels show it.
+    """
+    error, score, kept = (np.asarray(each) for each in (error, score, kept))
+    row = sparsification(error[kept], score[kept])
+    chosen = kept & np.asarray(on_object, bool) if on_object is not None else np.zeros_like(kept)
+    if chosen.sum() > 1:
+        row |= {f"{name}_object": each for name, each in sparsification(error[chosen], score[chosen]).items()}
+    return row
+
+
 def save(path: pathlib.Path, calibration: Calibration, key: str) -> None:
-    """Writes a calibration; key: text that is equal for the same checkpoint and estimate."""
+    """Writes a calibration unless there is one: of processes that share a folder, the first one decides for all.
+
+    Args:
+        path: of the file.
+        calibration: to write.
+        key: text that is equal for the same checkpoint and estimate.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_files.write_text(path, json.dumps({"key": key, **calibration._asdict()}, indent=1) + "\n")
+    atomic_files.write_text_once(path, json.dumps({"key": key, **calibration._asdict()}, indent=1) + "\n")
 
 
 def load(path: pathlib.Path, key: str) -> Calibration:
@@ -165,6 +195,6 @@ def load(path: pathlib.Path, key: str) -> Calibration:
 
 
 def figures(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Returns the means over the images of what `Predictor.row` computes."""
-    names = [name for name in ("coverage", "interval", "ause_rmse", "ause_mae") if all(name in row for row in rows)]
+    """Returns the means over the images of the figures of `Predictor.scored` that all of them have."""
+    names = [name for name in _FIGURES if all(name in row for row in rows)]
     return {name: float(np.mean([row[name] for row in rows])) for name in names}

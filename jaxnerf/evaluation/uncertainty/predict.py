@@ -2,7 +2,6 @@
 
 import functools
 import os
-import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -16,8 +15,9 @@ from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views
 from jaxnerf.evaluation.uncertainty import calibration as calibrations
 from jaxnerf.evaluation.uncertainty.base import Score, UncertaintySource
-from jaxnerf.evaluation.uncertainty.calibration import Calibration, pixel_error, sparsification
+from jaxnerf.evaluation.uncertainty.calibration import Calibration, pixel_error, score_order
 from jaxnerf.registry import ESTIMATORS
+from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
 
 
@@ -43,21 +43,29 @@ class Predictor(NamedTuple):
     def _error(self, score):
         return np.float32(score) if self.calibration is None else self.calibration.predicted(score)
 
-    def scored(self, rays: Rays, rgb: ArrayLike, truth: ArrayLike, mask: ArrayLike | None) -> tuple[np.ndarray, dict]:
+    def scored(
+        self,
+        rays: Rays,
+        rgb: ArrayLike,
+        truth: ArrayLike,
+        mask: ArrayLike | None,
+        on_object: ArrayLike | None = None,
+    ) -> tuple[np.ndarray, dict]:
         """Predicts the errors of an image, and compares them with its true errors.
 
         Args:
             rays: Rays [H, W].
             rgb, truth: [H, W, 3].
             mask: [H, W] bool, the pixels that count; None: all.
+            on_object: [H, W] bool, those of them that show the object; None: unknown.
 
         Returns:
-            The predicted errors [H, W]; and the figures of `sparsification`, with a calibration "coverage", the
+            The predicted errors [H, W]; and the figures of `score_order`, with a calibration "coverage", the
             fraction of pixels whose errors are within their intervals, and "interval", the mean half width.
         """
         score, error = np.asarray(self.score(rays)), pixel_error(rgb, truth)
         kept = np.ones(error.shape, bool) if mask is None else np.asarray(mask, bool)
-        row = sparsification(error[kept], score[kept])
+        row = score_order(error, score, kept, on_object)
         if self.calibration is not None:
             width = self.calibration.interval(score)
             row |= {"coverage": float((error <= width)[kept].mean()), "interval": float(width[kept].mean())}
@@ -67,6 +75,34 @@ class Predictor(NamedTuple):
         """Returns what results.json holds about the figures of its images."""
         target = None if self.calibration is None else self.calibration.coverage
         return {"estimator": self.name, "target_coverage": target, **calibrations.figures(rows)}
+
+
+def requested(
+    name: str | None,
+    workdir: str | os.PathLike | None,
+    *,
+    step: int | None = None,
+    members: Sequence[str] | None = None,
+    coverage: float = 0.9,
+) -> Callable[[TrainedRun], Predictor] | None:
+    """Returns the function that makes the Predictor that the flags of a program ask for; None without --uncertainty.
+
+    Args:
+        name: of the estimator, or None.
+        workdir, step, members, coverage: see `make_predictor`.
+
+    Raises:
+        ValueError: on a wrong flag, before anything is read.
+    """
+    if not 0 < coverage < 1:
+        raise ValueError(f"--coverage is {coverage}, expected a number between 0 and 1, such as 0.9; correct it")
+    if name is None:
+        if members:
+            raise ValueError("--members is given without --uncertainty=ensemble; add that, or drop --members")
+        return None
+    ESTIMATORS.get(name)
+    options = {"step": step, "members": members or (), "coverage": coverage}
+    return functools.partial(make_predictor, workdir=workdir, name=name, **options)
 
 
 def make_predictor(
@@ -81,8 +117,9 @@ def make_predictor(
 ) -> Predictor:
     """Makes the Predictor of a checkpoint, calibrated on the views that `data.hold_out` kept from training.
 
-    The calibration is written to <workdir>/uncertainty/STEP/NAME.json, and read again if it fits. A run without
-    held-out views has no calibration, which is said.
+    The calibration is written to <workdir>/uncertainty/STEP/NAME.json, and read again if it fits. Of several processes,
+    such as the shards of an evaluation, one calibrates, and the others wait for it. A run without held-out views has no
+    calibration, which is said.
 
     Args:
         run: restored from the workdir.
@@ -99,20 +136,22 @@ def make_predictor(
     estimate = ESTIMATORS.get(name)
     step = newest_step(run, workdir, step)
     variables = run.variables(step)
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
-    folder = pathlib.Path(workdir) / "uncertainty" / str(step)
+    source = UncertaintySource.of(run, workdir, step, variables, members=members, say=say)
     key = fingerprint(run.identity, variables[0], *([] if variables[1] is None else [variables[1]]))
-    found = estimate(UncertaintySource(run, variables, views, tuple(members), folder, key, say))
-    key, path = fingerprint(key, found.identity), folder / f"{name}.json"
-    known = calibrations.load(path, key) if path.is_file() else None
-    if known is None or known.coverage != coverage:
-        if run.experiment.config.data.hold_out:
-            if known is not None:
-                say(f"{path}: was calibrated for a coverage of {known.coverage:g}, and is calibrated again")
-            known = _calibrate(run, variables, found.score, coverage)
-            calibrations.save(path, known, key)
-        else:
+    path, limit = source.folder / f"{name}.json", run.experiment.config.eval.max_uncertainty
+    if limit < 1:
+        path = path.with_stem(f"{name}-max_uncertainty-{limit:g}")
+    with atomic_files.one_at_a_time(path.with_suffix(".lock"), lambda: say(f"{path}: waits for another process")):
+        found = estimate(source)
+        key = fingerprint(key, found.identity)
+        known = calibrations.load(path, key) if path.is_file() else None
+        if known is not None and known.coverage != coverage:
+            say(f"{path}: was calibrated for a coverage of {known.coverage:g}, and is calibrated again")
+            path.unlink()
             known = None
+        if known is None and run.experiment.config.data.hold_out:
+            calibrations.save(path, _calibrate(run, variables, found.score, coverage), key)
+            known = calibrations.load(path, key)
     if known is None:
         say(
             f"uncertainty: {name}, not calibrated, as no views were held out; "
