@@ -101,6 +101,12 @@ class LookAt:
         return float(np.median(self.half_size.min(axis=1)))
 
 
+def footprint_radii(views: Views) -> tuple[float, float]:
+    """Returns the smallest and the largest radius in world units of a pixel's cone at what the views look at."""
+    radius = 2 / math.sqrt(12) * LookAt(views).distance / np.asarray(views.cameras.focal, np.float64).mean(axis=1)
+    return float(radius.min()), float(radius.max())
+
+
 def _contracted(views, has_alpha, *, ndc, world):
     """Returns whether the box holds all of space, and why."""
     if ndc:
