@@ -4,8 +4,9 @@
         [--page=docs/results/multiscale.md]
 
 Each scene is trained with `lego_fast` on images shrunk by --factor, and at four sizes of them (`data.num_scales`)
-without and with `hash_grid.prefilter`, the last with more samples a ray than the usual 10. Truth at each size is the mean over the pixels of the
-original images. Supersampling renders several rays a pixel, on a regular grid, and averages their colours.
+without and with `hash_grid.prefilter`, the last with more samples a ray than the usual 10. Truth at each size is the
+mean over the pixels of the original images. Supersampling renders several rays a pixel, on a regular grid, and averages
+their colours.
 """
 
 import json
@@ -33,12 +34,7 @@ _SCENES = flags.DEFINE_list("scenes", ["lego", "mic"], "Datasets with images of 
 _FACTOR = flags.DEFINE_integer("factor", 4, "Full size is that of the images shrunk by this.", lower_bound=1)
 _STEPS = flags.DEFINE_integer("steps", 2000, "Steps of training.", lower_bound=1)
 _NUM_VIEWS = flags.DEFINE_integer("num_views", 25, "Test views to score, spread evenly.", lower_bound=1)
-_SPLIT = flags.DEFINE_enum(
-    "split",
-    "test",
-    ["test", "held_out"],
-    "The views to score; held_out chooses settings.",
-)
+_SPLIT = flags.DEFINE_enum("split", "test", ["test", "held_out"], "The views to score; held_out: to choose settings.")
 _SCALES = (1, 2, 4, 8)
 _PREFILTER = {"data.num_scales": 4, "hash_grid.prefilter": True}
 _VARIANTS = {
