@@ -39,7 +39,7 @@ _SCALES = (1, 2, 4, 8)
 _PREFILTER = {"data.num_scales": 4, "hash_grid.prefilter": True}
 _VARIANTS = {
     "full size": {},
-    "four scales": {"data.num_scales": 4},
+    "four scales": {"data.num_scales": 4, "hash_grid.prefilter": False},
     "four scales, prefilter": _PREFILTER,
     "four scales, prefilter, 15 samples a ray": {**_PREFILTER, "occupancy.pool_samples_per_ray": 15.0},
 }

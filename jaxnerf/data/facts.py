@@ -17,11 +17,21 @@ from jaxnerf.options import Facts, is_auto
 _MAX_INNER_BOX = 3.0
 # Times twice the side of the cube that most images show; a stated box that is larger is no better than contraction.
 _MAX_STATED_BOX = 3.0
+_OUTLIERS = 0.05  # fraction of views whose footprints may be larger than all others, or smaller
 _MEAN_RUNS, _MEAN_RUN = 2**10, 2**10  # of pixels, of whose colours the mean is taken
 
 
 def dataset_facts(
-    views: Views, *, ndc: bool, world: str, use_alpha: bool, sampler: str, contracted: Any, lower: Any, upper: Any
+    views: Views,
+    *,
+    ndc: bool,
+    world: str,
+    use_alpha: bool,
+    sampler: str,
+    contracted: Any,
+    lower: Any,
+    upper: Any,
+    num_scales: int = 1,
 ) -> Facts:
     """Returns the facts about a dataset.
 
@@ -32,6 +42,7 @@ def dataset_facts(
         use_alpha: whether alpha may bound the scene.
         sampler: the name of the run's sampler.
         contracted, lower, upper: of the box where they are set; otherwise "auto".
+        num_scales: sizes of the images that training draws from, see `DataOptions`.
 
     Raises:
         ValueError: if the box is empty.
@@ -49,6 +60,7 @@ def dataset_facts(
         num_views=len(views.size),
         side=float(np.sqrt(np.prod(views.size, axis=1)).mean()),
         footprint=2 / float(np.max(views.size[:, 1])) if ndc else LookAt(views).footprint,
+        footprint_spread=footprint_spread(views) * 2.0 ** (num_scales - 1),
         has_alpha=has_alpha,
         ndc=ndc,
         lower=lower,
@@ -76,7 +88,8 @@ class LookAt:
         distance: [V] from the cameras to the center.
         reach: half the side of the cube around the center that holds nine in ten cameras.
         half_size: [V, 2] half the width and height of the images at that distance.
-        footprint: the size of a pixel at that distance, the median over views.
+        footprints: [V] the side of a pixel at that distance, world units.
+        footprint: their median.
     """
 
     def __init__(self, views):
@@ -93,7 +106,8 @@ class LookAt:
         self.reach = float(np.quantile(np.abs(eyes - self.center).max(axis=-1), 0.9))
         focal = np.asarray(views.cameras.focal, np.float64)
         self.half_size = self.distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / focal
-        self.footprint = float(np.median(self.distance / focal[:, 0]))
+        self.footprints = self.distance / focal[:, 0]
+        self.footprint = float(np.median(self.footprints))
 
     @property
     def inner_half_side(self):
@@ -103,8 +117,26 @@ class LookAt:
 
 def footprint_radii(views: Views) -> tuple[float, float]:
     """Returns the smallest and the largest radius in world units of a pixel's cone at what the views look at."""
-    radius = 2 / math.sqrt(12) * LookAt(views).distance / np.asarray(views.cameras.focal, np.float64).mean(axis=1)
+    radius = 2 / math.sqrt(12) * LookAt(views).footprints
     return float(radius.min()), float(radius.max())
+
+
+def footprint_spread(views: Views) -> float:
+    """Returns the side of the largest pixels' footprint over that of the smallest, without outliers.
+
+    A view's footprint is that at the median depth of the points that it shows or, where it shows none, at the point
+    that the cameras look at, which is a poor guess inside a room. The result is 1 where the smallest is 0.
+    """
+    footprints, sparse = LookAt(views).footprints, views.sparse
+    if sparse is not None and len(sparse.view):
+        pose = np.asarray(views.cameras.to_world, np.float64)[np.asarray(sparse.view)]
+        depth = ((pose[:, :, 3] - np.asarray(sparse.positions)[np.asarray(sparse.point)]) * pose[:, :, 2]).sum(axis=1)
+        focal = np.asarray(views.cameras.focal, np.float64)[:, 0]
+        for view, each in enumerate(np.split(depth, np.searchsorted(sparse.view, np.arange(1, len(focal))))):
+            if len(each):
+                footprints[view] = np.median(each) / focal[view]
+    smallest, largest = np.quantile(footprints, [_OUTLIERS, 1 - _OUTLIERS])
+    return float(largest / smallest) if smallest > 0 else 1.0
 
 
 def _contracted(views, has_alpha, *, ndc, world):

@@ -38,6 +38,7 @@ _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of 
 _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
+_LEAST_SPREAD = 4.0  # of footprints: those of a hand-held capture differ by up to 1.7, those of four scales by 8
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
 # A larger table and wider networks take little time on an accelerator: each gained 0.3 dB for lego at 800 x 800 on an
 # H200 (docs/guides/accelerators.md).
@@ -94,9 +95,10 @@ class HashGridOptions(Options):
         4.0, "features are table entries times this; it scales the table's learning rate", range=POSITIVE
     )
     prefilter: bool = option(
-        False,
-        "whether the features of cells that are smaller than a pixel's footprint are damped (arXiv:2304.06706, Eq. 6); "
-        "it pays where images have footprints of several sizes, see `data.num_scales`",
+        "auto",
+        "Whether the features of cells that are smaller than a pixel's footprint are damped (arXiv:2304.06706, Eq. 6). "
+        "auto: where the footprints of the training images, those of `data.num_scales` included, differ by 4 or more.",
+        auto=True,
     )
     compute_dtype: str = option(
         "auto",
@@ -107,13 +109,20 @@ class HashGridOptions(Options):
     )
 
     def resolve(self, facts: Facts, device: Device) -> tuple["HashGridOptions", list[str]]:
-        """Infers levels from the detail that images resolve, rows from their size, and widths from the device."""
+        """Infers levels from what images resolve, rows from their size, and widths from the device.
+
+        Whether features are damped follows from the footprints of the images.
+        """
         more = int(facts.contracted or facts.has_fine_cells or facts.side >= _FIVE_LEVELS_SIDE)
         vertices = min(max(facts.detail, _FINEST[0]), _FINEST[1] << more)
         levels = tuple(max(vertices // 2**level, 2) for level in reversed(range(_LEVELS + more)))
         rows = 2 ** round(math.log2(min(max(_ROWS_PER_PIXEL * facts.side, _MIN_ROWS), _MAX_ROWS)))
         rows, width = (rows, _CPU_WIDTH) if device.is_cpu else (_ACCELERATOR_ROWS * rows, _ACCELERATOR_WIDTH)
         size = f"{facts.side:.0f} x {facts.side:.0f} px"
+        prefilter = not facts.ndc and facts.footprint_spread >= _LEAST_SPREAD
+        why = f"the footprints of pixels differ by a factor of {facts.footprint_spread:.2g}; on from {_LEAST_SPREAD:g}"
+        if facts.ndc:
+            why = "rays in normalised device coordinates have no cones"
         per_layer = f"hash grid     {width} outputs per hidden layer of the {{}} network, for this device"
         return infer(
             self,
@@ -121,6 +130,7 @@ class HashGridOptions(Options):
             table_size=(rows, f"hash grid     at most {rows:,} rows per level, for images of about {size}"),
             width=(width, per_layer.format("density")),
             view_width=(width, per_layer.format("colour")),
+            prefilter=(prefilter, f"prefilter     {'on' if prefilter else 'off'}: {why}"),
         )
 
     def resolve_for_device(self, device: Device) -> tuple["HashGridOptions", list[str]]:

@@ -18,7 +18,7 @@ from jaxnerf.data.scales import shrink_views, with_scales
 from jaxnerf.training import build
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step
-from runs import smoke_config
+from runs import PACKED, smoke_config
 from toys import LOSSES, OPTIMIZER, toy_model
 
 pytest_plugins = ["run_fixtures"]
@@ -138,3 +138,18 @@ def test_what_several_sizes_do_not_fit_is_refused(settings, reason):
     config.update_from_flattened_dict({"data.num_scales": 2, **settings})
     with pytest.raises(ValueError, match=f"data.num_scales is 2, expected 1, as {reason}"):
         build.build(config)
+
+
+@pytest.mark.slow
+def test_a_run_of_several_sizes_is_trained_and_rendered(tmp_path):
+    """Pixels of all sizes are drawn, and what an image shows depends on the size of its pixels."""
+    config = smoke_config(max_steps=8, lr_steps=8)
+    config.update_from_flattened_dict({**PACKED, "data.num_scales": 3, "hash_grid.prefilter": "auto"})
+    assert jaxnerf.train_and_evaluate(config, tmp_path / "run")
+    run = jaxnerf.restore_run(tmp_path / "run")
+    assert run.experiment.config.hash_grid.prefilter is True and run.experiment.model.needs == ("radius",)
+    variables = run.variables(8)
+    rays = run.experiment.view_rays(run.experiment.load_split("test"), 0, jaxnerf.pixel_grid(8, 8))
+    small, large = (dataclasses.replace(rays, radius=scale * rays.radius) for scale in (1, 4))
+    small, large = (np.asarray(run.render_image(variables, each).rgb) for each in (small, large))
+    assert np.isfinite(small).all() and np.abs(small - large).max() > 1e-4
