@@ -19,7 +19,7 @@ from jaxnerf.data.facts import LookAt
 from jaxnerf.evaluation.restore import TrainedRun
 
 MAX_RAYS = 16  # per pixel: at an eighth of the size of training they are a quarter of the rays of a full image
-_RAYS_AT_ONCE = 2**20  # a small image's are rendered together, as a chunk is mostly empty otherwise
+_RAYS_PER_CALL = 2**20  # a small image's are rendered together, as a chunk is mostly empty otherwise
 
 
 class Footprint(NamedTuple):
@@ -96,10 +96,10 @@ def render_pixels(
     experiment = run.experiment
     places = (np.arange(side) + 0.5) / side - 0.5
     offsets = np.float32(size * np.stack(np.meshgrid(places, places, indexing="xy"), axis=-1).reshape(-1, 1, 1, 2))
-    fitting = [each for each in (side**2, side) if each * pixels[..., 0].size <= _RAYS_AT_ONCE]
-    at_once, total = (fitting or [1])[0], None
-    for start in range(0, len(offsets), at_once):
-        at = pixels + offsets[start : start + at_once]
+    fitting = [each for each in (side**2, side) if each * pixels[..., 0].size <= _RAYS_PER_CALL]
+    per_call, total = (fitting or [1])[0], None
+    for start in range(0, len(offsets), per_call):
+        at = pixels + offsets[start : start + per_call]
         rays = experiment.view_rays(views, index, at)
         if rays.radius is not None:
             rays = dataclasses.replace(rays, radius=rays.radius * (size / side))

@@ -265,9 +265,9 @@ class FrameRenderer:
 
 def _averaged(frame, camera, side):
     """Returns the Frame of a camera from one with side times its width and height."""
-    blocks = (camera.height, side, camera.width, side)
+    shape = (camera.height, side, camera.width, side)
     middle = frame.distance[side // 2 :: side, side // 2 :: side]
-    rgb, opacity = frame.rgb.reshape(*blocks, 3).mean((1, 3)), frame.opacity.reshape(blocks).mean((1, 3))
+    rgb, opacity = frame.rgb.reshape(*shape, 3).mean((1, 3)), frame.opacity.reshape(shape).mean((1, 3))
     return Frame(camera, rgb, opacity, middle)
 
 
