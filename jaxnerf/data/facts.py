@@ -115,28 +115,42 @@ class LookAt:
         return float(np.median(self.half_size.min(axis=1)))
 
 
-def footprint_radii(views: Views) -> tuple[float, float]:
-    """Returns the smallest and the largest radius in world units of a pixel's cone at what the views look at."""
-    radius = 2 / math.sqrt(12) * LookAt(views).footprints
-    return float(radius.min()), float(radius.max())
+def footprints(views: Views) -> Float[np.ndarray, " V"]:
+    """Returns the side of a pixel [V] in world units at the median depth of the points that each view shows.
+
+    Without points it is that at the point that all cameras look at, which is a poor guess inside a room.
+    """
+    sides, sparse = LookAt(views).footprints, views.sparse
+    if sparse is None:
+        return sides
+    view, focal = np.asarray(sparse.view), np.asarray(views.cameras.focal, np.float64)[:, 0]
+    pose = np.asarray(views.cameras.to_world, np.float64)[view]
+    depth = ((pose[:, :, 3] - np.asarray(sparse.positions)[np.asarray(sparse.point)]) * pose[:, :, 2]).sum(axis=1)
+    for index, each in enumerate(np.split(depth, np.searchsorted(view, np.arange(1, len(focal))))):
+        if (each > 0).any():
+            sides[index] = np.median(each[each > 0]) / focal[index]
+    return sides
 
 
 def footprint_spread(views: Views) -> float:
-    """Returns the side of the largest pixels' footprint over that of the smallest, without outliers.
-
-    A view's footprint is that at the median depth of the points that it shows or, where it shows none, at the point
-    that the cameras look at, which is a poor guess inside a room. The result is 1 where the smallest is 0.
-    """
-    footprints, sparse = LookAt(views).footprints, views.sparse
-    if sparse is not None and len(sparse.view):
-        pose = np.asarray(views.cameras.to_world, np.float64)[np.asarray(sparse.view)]
-        depth = ((pose[:, :, 3] - np.asarray(sparse.positions)[np.asarray(sparse.point)]) * pose[:, :, 2]).sum(axis=1)
-        focal = np.asarray(views.cameras.focal, np.float64)[:, 0]
-        for view, each in enumerate(np.split(depth, np.searchsorted(sparse.view, np.arange(1, len(focal))))):
-            if len(each):
-                footprints[view] = np.median(each) / focal[view]
-    smallest, largest = np.quantile(footprints, [_OUTLIERS, 1 - _OUTLIERS])
+    """Returns the largest of the `footprints` over the smallest, without outliers; 1 where the smallest is 0."""
+    smallest, largest = np.quantile(footprints(views), [_OUTLIERS, 1 - _OUTLIERS])
     return float(largest / smallest) if smallest > 0 else 1.0
+
+
+def footprint_radii(views: Views, num_scales: int = 1) -> tuple[float, float]:
+    """Returns the smallest and the largest radius of the pixels' cones, world units, at the `footprints`.
+
+    Args:
+        views: of the split "train".
+        num_scales: sizes of the images that training draws from, see `DataOptions`.
+
+    Returns:
+        The radii; the smallest is at least a thousandth of the largest, as a camera may stand at what all look at.
+    """
+    radii = 2 / math.sqrt(12) * footprints(views)
+    largest = float(radii.max()) * 2.0 ** (num_scales - 1)
+    return max(float(radii.min()), largest / 1000), largest
 
 
 def _contracted(views, has_alpha, *, ndc, world):

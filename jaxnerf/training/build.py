@@ -356,7 +356,7 @@ def _prepare(config, model, extras, views):
         progress = ProgressData(np.float32(config.train.lr_steps), np.float32(0))
     radii = None
     if model.grid_schedule is not None and "radius" in model.needs:
-        radii = np.float32(footprint_radii(drawn))
+        radii = np.float32(footprint_radii(views, config.data.num_scales))
     # The mask is part of the active pixels.
     drawn = dataclasses.replace(drawn, mask=None, sparse=sparse)
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)

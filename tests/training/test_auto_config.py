@@ -16,7 +16,7 @@ from jaxnerf import Camera, SparsePoints, Views
 from jaxnerf.configs import default, lego_fast, lego_mlp_fast
 from jaxnerf.data import dataset, synthetic
 from jaxnerf.data.dataset import DataOptions
-from jaxnerf.data.facts import footprint_spread, mean_color
+from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
@@ -672,4 +672,9 @@ def test_footprints_are_those_of_the_points_that_views_show(views):
     index = np.arange(count, dtype=np.int32)
     sparse = SparsePoints(positions=positions, view=index, point=index, pixel=np.zeros((count, 2), np.float32))
     assert footprint_spread(views) == pytest.approx(1, abs=0.2)
-    assert footprint_spread(dataclasses.replace(views, sparse=sparse)) == pytest.approx(2, rel=1e-5)
+    found = dataclasses.replace(views, sparse=sparse)
+    assert footprint_spread(found) == pytest.approx(2, rel=1e-5)
+    focal = float(views.cameras.focal[0, 0])
+    assert footprint_radii(found, num_scales=3) == pytest.approx(np.array([3, 4 * 6]) / focal / 3**0.5, rel=1e-5)
+    behind = dataclasses.replace(sparse, positions=pose[:, :, 3] + pose[:, :, 2])  # as wrong matches are: not counted
+    assert footprint_radii(dataclasses.replace(views, sparse=behind)) == footprint_radii(views)
