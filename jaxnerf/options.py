@@ -123,6 +123,8 @@ class Facts(NamedTuple):
         num_views: training images.
         side: px, that of a square image with as many pixels as an image has, the mean over the images.
         footprint: world units that a pixel covers at the point that the cameras look at.
+        footprint_spread: side of the largest pixels' footprint over that of the smallest, at what each view shows, for
+            all but the outermost twentieths of the views, and for all sizes that training draws from.
         num_observations: of sparse points that at least two views show; 0 unless the run can use them.
         has_alpha: whether alpha bounds the scene.
         mean_alpha: of the pixels; 1 without alpha.
@@ -140,6 +142,7 @@ class Facts(NamedTuple):
     num_views: int
     side: float
     footprint: float
+    footprint_spread: float = 1.0
     num_observations: int = 0
     has_alpha: bool = False
     mean_alpha: float = 1.0

@@ -56,6 +56,14 @@ _WIDTH = flags.DEFINE_integer(
 _HEIGHT = flags.DEFINE_integer(
     "height", None, "The height in px. When it is not given, it follows --width, or the first view.", **_SIDE
 )
+_MAX_RAYS = flags.DEFINE_integer(
+    "max_rays_per_pixel",
+    16,
+    "The most rays per pixel. A pixel that covers more of the scene than those of training, as in small images and "
+    "from afar, is the mean of as many rays as training has there. 1 renders one ray per pixel.",
+    lower_bound=1,
+    upper_bound=4096,
+)
 _FPS = flags.DEFINE_float(
     "fps", None, "The frames per second. When it is not given, the path's file states them, or 24.", lower_bound=0.1
 )
@@ -116,6 +124,7 @@ def main(argv):
         kind=_VIDEO.value,
         overwrite=_OVERWRITE.value,
         shard=shards.parse(_SHARD.value),
+        max_rays_per_pixel=_MAX_RAYS.value,
     )
     print(*written, sep="\n")
     if _VIDEO.value == "auto" and written[-1].suffix == ".gif":

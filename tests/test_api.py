@@ -43,7 +43,8 @@ SURFACE = {
     "importance_padding=0.0 background=None median_depth=False",
     "render_image": "render rays | chunk",
     "create_grid": "lower upper valid | initial_density contracted=False",
-    "update_grid": "key grid scene cells | threshold spacing=None decay=0.6 smoothing=0.2 spread=True chunk=8192",
+    "update_grid": "key grid scene cells | threshold spacing=None decay=0.6 smoothing=0.2 spread=True chunk=8192 "
+    "radii=None",
     "grid_from_scene": "key scene lower upper shape | threshold contracted=False num_updates=4 chunk=8192",
     "mask_scene": "scene grid |",
     "render_packed": "scene grid rays samples | max_samples early_stop_eps=0.0 background=None median_depth=False",

@@ -70,6 +70,13 @@ class DataOptions(Options):
         protocol=True,
     )
     width: int = option(800, "see `factor`", unit="px", range=at_least(1))
+    num_scales: int = option(
+        1,
+        "sizes of the images that training draws from: full, 1/2, 1/4, ..., each the area average of the full one. "
+        "The losses of a ray weigh as the side of its pixel. It pays with `hash_grid.prefilter`.",
+        range=at_least(1),
+        changes=Changes.TRAINING,
+    )
     size: int = option(100, "side of the embedded scene's images", unit="px", range=at_least(1))
     finish: str = option(
         "usual",
@@ -437,6 +444,7 @@ def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -
         free_depth=None if views.free_depth is None else take(views.free_depth),
         time=None if views.time is None else take(views.time),
         image_index=None if views.image_index is None else take(views.image_index),
+        loss_weight=None if views.loss_weight is None else take(views.loss_weight),
         names=tuple(views.names[index] for index in indices) if views.names else (),
         sparse=None if views.sparse is None else _select_observations(views.sparse, indices),
     )

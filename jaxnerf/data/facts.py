@@ -17,11 +17,21 @@ from jaxnerf.options import Facts, is_auto
 _MAX_INNER_BOX = 3.0
 # Times twice the side of the cube that most images show; a stated box that is larger is no better than contraction.
 _MAX_STATED_BOX = 3.0
+_OUTLIERS = 0.05  # fraction of views whose footprints may be larger than all others, or smaller
 _MEAN_RUNS, _MEAN_RUN = 2**10, 2**10  # of pixels, of whose colours the mean is taken
 
 
 def dataset_facts(
-    views: Views, *, ndc: bool, world: str, use_alpha: bool, sampler: str, contracted: Any, lower: Any, upper: Any
+    views: Views,
+    *,
+    ndc: bool,
+    world: str,
+    use_alpha: bool,
+    sampler: str,
+    contracted: Any,
+    lower: Any,
+    upper: Any,
+    num_scales: int = 1,
 ) -> Facts:
     """Returns the facts about a dataset.
 
@@ -32,6 +42,7 @@ def dataset_facts(
         use_alpha: whether alpha may bound the scene.
         sampler: the name of the run's sampler.
         contracted, lower, upper: of the box where they are set; otherwise "auto".
+        num_scales: sizes of the images that training draws from, see `DataOptions`.
 
     Raises:
         ValueError: if the box is empty.
@@ -49,6 +60,7 @@ def dataset_facts(
         num_views=len(views.size),
         side=float(np.sqrt(np.prod(views.size, axis=1)).mean()),
         footprint=2 / float(np.max(views.size[:, 1])) if ndc else LookAt(views).footprint,
+        footprint_spread=footprint_spread(views) * 2.0 ** (num_scales - 1),
         has_alpha=has_alpha,
         ndc=ndc,
         lower=lower,
@@ -76,7 +88,8 @@ class LookAt:
         distance: [V] from the cameras to the center.
         reach: half the side of the cube around the center that holds nine in ten cameras.
         half_size: [V, 2] half the width and height of the images at that distance.
-        footprint: the size of a pixel at that distance, the median over views.
+        footprints: [V] the side of a pixel at that distance, world units.
+        footprint: their median.
     """
 
     def __init__(self, views):
@@ -93,12 +106,51 @@ class LookAt:
         self.reach = float(np.quantile(np.abs(eyes - self.center).max(axis=-1), 0.9))
         focal = np.asarray(views.cameras.focal, np.float64)
         self.half_size = self.distance[:, None] * np.asarray(views.size)[:, ::-1] / 2 / focal
-        self.footprint = float(np.median(self.distance / focal[:, 0]))
+        self.footprints = self.distance / focal[:, 0]
+        self.footprint = float(np.median(self.footprints))
 
     @property
     def inner_half_side(self):
         """Half the side of the cube that most images show completely."""
         return float(np.median(self.half_size.min(axis=1)))
+
+
+def footprints(views: Views) -> Float[np.ndarray, " V"]:
+    """Returns the side of a pixel [V] in world units at the median depth of the points that each view shows.
+
+    Without points it is that at the point that all cameras look at, which is a poor guess inside a room.
+    """
+    sides, sparse = LookAt(views).footprints, views.sparse
+    if sparse is None:
+        return sides
+    view, focal = np.asarray(sparse.view), np.asarray(views.cameras.focal, np.float64)[:, 0]
+    pose = np.asarray(views.cameras.to_world, np.float64)[view]
+    depth = ((pose[:, :, 3] - np.asarray(sparse.positions)[np.asarray(sparse.point)]) * pose[:, :, 2]).sum(axis=1)
+    for index, each in enumerate(np.split(depth, np.searchsorted(view, np.arange(1, len(focal))))):
+        if (each > 0).any():
+            sides[index] = np.median(each[each > 0]) / focal[index]
+    return sides
+
+
+def footprint_spread(views: Views) -> float:
+    """Returns the largest of the `footprints` over the smallest, without outliers; 1 where the smallest is 0."""
+    smallest, largest = np.quantile(footprints(views), [_OUTLIERS, 1 - _OUTLIERS])
+    return float(largest / smallest) if smallest > 0 else 1.0
+
+
+def footprint_radii(views: Views, num_scales: int = 1) -> tuple[float, float]:
+    """Returns the smallest and the largest radius of the pixels' cones, world units, at the `footprints`.
+
+    Args:
+        views: of the split "train".
+        num_scales: sizes of the images that training draws from, see `DataOptions`.
+
+    Returns:
+        The radii; the smallest is at least a thousandth of the largest, as a camera may stand at what all look at.
+    """
+    radii = 2 / math.sqrt(12) * footprints(views)
+    largest = float(radii.max()) * 2.0 ** (num_scales - 1)
+    return max(float(radii.min()), largest / 1000), largest
 
 
 def _contracted(views, has_alpha, *, ndc, world):

@@ -193,7 +193,8 @@ def draw_batch(
     rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc, needs=needs))(view, pixels)
     stored = views.pixels
     colors = stored.rows[positions] if isinstance(stored, BatchPixels) else stored[index]
-    batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background))
+    weight = None if views.loss_weight is None else jnp.asarray(views.loss_weight)[view]
+    batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background), loss_weight=weight)
     if not extras:
         return keys, batch
     known = {"image_index": view.astype(jnp.int32), "pixel": pixels, "alpha": _alpha(colors)}

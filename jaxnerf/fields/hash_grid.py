@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.fixed_order import add_rows, in_fixed_order
 from jaxnerf.core.loops import is_cpu
-from jaxnerf.core.safe_math import clamp
+from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network
@@ -31,7 +31,7 @@ _PRIMES = (1, 2654435761, 805459861)  # of the spatial hash, arXiv:2201.05989, E
 _LARGEST_EXPONENT = 15.0  # a density that is opaque within 1e-5 world units
 # The sigmoid has this slope at this logit, where its value is 0.001 from 1: a quarter of an 8-bit level.
 _END_SLOPE, _END_LOGIT = 1e-3, 6.9
-
+_ERF_IS_1 = 4.0  # erf(4) = 1 - 1.5e-8, which float32 rounds to 1
 
 _MAX_LEVELS = _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
 _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of the last of four levels
@@ -40,6 +40,7 @@ _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of 
 _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
+_LEAST_SPREAD = 4.0  # of footprints: those of a hand-held capture differ by up to 1.7, those of four scales by 8
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
 # A larger table and wider networks take little time on an accelerator: each gained 0.3 dB for lego at 800 x 800 on an
 # H200 (docs/guides/accelerators.md).
@@ -95,6 +96,12 @@ class HashGridOptions(Options):
     feature_scale: float = option(
         4.0, "features are table entries times this; it scales the table's learning rate", range=POSITIVE
     )
+    prefilter: bool = option(
+        "auto",
+        "Whether the features of cells that are smaller than a pixel's footprint are damped (arXiv:2304.06706, Eq. 6). "
+        "auto: where the footprints of the training images, those of `data.num_scales` included, differ by 4 or more.",
+        auto=True,
+    )
     compute_dtype: str = option(
         "auto",
         "type of the numbers in the networks' layers; all else is float32",
@@ -104,13 +111,20 @@ class HashGridOptions(Options):
     )
 
     def resolve(self, facts: Facts, device: Device) -> tuple["HashGridOptions", list[str]]:
-        """Infers levels from the detail that images resolve, rows from their size, and widths from the device."""
+        """Infers levels from what images resolve, rows from their size, and widths from the device.
+
+        Whether features are damped follows from the footprints of the images.
+        """
         more = int(facts.contracted or facts.has_fine_cells or facts.side >= _FIVE_LEVELS_SIDE)
         vertices = min(max(facts.detail, _FINEST[0]), _FINEST[1] << more)
         levels = tuple(max(vertices // 2**level, 2) for level in reversed(range(_LEVELS + more)))
         rows = 2 ** round(math.log2(min(max(_ROWS_PER_PIXEL * facts.side, _MIN_ROWS), _MAX_ROWS)))
         rows, width = (rows, _CPU_WIDTH) if device.is_cpu else (_ACCELERATOR_ROWS * rows, _ACCELERATOR_WIDTH)
         size = f"{facts.side:.0f} x {facts.side:.0f} px"
+        prefilter = not facts.ndc and facts.footprint_spread >= _LEAST_SPREAD
+        why = f"the footprints of pixels differ by a factor of {facts.footprint_spread:.2g}; on from {_LEAST_SPREAD:g}"
+        if facts.ndc:
+            why = "rays in normalised device coordinates have no cones"
         per_layer = f"hash grid     {width} outputs per hidden layer of the {{}} network, for this device"
         return infer(
             self,
@@ -118,6 +132,7 @@ class HashGridOptions(Options):
             table_size=(rows, f"hash grid     at most {rows:,} rows per level, for images of about {size}"),
             width=(width, per_layer.format("density")),
             view_width=(width, per_layer.format("colour")),
+            prefilter=(prefilter, f"prefilter     {'on' if prefilter else 'off'}: {why}"),
         )
 
     def resolve_for_device(self, device: Device) -> tuple["HashGridOptions", list[str]]:
@@ -155,7 +170,8 @@ def hash_grid_field(**options: Any) -> Field:
     Returns:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3]) returns density [..., S] in
         1 / world unit, an exponential of at most e^15, and rgb [..., S, 3] in [0, 1], both float32.
-        Outside the box the values are those of the nearest point inside.
+        Outside the box the values are those of the nearest point inside. With prefilter, apply asks for the radius
+        [..., 1 or S] of the cone at each sample, too, see `damping`.
 
     Raises:
         ValueError: if the box is empty, or a level has fewer than 2 vertices along its longest side.
@@ -173,18 +189,26 @@ def hash_grid_field(**options: Any) -> Field:
         )
 
     def init(key):
-        return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
+        inputs = {"radius": jnp.zeros((1, 1))} if network.prefilter else {}
+        return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
-    def apply(params, x, viewdirs):
-        density, rgb = apply_network(network, params, x, viewdirs)
+    def apply(params, x, viewdirs, **inputs):
+        density, rgb = apply_network(network, params, x, viewdirs, **inputs)
         return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), color_activation(rgb)
+
+    def apply_to_rays(params, x, viewdirs):
+        return apply(params, x, viewdirs)
+
+    def apply_to_cones(params, x, viewdirs, *, radius):
+        return apply(params, x, viewdirs, radius=jnp.broadcast_to(radius, x.shape[:-1]))
 
     color_layers = ("view_0",) if network.view_depth else ("rgb",)
     regularizers = {
         name: functools.partial(function, levels=network.levels())
         for name, function in (("hash_decay", hash_decay), ("total_variation", total_variation))
     }
-    return Field(init, apply, regularizers=regularizers, color_layers=color_layers)
+    scene = apply_to_cones if network.prefilter else apply_to_rays
+    return Field(init, scene, regularizers=regularizers, color_layers=color_layers)
 
 
 def from_options(options: HashGridOptions, box: Box | None) -> Field:
@@ -243,6 +267,7 @@ class HashGrid(linen.Module):
         view_width: features of such a layer.
         use_viewdirs: False: colour does not depend on the direction.
         feature_scale: features over table entries. A step reaches few entries, so each should change more.
+        prefilter: whether the features of each level are multiplied by its `damping`, which is an input, too.
         compute_dtype: of the inputs of both networks' layers; parameters, interpolation and outputs keep the
             precision of the table. None: that of the table for all.
     """
@@ -258,6 +283,7 @@ class HashGrid(linen.Module):
     view_width: int = 128
     use_viewdirs: bool = True
     feature_scale: float = 4.0
+    prefilter: bool = False
     compute_dtype: Any = None
 
     @linen.nowrap
@@ -274,7 +300,10 @@ class HashGrid(linen.Module):
 
     @linen.compact
     def __call__(
-        self, x: Float[ArrayLike, "*batch samples 3"], viewdirs: Float[ArrayLike, "*batch #samples 3"]
+        self,
+        x: Float[ArrayLike, "*batch samples 3"],
+        viewdirs: Float[ArrayLike, "*batch #samples 3"],
+        radius: Float[ArrayLike, "*batch samples"] | None = None,
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N]."""
         shape = x.shape[:-1]
@@ -283,7 +312,13 @@ class HashGrid(linen.Module):
         levels = self.levels()
         # All levels share a table, so there is only one gradient to clear and one array to update.
         table = self.param("table", _near_zero, (levels[-1].rows.stop, self.features_per_level))
-        features = self._rounded(self.feature_scale * interpolate(table, place, levels))
+        features = self.feature_scale * interpolate(table, place, levels)
+        if self.prefilter:
+            cells = [float((side / (np.array(level.size) - 1)).max()) for level in levels]
+            left = jnp.stack([damping(radius.reshape(-1), cell) for cell in cells], axis=-1)
+            damped = features * jnp.repeat(left, self.features_per_level, axis=-1)
+            features = jnp.concatenate([damped, left], axis=-1)
+        features = self._rounded(features)
         kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
         bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
         kernel, bias = self._rounded(kernel), self._rounded(bias)
@@ -305,6 +340,25 @@ def vertices(side: Vector, resolution: int) -> tuple[int, int, int]:
     """Returns the number of vertices along each side [3] of a box, for cells that are nearly cubes."""
     side = np.asarray(side, np.float64)
     return tuple(int(max(round(fraction * (resolution - 1)), 1)) + 1 for fraction in side / side.max())
+
+
+def damping(radius: Float[ArrayLike, "*shape"], cell: float) -> Float[Array, "*shape"]:
+    """Computes the fraction of a cone's cross-section that a cell holds, erf(cell / (sqrt(8) sigma)).
+
+    It is the mass, along one axis, of a Gaussian of the variance sigma^2 = (radius / 2)^2 of the cross-section,
+    a disk, within half a cell on both sides (arXiv:2304.06706, Eq. 6 with n = 1 / cell): how much of a level's detail
+    the mean over the cross-section keeps.
+
+    Args:
+        radius: [...] world units, at least 0.
+        cell: world units, the side of a cell.
+
+    Returns:
+        [...] in [0, 1]: exactly 1, with derivative 0, for a radius of less than 0.17 cells, where float32 has no
+        number between the value and 1; 0, with derivative 0, for an infinite one.
+    """
+    least = cell / (math.sqrt(2) * _ERF_IS_1)
+    return jax.lax.erf(divide(cell / math.sqrt(2), clamp(radius, least, jnp.inf)))
 
 
 def interpolate(

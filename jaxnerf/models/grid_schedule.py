@@ -35,7 +35,7 @@ class GridSchedule(NamedTuple):
         step_size: world units between samples.
         threshold: 1 / world unit, the density below which a cell is empty, or that of each cell [X, Y, Z].
         create: (valid, empty=None) -> OccupancyGrid, see InitialCells.
-        update: (key, step, params, OccupancyGrid, cells [L] int32) -> OccupancyGrid.
+        update: (key, step, params, OccupancyGrid, cells [L] int32, radii=None) -> OccupancyGrid, see `update_grid`.
         contracted: see OccupancyGrid.
     """
 
@@ -112,7 +112,7 @@ def make_grid_schedule(
             contracted=contracted,
         )
 
-    def update(key, step, params, grid, cells):
+    def update(key, step, params, grid, cells, radii=None):
         if cells.size == 0:
             return grid
         rounds = -(-cells.size // cells_per_update)  # updates that visit all cells
@@ -137,6 +137,7 @@ def make_grid_schedule(
                 spacing=spacing,
                 spread=young,
                 chunk=update_chunk,
+                radii=radii,
             )
 
         return jax.lax.cond(step % interval == interval - 1, updated, lambda: grid)

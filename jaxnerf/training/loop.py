@@ -365,7 +365,8 @@ def _compile(experiment, views, together=()):
     if many:
         data, own = many_runs.stack_data(each_data, [str(folder) for *_, folder in together])
     prepared = time.perf_counter()
-    pixels, gather = views.pixels, not many and _stay_on_host(views.pixels)
+    pixels = each_data[0].views.pixels
+    gather = not many and _stay_on_host(pixels)
     if gather:
         rows = np.zeros_like(pixels, shape=(options.batch_size, pixels.shape[1]))
         batch_pixels = BatchPixels(rows=rows, shape=pixels.shape)

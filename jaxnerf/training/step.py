@@ -44,6 +44,8 @@ class TrainData(NamedTuple):
         views: of the split "train".
         active_pixels: the pixels to draw from; None: all.
         cells: [M] int32, the cells of the grid that are updated; None without a grid.
+        radii: [2] float32 world units, smallest and largest radius of a pixel's cone, see `update_grid`; None where
+            the model does not ask for the radius, or has no grid.
         decay: DecayData of the learning rate; None: as the optimizer's options say.
         progress: ProgressData; None where the model does not ask for the progress.
     """
@@ -54,6 +56,7 @@ class TrainData(NamedTuple):
     cells: Any
     decay: Any = None
     progress: Any = None
+    radii: Any = None
 
 
 class StepLoss(NamedTuple):
@@ -120,6 +123,7 @@ def make_train_step(
         complete = renderings[-1].num_dropped == 0
 
         def total(values):
+            values = values if batch.loss_weight is None else batch.loss_weight * values
             return jnp.where(complete, values, 0).sum()
 
         parts = {loss.name: total(loss.function(renderings, batch)) for loss in ray_losses}
@@ -196,7 +200,7 @@ def make_train_step(
             # No ray has this position in the batch, so the key is unused otherwise.
             key = jax.random.fold_in(ray_batches.step_key(data.seed, state.step), 2**32 - 2)
             now = {**params, **progress_at(state.step, data)}
-            grid = model.grid_schedule.update(key, state.step, now, grid, data.cells)
+            grid = model.grid_schedule.update(key, state.step, now, grid, data.cells, getattr(data, "radii", None))
         counters |= progress_at(state.step + 1, data)
         state = TrainState(step=state.step + 1, params=params, opt_state=opt_state, grid=grid, counters=counters)
         return state, {**metrics, "rays": rays, **counters}

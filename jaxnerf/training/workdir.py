@@ -27,8 +27,10 @@ _FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training w
 # Options that the config.json of an older version may lack though training depends on them, and what it did instead.
 _ADDED = {
     "data.background_color": (),
+    "data.num_scales": 1,
     "data.up": "",
     "data.view_indices": (),
+    "hash_grid.prefilter": False,
     "occupancy.min_views": 0,
     "occupancy.uniform_fraction": 1.0,
     "train.lr_decay_power": 1.0,

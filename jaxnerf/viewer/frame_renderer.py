@@ -22,6 +22,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import with_needs
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.restore import TrainedRun
+from jaxnerf.evaluation.supersampling import MAX_RAYS, trained_footprint
 
 UNCERTAINTY = "uncertainty"
 MODES = ("colour", "depth", "opacity", "normals", UNCERTAINTY)
@@ -116,6 +117,7 @@ class FrameRenderer:
         self._chunk = chunk or _CHUNK.get(jax.default_backend(), _CHUNK_ELSEWHERE)
         self._ndc, self._offset = run.experiment.config.data.ndc, run.experiment.config.data.pixel_offset
         self._needs = run.experiment.model.needs
+        self._footprint = trained_footprint(run, views)
         self._middle = np.asarray(views.cameras.to_world)[:, :, 3].mean(axis=0)
         self._bounds = float(np.min(views.near)), float(np.max(views.far))
         height, width = (int(side) for side in views.size[0])
@@ -141,6 +143,18 @@ class FrameRenderer:
             box = np.stack([np.asarray(tight.lower), np.asarray(tight.upper)])
         return SceneState(step, params, grid, box, uncertainty_at)
 
+    def rays_per_side(self, camera: FrameCamera, max_rays: float = MAX_RAYS) -> int:
+        """Returns how many rays along a pixel's side are as dense as those of training.
+
+        Args:
+            camera: FrameCamera.
+            max_rays: per pixel, at most MAX_RAYS count; fewer than 1 count as 1.
+        """
+        most = int(np.clip(max_rays, 1, MAX_RAYS))
+        focal = np.full((1, 2), camera.focal)
+        side = int(self._footprint.rays_per_side(camera.to_world[None], focal, max_rays=most)[0])
+        return max(min(side, MAX_SIDE // max(camera.width, camera.height, 1)), 1)
+
     def compile(self, state: SceneState) -> None:
         """Compiles both qualities, so that the first frame does not wait for it."""
         camera = FrameCamera(np.eye(3, 4, dtype=np.float32), 1.0, 1, 1)
@@ -158,6 +172,7 @@ class FrameRenderer:
         crop: np.ndarray | None = None,
         uncertain: bool = False,
         abandoned: Callable[[], bool] = lambda: False,
+        side: int = 1,
     ) -> Frame | None:
         """Renders a frame.
 
@@ -172,6 +187,7 @@ class FrameRenderer:
             crop: [2, 3] corners in the run's world; what is outside is not shown.
             uncertain: whether uncertainty takes the place of colour, where the state has an estimate.
             abandoned: called between chunks; where it returns True, the frame is not finished.
+            side: each pixel is the mean over side x side rays; its distance is that of one in the middle.
 
         Returns:
             The Frame; None if it was abandoned.
@@ -181,6 +197,10 @@ class FrameRenderer:
         """
         if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
             raise ValueError(f"a frame has {camera.width} x {camera.height} px, expected sides of 1 to {MAX_SIDE}")
+        if side > 1:
+            fine = camera.resized(side * camera.width, side * camera.height)
+            frame = self.render(state, fine, fast=fast, crop=crop, uncertain=uncertain, abandoned=abandoned)
+            return frame and _averaged(frame, camera, side)
         count = camera.width * camera.height
         uncertain = uncertain and state.uncertainty_at is not None
         parts = self._uncertain_parts if uncertain else self._parts
@@ -276,6 +296,14 @@ def _with_uncertainty(field):
         return density, jnp.broadcast_to(uncertainty_at(x)[..., None], rgb.shape)
 
     return field._replace(apply=apply)
+
+
+def _averaged(frame, camera, side):
+    """Returns the Frame of a camera from one with side times its width and height."""
+    shape = (camera.height, side, camera.width, side)
+    middle = frame.distance[side // 2 :: side, side // 2 :: side]
+    rgb, opacity = frame.rgb.reshape(*shape, 3).mean((1, 3)), frame.opacity.reshape(shape).mean((1, 3))
+    return Frame(camera, rgb, opacity, middle)
 
 
 def _t_in_ndc(rays, t):

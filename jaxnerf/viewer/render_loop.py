@@ -16,6 +16,7 @@ _MIN_PIXELS = 32 * 32  # of a frame while the camera moves
 _PATIENCE = 3.0  # times as long as planned, after which an outdated frame of a moving camera is abandoned, too
 _MOVING = 0.5  # s after its last message in which a camera counts as moving
 _SMOOTHING = 0.3  # weight of the newest frame in the measured speed
+_FINAL_SECONDS = 1.0  # that the rays of a final frame may take beyond one a pixel, at the speed of moving frames
 _FIRST_SPEED = 1e5  # px/s, before any frame has been measured
 
 
@@ -71,7 +72,8 @@ class RenderLoop:
     """Renders the latest request of each client in a thread, and delivers the frames.
 
     A frame is first rendered at a size that keeps FRAMES_PER_SECOND, then at twice that width and height, and so on up
-    to the full size, and last with the run's own quality. A newer request of the same client, or one of a client whose
+    to the full size, and last with the run's own quality, and with several rays a pixel where a pixel covers more than
+    those of training, as far as time allows. A newer request of the same client, or one of a client whose
     camera has just moved, abandons a larger frame between two chunks. The small frame of a moving camera is finished
     unless it takes far too long: if each message of a drag abandoned it, there would be no image before the drag ends.
     A new scene replaces finished frames at full quality.
@@ -177,7 +179,12 @@ class RenderLoop:
             large = camera.width * camera.height > 2 * _MIN_PIXELS
             return large and time.perf_counter() - started > _PATIENCE / FRAMES_PER_SECOND
 
-        options = {"crop": request.crop, "uncertain": request.uncertain, "abandoned": abandoned}
+        side = 1
+        if final:
+            with self._lock:
+                affordable = self._speed * _FINAL_SECONDS / (camera.width * camera.height)
+            side = self._renderer.rays_per_side(camera, affordable)
+        options = {"crop": request.crop, "uncertain": request.uncertain, "abandoned": abandoned, "side": side}
         frame = self._renderer.render(state, camera, fast=not final, **options)
         now = time.perf_counter()
         with self._lock:

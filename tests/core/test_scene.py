@@ -421,6 +421,29 @@ def test_contracted_cells_are_larger_far_away_and_a_contracted_field_undoes_it()
     np.testing.assert_allclose(radius * length_scale(x), 0.25, rtol=1e-5)
 
 
+@pytest.mark.parametrize("contracted", [False, True])
+def test_a_cell_is_occupied_if_matter_is_there_for_any_radius(contracted):
+    """Matter that only cones of one size meet; far away, where space is contracted, cones are larger."""
+    shape = (8, 8, 8)
+    valid = np.ones(shape, bool)
+    grid = jaxnerf.create_grid(np.full(3, -2.0), np.full(3, 2.0), valid, initial_density=0.0, contracted=contracted)
+    cells, found = jnp.arange(512), []
+
+    def density_at(low, high):
+        def scene(x, viewdirs, *, radius):
+            stretched = radius * (length_scale(x) if contracted else 1)
+            return jnp.where((stretched > low) & (stretched < high), 10.0, 0.0), 0 * x
+
+        key = jax.random.key(0)
+        return jaxnerf.update_grid(key, grid, scene, cells, threshold=0.1, radii=jnp.float32([0.01, 0.16])).density_max
+
+    assert (density_at(0.0099, 0.1601) == 10).all()
+    for low, high in ((0.01, 0.02), (0.02, 0.04), (0.04, 0.08), (0.08, 0.16)):
+        found.append(float((density_at(low, high) > 0).mean()))
+    np.testing.assert_allclose(found, 0.25, atol=0.06)  # uniform in the logarithm
+    assert not (density_at(0.2, 0.3) > 0).any()
+
+
 def test_a_cell_is_occupied_if_matter_is_there_at_any_time():
     """A wall stands at x < 0 in the first half of the time, and at x > 0 in the second."""
 

@@ -302,6 +302,11 @@ def test_near_and_far_of_a_frame_are_those_of_the_views_nearby_and_move_with_it(
     assert bounds(forward) == pytest.approx((1.5, 6.5), abs=0.05)
     forward[:, 3] -= 2 * forward[:, 2]
     assert bounds(forward)[0] == 1, "no less than any view's"
+    backward = fourth.copy()
+    backward[:, 3] += 50 * backward[:, 2]
+    near, far = bounds(backward)
+    distance = np.linalg.norm(fourth[:, 3])
+    assert 40 < near < 50 + distance < far <= 50.01 + 9, "what the views look at is between them"
     shared = views_of(ring(8), near=0.05, far=7.0)
     for pose in (first, between, forward):
         near, far = camera_paths.frame_bounds(pose[None], shared)

@@ -1,5 +1,7 @@
 """The hash grid: interpolation of its levels, spherical harmonics, gradients and cost."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,9 +9,11 @@ import optax
 import pytest
 
 from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
+from jaxnerf.core.scene import needs_of
 from jaxnerf.fields.hash_grid import (
     TableLevel,
     color_activation,
+    damping,
     harmonics,
     hash_decay,
     hash_grid_field,
@@ -436,3 +440,43 @@ def test_total_variation_compares_neighbours_in_levels_that_are_not_hashed():
     np.testing.assert_allclose(value, want, rtol=1e-5)
     assert not slope[12:32].any() and slope[:12].any() and abs(slope.sum()) < 1e-5
     assert total_variation({"table": table}, levels=LEVELS[1:2]) == 0
+
+
+# Damping by the size of a pixel's footprint.
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_damping_is_the_mass_within_a_cell(dtype):
+    """Its value and derivative are those of float64, for any radius."""
+    radius = np.array([0.0, 1e-30, 1e-3, 0.1, 0.3, 1.0, 7.0, 1e4, 1e30, np.inf], dtype)
+    cell = 0.25
+    with jax.enable_x64(dtype == np.float64):
+        value, slope = jax.vmap(jax.value_and_grad(lambda at: damping(at, cell)))(jnp.asarray(radius))
+        assert value.dtype == dtype
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        at = cell / (math.sqrt(2) * radius.astype(np.float64))
+        expected = np.array([math.erf(each) for each in at])
+        derivative = np.where(at > 4, 0, -2 / math.sqrt(math.pi) * np.exp(-(at**2)) * at / radius)
+    np.testing.assert_allclose(value, expected, rtol=1e-6, atol=2e-8)
+    np.testing.assert_allclose(slope[:-1], derivative[:-1], rtol=1e-5, atol=1e-6)
+    assert value[0] == 1 and slope[0] == 0 and value[-1] == 0 and slope[-1] == 0
+
+
+def test_a_prefiltered_field_forgets_what_is_smaller_than_the_footprint():
+    options = {**BOX, "resolutions": (3, 17), "table_size": 2000, "prefilter": True}
+    field = hash_grid_field(**options)
+    assert needs_of(field.apply) == ("radius",) and needs_of(hash_grid_field(**BOX).apply) == ()
+    params = field.init(jax.random.key(0))
+    params["table"] = jnp.asarray(np.random.default_rng(0).normal(size=params["table"].shape), jnp.float32)
+    x, viewdirs = inside((6, 4)), directions((6, 1))
+
+    @jax.jit
+    def log_density(radius, params=params):
+        return jnp.log(field.apply(params, x, viewdirs, radius=jnp.broadcast_to(radius, (6, 4)))[0])
+
+    assert np.ptp(log_density(jnp.inf)) == 0 < np.ptp(log_density(0.0))
+    coarse = {**params, "table": params["table"].at[2 * 3 * 2 :].set(0)}  # without cells of 0.19 a side
+    narrow, wide = (np.abs(log_density(radius, coarse) - log_density(radius)).max() for radius in (1e-3, 1.0))
+    assert narrow > 0.5 and wide < 0.2 * narrow
+    one_per_ray = field.apply(params, x, viewdirs, radius=jnp.full((6, 1), 0.3))[0]
+    np.testing.assert_allclose(jnp.log(one_per_ray), log_density(0.3), atol=1e-5)

@@ -12,11 +12,11 @@ from absl import flags
 from ml_collections import config_flags
 
 from helpers import compiled
-from jaxnerf import Camera, Views
+from jaxnerf import Camera, SparsePoints, Views
 from jaxnerf.configs import default, lego_fast, lego_mlp_fast
 from jaxnerf.data import dataset, synthetic
 from jaxnerf.data.dataset import DataOptions
-from jaxnerf.data.facts import mean_color
+from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
@@ -40,6 +40,7 @@ AUTO_FIELDS = {
     "hash_grid.table_size": 2**12,
     "hash_grid.width": 32,
     "hash_grid.view_width": 32,
+    "hash_grid.prefilter": True,
     "occupancy.pool_samples_per_ray": 6.0,
     "occupancy.contracted": True,
     "occupancy.lower": (-1.0, -2.0, -3.0),
@@ -245,7 +246,7 @@ def test_explicit_values_do_not_change(views):
     changed = {name for name, value in fields(config).items() if value != fields(given)[name]}
     names = ("contracted", "lower", "upper", "step_size", "resolution", "min_views")
     expected = {"data.world", "data.fingerprint", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
-    expected |= {"data.near", "data.background_color", "cameras.num_images", "losses.depth"}
+    expected |= {"data.near", "data.background_color", "cameras.num_images", "losses.depth", "hash_grid.prefilter"}
     assert changed == expected
 
 
@@ -645,3 +646,35 @@ def test_sizes_of_lego(scenes_dir):
     assert slow.occupancy.lower == occupancy.lower and slow.occupancy.step_size == occupancy.step_size
     assert config.train.max_steps == config.train.lr_steps == 10000
     build(resolve_for_device(slow)[0])
+
+
+@pytest.mark.parametrize(
+    ("spread", "num_scales", "expected"), [(1.7, 1, "off"), (1.7, 2, "off"), (1, 3, "on"), (6, 1, "on")]
+)
+def test_features_are_damped_where_footprints_differ(views, spread, num_scales, expected):
+    away = np.linspace(1, spread, len(views.size))[:, None]
+    focal = np.asarray(views.cameras.focal) / away
+    views = dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, focal=focal.astype(np.float32)))
+    config = auto_config()
+    config.data.num_scales = num_scales
+    resolved = resolve(config, views)
+    assert resolved.config.hash_grid.prefilter is (expected == "on")
+    (line,) = (line for line in resolved.lines if line.startswith("prefilter"))
+    assert line.startswith(f"prefilter     {expected}: the footprints of pixels differ by a factor of")
+
+
+def test_footprints_are_those_of_the_points_that_views_show(views):
+    """Half of the views see points twice as far away as the others; one that shows none counts by what all look at."""
+    count = len(views.size)
+    pose = np.asarray(views.cameras.to_world)
+    depth = np.where(np.arange(count) % 2, 6.0, 3.0).astype(np.float32)
+    positions = pose[:, :, 3] - depth[:, None] * pose[:, :, 2]
+    index = np.arange(count, dtype=np.int32)
+    sparse = SparsePoints(positions=positions, view=index, point=index, pixel=np.zeros((count, 2), np.float32))
+    assert footprint_spread(views) == pytest.approx(1, abs=0.2)
+    found = dataclasses.replace(views, sparse=sparse)
+    assert footprint_spread(found) == pytest.approx(2, rel=1e-5)
+    focal = float(views.cameras.focal[0, 0])
+    assert footprint_radii(found, num_scales=3) == pytest.approx(np.array([3, 4 * 6]) / focal / 3**0.5, rel=1e-5)
+    behind = dataclasses.replace(sparse, positions=pose[:, :, 3] + pose[:, :, 2])  # as wrong matches are: not counted
+    assert footprint_radii(dataclasses.replace(views, sparse=behind)) == footprint_radii(views)

@@ -53,6 +53,27 @@ def solid():
     return Solid()
 
 
+def test_a_small_frame_is_the_mean_of_rays_as_dense_as_in_training(solid):
+    """The ball's silhouette: with one ray a pixel is white or not, with several it is what is covered."""
+    height = int(solid.views.size[0, 0])
+    fov = 2 * np.arctan(0.5 * height / float(solid.views.cameras.focal[0, 1]))
+    small = FrameCamera(np.asarray(solid.views.cameras.to_world)[1], fov, height // 4, height // 4)
+    renderer = solid.renderer
+    assert renderer.rays_per_side(small) == 4 and renderer.rays_per_side(small.resized(height, height)) == 1
+    assert renderer.rays_per_side(small, max_rays=9.5) == 3 and renderer.rays_per_side(small, max_rays=0.1) == 1
+    compiled = renderer.num_compiled
+    frame, whole = (
+        renderer.render(solid.state, small, side=4),
+        renderer.render(solid.state, small.resized(height, height)),
+    )
+    assert frame.camera == small and renderer.num_compiled <= max(compiled, 3)
+    np.testing.assert_allclose(frame.rgb, whole.rgb.reshape(height // 4, 4, -1, 4, 3).mean((1, 3)), atol=1e-6)
+    np.testing.assert_allclose(frame.opacity, whole.opacity.reshape(height // 4, 4, -1, 4).mean((1, 3)), atol=1e-6)
+    np.testing.assert_array_equal(frame.distance, whole.distance[2::4, 2::4])
+    edge = (frame.opacity > 0.1) & (frame.opacity < 0.9)
+    assert edge.any()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ball_runs.KINDS)
 def test_a_frame_equals_that_of_render(kind, tmp_path):
@@ -66,9 +87,8 @@ def test_a_frame_equals_that_of_render(kind, tmp_path):
     pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
     content = {"frames": [{"transform_matrix": pose.tolist()}], "w": 30, "h": 20, "fl_x": camera.focal}
     (tmp_path / "one.json").write_text(json.dumps(content))
-    folder, *_ = render_path(
-        it.folder, path=str(tmp_path / "one.json"), kind="none", overwrite=True, settings={"bake_occupancy": True}
-    )
+    options = {"settings": {"bake_occupancy": True}, "max_rays_per_pixel": 1}
+    folder, *_ = render_path(it.folder, path=str(tmp_path / "one.json"), kind="none", overwrite=True, **options)
     expected = iio.imread(folder / "color" / "0000.png").astype(int)
     assert np.abs(frame_image(frame, "colour") - expected).max() <= 1
     assert np.ptp(expected) > 50 and 0.05 < (frame.opacity > 0.5).mean() < 0.95

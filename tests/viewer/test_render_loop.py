@@ -20,8 +20,11 @@ class FakeRenderer:
         self.calls, self.seconds, self.hold = [], chunk_seconds, threading.Event()
         self.hold.set()
 
-    def render(self, state, camera, *, fast, crop, uncertain, abandoned):
-        call = SimpleNamespace(state=state, camera=camera, fast=fast, crop=crop, chunks=0, abandoned=False)
+    def rays_per_side(self, camera, max_rays):
+        return 3 if max_rays >= 9 else 1
+
+    def render(self, state, camera, *, fast, crop, uncertain, abandoned, side):
+        call = SimpleNamespace(state=state, camera=camera, fast=fast, side=side, crop=crop, chunks=0, abandoned=False)
         self.calls.append(call)
         for _ in range(-(-camera.width * camera.height // CHUNK)):
             assert self.hold.wait(10)
@@ -210,3 +213,16 @@ def test_the_fraction_of_the_time_is_kept(watched):
     it.wait()
     spent = sum(call.chunks for call in it.renderer.calls) * 0.01
     assert time.perf_counter() - started > 3 * spent
+
+
+def test_only_a_final_frame_has_several_rays_a_pixel_as_far_as_time_allows():
+    watched = Watched()
+    watched.submit(width=60, height=40)
+    watched.wait()
+    *moving, last = watched.renderer.calls
+    assert moving and all(call.side == 1 and call.fast for call in moving)
+    assert last.side == 3 and not last.fast and last.camera.width == 60
+    watched.submit(width=400, height=300)  # each ray takes at least 2 us, so nine a pixel would take over 2 s
+    watched.wait()
+    watched.loop.close()
+    assert watched.renderer.calls[-1].side == 1 and not watched.renderer.calls[-1].fast

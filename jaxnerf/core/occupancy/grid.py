@@ -104,6 +104,7 @@ def update_grid(
     smoothing: Float[ArrayLike, ""] = 0.2,
     spread: Bool[ArrayLike, ""] = True,
     chunk: int = 8192,
+    radii: Float[ArrayLike, "2"] | None = None,
 ) -> OccupancyGrid:
     """Updates some cells from the density at a random point in each (as in arXiv:2201.05989).
 
@@ -114,7 +115,8 @@ def update_grid(
         key: for the point in each cell.
         grid: OccupancyGrid.
         scene: see render_samples. A scene that asks for more gets what `cell_inputs` computes, with the spacing as
-            length, and a random time for each cell: a cell is occupied if matter is there at any time.
+            length, and a random time for each cell: a cell is occupied if matter is there at any time, or for a cone
+            of any of the radii.
         cells: [M] int32, flat indices x first, each at most once; indices past the last cell are ignored.
         threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there empties cells
             that absorb less than 1 % of the light.
@@ -125,6 +127,9 @@ def update_grid(
             that find opaque matter the transmittance is (1 - smoothing)^n; one that finds none adds smoothing.
         spread: bool, may be traced. Once the field has formed, neighbours of dense cells only cost samples.
         chunk: cells evaluated at once.
+        radii: [2] world units, above 0, the smallest and the largest radius for which the scene is rendered where
+            space is not contracted; that of a cell is drawn between them, uniform in its logarithm. None: see
+            `cell_inputs`.
 
     Returns:
         OccupancyGrid. Cells that are not valid stay empty. The update is not meant to be differentiated.
@@ -142,7 +147,13 @@ def update_grid(
         place = (contraction.expand(jnp.clip(4 * place - 2, -_JUST_INSIDE, _JUST_INSIDE)) + 2) / 4
     x = grid.lower[None] + place * (grid.upper - grid.lower)[None]
     length = _spacings(grid, threshold, spacing)[cells] if needs_of(scene) else None
-    inputs = cell_inputs("update_grid", scene, grid, x, length=length, key=key)
+    radius = None
+    if radii is not None and "radius" in needs_of(scene):
+        # Another key than those of place and time.
+        smallest, largest = jnp.log(radii)
+        at = jax.random.uniform(jax.random.fold_in(key, 2), x.shape[:-1])
+        radius = _stretch(grid, x) * jnp.exp(smallest + (largest - smallest) * at)
+    inputs = cell_inputs("update_grid", scene, grid, x, length=length, radius=radius, key=key)
 
     def density_at(at):
         x, inputs = at
@@ -217,6 +228,7 @@ def cell_inputs(
     x: Float[ArrayLike, "*batch 3"],
     *,
     length: Num[ArrayLike, "*batch"] | None = None,
+    radius: Num[ArrayLike, "*batch"] | None = None,
     key: Keys | None = None,
 ) -> dict[str, Num[Array, "*batch"]]:
     """Computes what a scene asks for at positions that are on no ray, such as those in the cells of a grid.
@@ -227,10 +239,11 @@ def cell_inputs(
         grid: OccupancyGrid.
         x: [..., 3] world units.
         length: [...] world units; None: the size of the cell around x, the cube root of its volume.
+        radius: [...] world units; None: half that size.
         key: of the times; None: all are 0.
 
     Returns:
-        By name, each [...]: radius, half the size of the cell; length; time, uniform in [0, 1) or 0; image_index, 0.
+        By name, each [...]: radius; length; time, uniform in [0, 1) or 0; image_index, 0.
 
     Raises:
         ValueError: if the scene asks for progress, which must be bound.
@@ -244,7 +257,7 @@ def cell_inputs(
     return inputs_of(
         function,
         scene,
-        radius=lambda: _cell_sizes(grid, x) / 2,
+        radius=lambda: _cell_sizes(grid, x) / 2 if radius is None else radius,
         length=lambda: _cell_sizes(grid, x) if length is None else length,
         time=time,
         image_index=lambda: jnp.zeros(shape, jnp.int32),
@@ -253,13 +266,16 @@ def cell_inputs(
 
 def _cell_sizes(grid, x):
     """Returns [...], the cube root of the volume of the cell around positions x [..., 3], in world units."""
-    lead = (1,) * (x.ndim - 1)
-    sides = grid.upper - grid.lower
-    size = jnp.cbrt(jnp.prod(sides / jnp.array(grid.occupied.shape)))
+    size = jnp.cbrt(jnp.prod((grid.upper - grid.lower) / jnp.array(grid.occupied.shape)))
+    return size * _stretch(grid, x)
+
+
+def _stretch(grid, x):
+    """Returns [...], lengths at positions x [..., 3] over those that contraction makes of them; 1 without it."""
     if not grid.contracted:
-        return jnp.full(x.shape[:-1], size)
-    middle = (grid.lower + grid.upper) / 2
-    return size / contraction.length_scale((x - middle.reshape(*lead, 3)) / (sides / 4).reshape(*lead, 3))
+        return jnp.ones(x.shape[:-1])
+    lead, middle, quarter = (1,) * (x.ndim - 1), (grid.lower + grid.upper) / 2, (grid.upper - grid.lower) / 4
+    return 1 / contraction.length_scale((x - middle.reshape(*lead, 3)) / quarter.reshape(*lead, 3))
 
 
 def cells_along(grid: OccupancyGrid, rays: Rays, samples: Samples) -> Int[Array, "*batch samples"]:

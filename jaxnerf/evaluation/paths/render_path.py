@@ -1,6 +1,5 @@
 """Renders a trained run along a camera path, resumes where it was interrupted, and makes a video."""
 
-import functools
 import glob
 import importlib.util
 import os
@@ -19,6 +18,7 @@ from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import newest_step, refined_views, render_settings, restore_run
+from jaxnerf.evaluation.supersampling import MAX_RAYS, render_pixels, trained_footprint
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
@@ -46,6 +46,7 @@ def render_path(
     kind: str = "auto",
     overwrite: bool = False,
     shard: tuple[int, int] = shards.WHOLE,
+    max_rays_per_pixel: int = MAX_RAYS,
 ) -> list[pathlib.Path]:
     """Renders a camera path to <workdir>/renders/<path>-<step>/ and a video beside that folder.
 
@@ -72,6 +73,8 @@ def render_path(
         overwrite: whether frames of that name are deleted first.
         shard: (index, count): only every count-th frame, from frame `index` on. The process that finds all
             frames finished makes the depth images and the videos.
+        max_rays_per_pixel: a pixel that covers more of the scene than those of training is the mean over as many rays
+            as training has there, and at most so many, see `Footprint.rays_per_side`.
 
     Returns:
         The paths written: the folder and the videos.
@@ -89,14 +92,16 @@ def render_path(
     up = up or run.experiment.config.data.up or None
     path = camera_path.make_path(select_kind(path, views, up), views, num_frames=num_frames, closed=closed, up=up)
     path = camera_path.resize(path, *size)
+    sides = trained_footprint(run, views).rays_per_side(path.poses, path.focal, max_rays=max_rays_per_pixel)
+    _print_rays(sides)
     target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
     atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(overwrite, shard, target)
     found = predictor and predictor(run)
-    provenance = _provenance(run, step, variables, views, path, closed)
+    provenance = _provenance(run, step, variables, views, path, closed, sides)
     provenance |= {"uncertainty": found.identity} if found else {}
     shards.make_folder(target, provenance, overwrite=overwrite)
-    missing = _write_frames(target, run, variables, views, path, rgba=rgba, predictor=found, shard=shard)
+    missing = _write_frames(target, run, variables, views, path, sides, rgba=rgba, predictor=found, shard=shard)
     written = [target]
     if missing:
         print(f"shard {shard[0]}/{shard[1]} is done, {missing} frames of others are missing", file=sys.stderr)
@@ -110,7 +115,7 @@ def render_path(
     return written
 
 
-def _write_frames(target, run, variables, views, path, *, rgba, predictor, shard):
+def _write_frames(target, run, variables, views, path, sides, *, rgba, predictor, shard):
     """Renders those frames of a shard that are not in a folder yet; see `render_path`.
 
     Returns:
@@ -129,19 +134,17 @@ def _write_frames(target, run, variables, views, path, *, rgba, predictor, shard
     readable = output_images.readable([files[index] for index in frames], [(path.height, path.width)] * len(frames))
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
     if todo:
-        render = functools.partial(run.render_image, variables)
         posed, progress = camera_path.posed_views(views, path), Progress(len(frames))
         compiled = None
         for done, index in enumerate(todo, len(frames) - len(todo) + 1):
             pixels = camera_path.path_pixels(posed, path, index, offset=run.experiment.config.data.pixel_offset)
-            rays = run.experiment.view_rays(posed, index, pixels)
-            image = render(rays)
-            distance = run.experiment.world_depth(posed, index, pixels, image.depth)
+            size = float(np.sqrt(np.prod(posed.cameras.focal[index] / path.focal[index])))
+            image, distance = render_pixels(run, variables, posed, index, pixels, side=int(sides[index]), size=size)
             planes = [np.asarray(distance, np.float32), output_images.to_8_bits(image.rgb)]
             if rgba:
                 planes.append(output_images.straight_alpha(image.rgb, image.opacity, run.experiment.background))
             if predictor:
-                planes.append(predictor.error(rays))
+                planes.append(predictor.error(run.experiment.view_rays(posed, index, pixels)))
             for file, plane in zip(files[index], planes, strict=True):
                 output_images.write_image(file, plane)
             compiled, left = compiled or (time.monotonic(), done), ""
@@ -171,11 +174,23 @@ def select_kind(kind, views, up):
     return kind
 
 
-def _provenance(run, step, variables, views, path, closed):
+def _print_rays(sides):
+    """Prints how many rays a pixel has, if some pixels have several."""
+    if sides.max() > 1:
+        rays = sides[sides > 1] ** 2
+        count = f"{rays.min()}" if rays.min() == rays.max() else f"{rays.min()} to {rays.max()}"
+        where = f" in {len(rays)} of {len(sides)} frames" if len(rays) < len(sides) else ""
+        why = "as a pixel covers more than in training; --max_rays_per_pixel=1 renders one"
+        print(f"rays: {count} per pixel{where}, {why}", file=sys.stderr)
+
+
+def _provenance(run, step, variables, views, path, closed, sides):
     """Returns everything that the frames depend on, for path.json."""
     provenance = {"path": path.source, "frames": len(path.poses), "width": path.width, "height": path.height}
     if path.source == "interpolate":
         provenance["closed"] = closed
+    if sides.max() > 1:
+        provenance["rays_per_pixel"] = fingerprint(sides)
     return {
         **provenance,
         "step": step,
