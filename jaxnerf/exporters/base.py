@@ -109,12 +109,14 @@ def export_run(
     Raises:
         ValueError: if there is no such run, checkpoint or exporter, a setting is out of range, or the folder exists.
     """
-    export = EXPORTERS.get(kind)
+    exporter = EXPORTERS.get(kind)
     settings = settings or ExportSettings()
     _check_settings(settings)
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
     run = restore_run(workdir, data_dir=data_dir)
+    if exporter.check is not None:
+        exporter.check(run)
     step = newest_step(run, workdir, step)
     target = pathlib.Path(workdir) / "exports" / (name or f"{kind}-{step}")
     atomic_files.check_tree(target.parent)
@@ -128,7 +130,8 @@ def export_run(
     with atomic_files.partial_folder(target) as partial:
         if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
             say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
-        export(ExportSource(run, step, variables, views, relative_to(settings, views.file_origin), say), partial)
+        relative = relative_to(settings, views.file_origin)
+        exporter.export(ExportSource(run, step, variables, views, relative, say), partial)
         if any(views.file_origin):
             (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
     return target

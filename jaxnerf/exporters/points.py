@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
+from jaxnerf.registry import Exporter
 
 _TYPES = {"f": ("float", "<f4"), "u": ("uchar", "u1")}
 
@@ -32,6 +33,9 @@ def export_points(source: ExportSource, folder: pathlib.Path) -> None:
         },
     )
     source.say(f"{len(chosen):,} points with normals and colours, in the dataset's units")
+
+
+EXPORTER = Exporter(export_points)
 
 
 def surface_points(images: Sequence[DepthImage], box: np.ndarray) -> tuple[np.ndarray, ...]:

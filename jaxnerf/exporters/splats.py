@@ -22,6 +22,7 @@ from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.points import surface_points, thinned, write_ply
 from jaxnerf.exporters.surfaces import export_box, render_depth_images, sphere_directions
 from jaxnerf.fields.hash_grid import harmonics
+from jaxnerf.registry import Exporter
 
 _NUM_DIRECTIONS = 32  # from which the colour of a point is evaluated
 _NUM_NEIGHBORS = 4
@@ -77,6 +78,9 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
     value, count = score(source, gaussians)
     split = source.run.experiment.config.eval.split
     source.say(f"{len(points):,} Gaussians; PSNR {value:.2f} dB over {count} views of {split}")
+
+
+EXPORTER = Exporter(export_splats)
 
 
 def make_gaussians(points: np.ndarray, normals: np.ndarray, extinction: np.ndarray, colors: np.ndarray) -> Gaussians:

@@ -15,6 +15,7 @@ from jaxnerf.exporters.depth import export_depth
 from jaxnerf.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field, write_glb
 from jaxnerf.exporters.points import export_points, thinned
 from jaxnerf.exporters.splats import export_splats, score
+from jaxnerf.registry import Exporter
 from runs import run
 
 IN_FILE = 2 * RADIUS  # the ball's radius there
@@ -274,7 +275,7 @@ def test_an_export_is_whole_or_absent(workdir, monkeypatch):
         if fail[0]:
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(base.EXPORTERS._parts, "test", export)
+    monkeypatch.setitem(base.EXPORTERS._parts, "test", Exporter(export))
     with pytest.raises(OSError, match="No space"):
         export_run(workdir, "test")
     assert list((workdir / "exports").iterdir()) == []
@@ -293,6 +294,26 @@ def test_an_export_is_whole_or_absent(workdir, monkeypatch):
     assert [path.name for path in (workdir / "exports").iterdir()] == ["test-7"]
     with pytest.raises(ValueError, match="expected a plain file name"):
         export_run(workdir, "test", name="../out")
+
+
+def test_a_run_that_cannot_be_exported_is_refused_before_its_grid_is_extracted(monkeypatch, tmp_path):
+    source, calls = source_of(), []
+
+    def restore(workdir, data_dir=None, settings=None):
+        calls.append(settings)
+        return source.run
+
+    def check(run):
+        assert run is source.run
+        raise ValueError("has no colours")
+
+    monkeypatch.setattr(base, "restore_run", restore)
+    source.run.experiment.model.grid_schedule = None
+    monkeypatch.setitem(base.EXPORTERS._parts, "test", Exporter(lambda source, folder: None, check))
+    with pytest.raises(ValueError, match="has no colours"):
+        export_run(tmp_path, "test")
+    assert calls == [None] and not list(tmp_path.iterdir())
+    assert base.EXPORTERS.get("web").check is not None
 
 
 @pytest.mark.parametrize(
