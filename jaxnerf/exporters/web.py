@@ -18,9 +18,9 @@ import numpy as np
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.views import Views
+from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import gaze_center, up_of
 from jaxnerf.evaluation.paths import camera_path
-from jaxnerf.evaluation.paths.render_path import select_kind
 from jaxnerf.evaluation.restore import TrainedRun, refined_views
 from jaxnerf.exporters import web_scene
 from jaxnerf.exporters.base import ExportSource
@@ -139,7 +139,8 @@ def about(source: ExportSource, scene: WebScene, quality: str) -> dict[str, Any]
     name = pathlib.PurePath(config.data.dir).name or "embedded scene"
     names = views.names or tuple(f"view {index}" for index in range(len(poses)))
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MAX_CAMERAS)).round().astype(int))
-    path = camera_path.make_path(select_kind(None, views, None), views, num_frames=_TOUR_FRAMES)
+    kind, _ = path_poses.default_kind(poses, camera_path.up_direction(None, views))
+    path = camera_path.make_path(kind, views, num_frames=_TOUR_FRAMES)
     how = [f"trained for {source.step:,} steps on {len(poses)} images", quality, "made with jaxnerf"]
     return {
         "name": name,
@@ -173,7 +174,7 @@ def encode(scene: WebScene, description: dict[str, Any], *, level: int = 9) -> b
     Args:
         scene: WebScene.
         description: see `about`.
-        level: of the compression, 1 (fast) to 9 (small).
+        level: of the compression, 0 (none) to 9 (small).
     """
     arrays, parts, place = [], [], 0
     for name, array in web_scene.textures(scene).items():
