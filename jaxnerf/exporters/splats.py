@@ -55,10 +55,11 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
     write_gaussians(folder / "splats.ply", gaussians)
     write_spz(folder / "splats.spz", gaussians)
     value, count = score(source, gaussians)
-    rounded, _ = score(source, read_spz(folder / "splats.spz"))
+    rounded, of_run = score(source, read_spz(folder / "splats.spz"))[0], score(source, None)[0]
     split = source.run.experiment.config.eval.split
     source.say(
-        f"{len(points):,} Gaussians; PSNR {value:.2f} dB, as SPZ {rounded:.2f} dB, over {count} views of {split}"
+        f"{len(points):,} Gaussians; PSNR {value:.2f} dB, as SPZ {rounded:.2f} dB, over {count} views of {split}, "
+        f"where the run has {of_run:.2f} dB"
     )
 
 
@@ -115,28 +116,36 @@ def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) ->
     return np.concatenate(parts)[:count]
 
 
-def score(source: ExportSource, gaussians: Gaussians) -> tuple[float, int]:
+def score(source: ExportSource, gaussians: Gaussians | None) -> tuple[float, int]:
     """Returns the mean PSNR of rasterized Gaussians over views of the split `eval.split`, and how many these are.
 
-    Behind the Gaussians is the run's background, which the file does not hold.
+    Behind the Gaussians is the run's background, which the file does not hold. None: the run itself is scored.
     """
     run, split = source.run, source.run.experiment.config.eval.split
     views = refined_views(run, run.experiment.load_split(split), split, source.variables[0])
-    poses = poses_in_file(np.asarray(views.cameras.to_world), views.to_file)
     count = min(_NUM_SCORED, len(views.size))
     values = []
     for index in map(int, np.arange(count) * len(views.size) // count):
-        camera = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], views.cameras)
-        height, width = (int(side) for side in views.size[index])
-        pinhole = Camera(to_world=poses[index], focal=camera.focal, center=camera.center, height=height, width=width)
-        image = rasterize(gaussians, pinhole, run.experiment.background)
-        if camera.distortion is not None:
-            pixels = undistort(camera, pixel_grid(height, width))[0] * camera.focal + camera.center - 0.5
-            rows = np.asarray(pixels).reshape(-1, 2).T[::-1]
-            planes = [
-                ndimage.map_coordinates(plane, rows, order=1, mode="nearest") for plane in np.moveaxis(image, -1, 0)
-            ]
-            image = np.stack(planes, axis=-1).reshape(height, width, 3)
+        if gaussians is None:
+            pixels = pixel_grid(*(int(side) for side in views.size[index]))
+            image = run.render_image(source.variables, run.experiment.view_rays(views, index, pixels)).rgb
+        else:
+            image = _image_of(source, gaussians, views, index)
         image = np.clip(image, 0, 1).astype(np.float32)
         values.append(float(psnr(jnp.asarray(image), views.image(index), mask=pixel_mask(views, index))))
     return float(np.mean(values)), count
+
+
+def _image_of(source, gaussians, views, index):
+    """Returns what Gaussians look like through the camera of a view, with its lens."""
+    pose = poses_in_file(np.asarray(views.cameras.to_world)[index : index + 1], views.to_file)[0]
+    camera = jax.tree.map(lambda leaf: np.asarray(leaf)[index], views.cameras)
+    height, width = (int(side) for side in views.size[index])
+    pinhole = Camera(to_world=pose, focal=camera.focal, center=camera.center, height=height, width=width)
+    image = rasterize(gaussians, pinhole, source.run.experiment.background)
+    if camera.distortion is None:
+        return image
+    pixels = undistort(camera, pixel_grid(height, width))[0] * camera.focal + camera.center - 0.5
+    rows = np.asarray(pixels).reshape(-1, 2).T[::-1]
+    planes = [ndimage.map_coordinates(plane, rows, order=1, mode="nearest") for plane in np.moveaxis(image, -1, 0)]
+    return np.stack(planes, axis=-1).reshape(height, width, 3)
