@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera, Vector
 from jaxnerf.exporters.gaussians import LOW_PASS, MAX_ALPHA, MAX_SLOPE, Gaussians, visible_pairs
-from jaxnerf.exporters.surfaces import DepthImage
+from jaxnerf.exporters.surfaces import DepthImage, inside
 from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.training.metric_log import Progress
 
@@ -44,7 +44,13 @@ class _Pairs(NamedTuple):
 
 
 def fit_gaussians(
-    gaussians: Gaussians, images: Sequence[DepthImage], background: Vector | None, *, steps: int, seed: int = 0
+    gaussians: Gaussians,
+    images: Sequence[DepthImage],
+    background: Vector | None,
+    *,
+    box: Float[np.ndarray, "2 3"] | None = None,
+    steps: int,
+    seed: int = 0,
 ) -> Gaussians:
     """Fits Gaussians to the colours of images, by Adam on the mean squared error of one image a step.
 
@@ -54,6 +60,7 @@ def fit_gaussians(
         gaussians: to begin with.
         images: all of one size.
         background: [3] behind the Gaussians; None: black.
+        box: pixels that show a surface outside of it are left out, as no Gaussian is there; None: all count.
         steps: of Adam; its rates decay exponentially.
         seed: of the order of the images.
     """
@@ -64,16 +71,18 @@ def fit_gaussians(
     adam = optax.chain(optax.scale_by_adam(b2=_BETA2, eps=_EPSILON), optax.scale_by_learning_rate(rates))
 
     @jax.jit
-    def step(parameters, state, initial, camera, pairs, rgb):
+    def step(parameters, state, initial, camera, pairs, rgb, weight):
         def error(parameters):
             image = _draw(_gaussians(parameters, *initial), camera, pairs, rgb.shape[:2], behind)
-            return jnp.mean((image - rgb.reshape(-1, 3) / 255.0) ** 2)
+            squares = ((image - rgb.reshape(-1, 3) / 255.0) ** 2).sum(axis=-1)
+            return (weight.reshape(-1) * squares).mean()
 
         updates, state = adam.update(jax.grad(error)(parameters), state)
         updates = {name: RATES[name] * update for name, update in updates.items()}
         return optax.apply_updates(parameters, updates), state
 
     state, rng, progress = adam.init(parameters), np.random.default_rng(seed), Progress(steps)
+    weights = [_weights(image, box) for image in images]
     count, order = 0, []
     while count < steps:
         order = order or rng.permutation(len(images)).tolist()
@@ -82,11 +91,19 @@ def fit_gaussians(
         listed = {index: _listed(now, images[index].camera) for index in group}
         for index in rng.permutation(group * _VISITS)[: steps - count]:
             camera = [np.float32(getattr(images[index].camera, name)) for name in ("to_world", "focal", "center")]
-            parameters, state = step(parameters, state, initial, camera, listed[index], images[index].rgb)
+            parameters, state = step(
+                parameters, state, initial, camera, listed[index], images[index].rgb, weights[index]
+            )
             count += 1
         progress.show(count, "steps of fitting splats")
     progress.close()
     return jax.tree.map(np.asarray, _gaussians(parameters, *initial))
+
+
+def _weights(image, box):
+    """Returns [H, W] float32, 0 for the pixels that show a surface outside of the box, and otherwise 1."""
+    outside = np.isfinite(image.depth) & (image.depth > 0) & ~inside(image.points(), box)
+    return np.float32(~outside)
 
 
 def _parameters(gaussians):

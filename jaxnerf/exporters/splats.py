@@ -45,13 +45,14 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
     settings = source.settings
     longest = int(source.views.size[0].max())
     images = render_depth_images(source, settings.size or min(settings.image_size, longest))
-    points, normals, _, extinction, field_x = surface_points(images, export_box(source, images))
+    box = export_box(source, images)
+    points, normals, _, extinction, field_x = surface_points(images, box)
     chosen = thinned(points, settings.num_points or _NUM_POINTS)
     points, normals, extinction, field_x = (each[chosen] for each in (points, normals, extinction, field_x))
     gaussians = make_gaussians(points, normals, extinction, colors_of(source, field_x, normals))
     if settings.fit_steps:
         background = source.run.experiment.background
-        gaussians = fit_gaussians(gaussians, images, background, steps=settings.fit_steps)
+        gaussians = fit_gaussians(gaussians, images, background, box=box, steps=settings.fit_steps)
     write_gaussians(folder / "splats.ply", gaussians)
     write_spz(folder / "splats.spz", gaussians)
     value, count = score(source, gaussians)

@@ -90,6 +90,14 @@ def test_no_steps_change_nothing():
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
+def test_pixels_that_show_what_is_outside_the_box_do_not_count():
+    given, (image,) = some(), images_of(some(seed=1), 1)
+    image = image._replace(depth=np.ones((SIZE, SIZE), np.float32))
+    for box, moves in ((np.array([[8.0] * 3, [9.0] * 3]), False), (np.array([[-9.0] * 3, [9.0] * 3]), True)):
+        fitted = fit_gaussians(given, [image], WHITE, box=box, steps=1)
+        assert (np.abs(fitted.harmonics - given.harmonics).max() > 1e-3) == moves
+
+
 def test_spz_holds_the_gaussians_with_the_precision_of_the_format(tmp_path):
     given = some(200)
     files.write_spz(tmp_path / "splats.spz", given)
