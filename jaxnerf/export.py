@@ -43,7 +43,14 @@ _NUM_VIEWS = flags.DEFINE_integer(
     "The largest number of training views to render. For a mesh of a bounded scene half as many views from all around "
     "are added.",
 )
-_NUM_POINTS = flags.DEFINE_integer("num_points", 200_000, "points, splats: the largest number of points or Gaussians.")
+_NUM_POINTS = flags.DEFINE_integer(
+    "num_points",
+    None,
+    "points, splats: the largest number of points or Gaussians. When it is not given, it is 200,000 and 60,000.",
+)
+_FIT_STEPS = flags.DEFINE_integer(
+    "fit_steps", 400, "splats: steps of fitting them to images of the field; 0: they stay as they are placed."
+)
 _FORMAT = flags.DEFINE_string("format", "ply", "mesh: ply, glb or obj.")
 _UP = flags.DEFINE_enum(
     "up",
@@ -68,6 +75,7 @@ _SPLIT = flags.DEFINE_bool("split", False, "web: whether the scene's data is in 
 _CONCERN = {  # the flags that only some kinds read
     ("mesh",): (_FORMAT, _UP, _MAX_FACES, _CLOSED, _MIN_PIECE),
     ("points", "splats"): (_NUM_POINTS,),
+    ("splats",): (_FIT_STEPS,),
     ("web",): (_SPLIT,),
 }
 _NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP.")
@@ -87,7 +95,7 @@ def main(argv):
             )
     names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
     names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED, "up": _UP}
-    names |= {"split": _SPLIT}
+    names |= {"split": _SPLIT, "fit_steps": _FIT_STEPS}
     try:
         box = None if _BOX.value is None else tuple(map(float, _BOX.value))
     except ValueError:

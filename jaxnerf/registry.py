@@ -57,6 +57,18 @@ class Reader(NamedTuple):
     detect: Callable[..., bool]
 
 
+class Exporter(NamedTuple):
+    """A way to export a trained run.
+
+    Attributes:
+        export: (ExportSource, folder) -> None.
+        check: raises a ValueError for a TrainedRun that cannot be exported; None: all can.
+    """
+
+    export: Callable[..., None]
+    check: Callable[..., Any] | None = None
+
+
 class Registry:
     """Parts of one kind by name."""
 
@@ -134,11 +146,11 @@ EXPORTERS = Registry(
     "exporter",
     "jaxnerf.register_exporter",
     {
-        "mesh": "jaxnerf.exporters.mesh:export_mesh",
-        "points": "jaxnerf.exporters.points:export_points",
-        "depth": "jaxnerf.exporters.depth:export_depth",
-        "splats": "jaxnerf.exporters.splats:export_splats",
-        "web": "jaxnerf.exporters.web:export_web",
+        "mesh": "jaxnerf.exporters.mesh:EXPORTER",
+        "points": "jaxnerf.exporters.points:EXPORTER",
+        "depth": "jaxnerf.exporters.depth:EXPORTER",
+        "splats": "jaxnerf.exporters.splats:EXPORTER",
+        "web": "jaxnerf.exporters.web:EXPORTER",
     },
 )
 ESTIMATORS = Registry(
@@ -228,18 +240,20 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
     READERS.add(name, Reader(read, detect or _never))
 
 
-def register_exporter(name: str, export: Callable[..., Any]) -> None:
+def register_exporter(name: str, export: Callable[..., Any], *, check: Callable[..., Any] | None = None) -> None:
     """Registers a way to export a trained run under a name for `jaxnerf-export --kind`.
 
     Args:
         name: of the exporter.
         export: (source: ExportSource, folder: Path) -> None, see `jaxnerf.extend.ExportSource`. It writes files
             into the folder, which is moved into place when it returns.
+        check: (run: TrainedRun) -> anything; raises a ValueError that says why the run cannot be exported. It is called
+            before anything is computed, and for a run without a grid before one is extracted. None: all runs can be.
 
     Raises:
         ValueError: if another exporter has that name.
     """
-    EXPORTERS.add(name, export)
+    EXPORTERS.add(name, Exporter(export, check))
 
 
 def register_estimator(name: str, estimate: Callable[..., Any]) -> None:

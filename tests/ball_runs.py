@@ -11,6 +11,7 @@ import captures
 import jaxnerf
 from jaxnerf.core.types import Rendering
 from jaxnerf.core.views import Views
+from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model
 from jaxnerf.training import auto_config, build, workdir
@@ -94,8 +95,8 @@ def solid_run():
 
     model = Model(init=None, render=None, view=view, scene=None, samples_per_ray=1.0)
     experiment = SimpleNamespace(model=model, config=RunConfig(), cameras=None, background=(1.0, 1.0, 1.0))
-    run = SimpleNamespace(experiment=experiment, model_with=lambda settings: model, steps=lambda: [20])
-    return run, solid_views()
+    functions = dict.fromkeys(TrainedRun._fields) | {"steps": lambda: [20], "model_with": lambda settings: model}
+    return TrainedRun(**{**functions, "experiment": experiment}), solid_views()
 
 
 @functools.cache

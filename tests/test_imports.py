@@ -30,7 +30,7 @@ RANKS = {
     "programs": 5,
 }
 # Packages of one rank do not import each other, apart from these.
-ALLOWED = {("models", "fields"), ("exporters", "evaluation"), ("viewer", "evaluation")}
+ALLOWED = {("models", "fields"), ("exporters", "evaluation"), ("viewer", "evaluation"), ("viewer", "exporters")}
 FORBIDDEN = {("fields", "runtime"), ("models", "runtime")}
 SHARED = ("jaxnerf.registry", "jaxnerf.options")
 CORE_LIBRARIES = {"jax", "jaxtyping", *sys.stdlib_module_names}

@@ -32,7 +32,7 @@ from jaxnerf.runtime.atomic_files import write_text
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run on the embedded scene.", required=True)
 _RESOLUTION = flags.DEFINE_integer("resolution", 256, "Voxels along the longest side.")
-_NUM_POINTS = flags.DEFINE_integer("num_points", 200_000, "Points or Gaussians.")
+_NUM_POINTS = flags.DEFINE_integer("num_points", None, "Points or Gaussians; None: the exporter's own.")
 _EXPORTS = flags.DEFINE_list("exports", ["mesh", "closed", "points", "splats"], "Of mesh, closed, points, splats.")
 _OUT = flags.DEFINE_string("out", None, "Markdown page; replaces it.")
 _KINDS = {

@@ -4,6 +4,8 @@ latency.py --workdirs=runs/demo,runs/lego --train=quickstart --report=docs/resul
 """
 
 import functools
+import gzip
+import json
 import os
 import pathlib
 import resource
@@ -13,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+import urllib.request
 
 import msgspec
 import numpy as np
@@ -34,7 +37,7 @@ from jaxnerf.viewer.render_loop import RenderLoop, Request
 
 _WORKDIRS = flags.DEFINE_list("workdirs", [], "The runs to view.")
 _TRAIN = flags.DEFINE_string("train", None, "The config whose training is measured with and without the viewer.")
-_STEPS = flags.DEFINE_integer("steps", 400, "The steps of each training without a browser.")
+_STEPS = flags.DEFINE_integer("steps", 400, "The steps of each training without a browser; 0: none.")
 _SECONDS = flags.DEFINE_float("seconds", 20.0, "The time with and without a browser in turn.")
 _REPORT = flags.DEFINE_string("report", None, "The Markdown file to write.")
 _CLIENT = flags.DEFINE_integer("client", 0, "Internal: acts as a browser on this port that moves its camera.")
@@ -42,6 +45,7 @@ SIDES = (100, 200, 400)  # px
 MESSAGES_PER_SECOND = 20.0  # of a camera that is dragged
 _DRAG_SECONDS = 6.0
 _FRAMES = 8
+_BY_ITSELF = -1.0  # in place of the camera's speed: a page that renders by itself
 
 
 def main(argv):
@@ -51,7 +55,8 @@ def main(argv):
     parts = ["\n".join(["# The viewer in figures", "", *common.provenance(), "", _ABOUT, ""])]
     parts += [_view(workdir) for workdir in _WORKDIRS.value]
     if _TRAIN.value:
-        parts += [_idle_cost(_TRAIN.value), _busy_cost(_TRAIN.value)]
+        parts += [_idle_cost(_TRAIN.value)] if _STEPS.value else []
+        parts += [_busy_cost(_TRAIN.value)]
     text = "\n".join(parts)
     print(text)
     if _REPORT.value:
@@ -184,7 +189,13 @@ def _idle_cost(config):
 
 def _busy_cost(config):
     """Returns what a browser costs a training: steps per second with and without it, in turn."""
-    rates = {"no browser": [], "a browser that rests": [], "a browser whose camera moves": []}
+    browsers = {
+        "no browser": None,
+        "a browser that rests": 0.0,
+        "a browser whose camera moves": 1.0,
+        "a browser that renders by itself": _BY_ITSELF,
+    }
+    rates = {name: [] for name in browsers}
     with tempfile.TemporaryDirectory() as folder:
         flags = ["--config.train.max_steps=1000000", "--config.train.preview_every=0", "--config.train.log_every=5"]
         process = _train(config, folder, *flags, "--viewer", "--viewer_port=0")
@@ -195,11 +206,7 @@ def _busy_cost(config):
         with _browser(port, 0.0):  # the renderer is compiled
             time.sleep(_SECONDS.value)
         for _ in range(3):
-            for name, moves in (
-                ("no browser", None),
-                ("a browser that rests", 0.0),
-                ("a browser whose camera moves", 1.0),
-            ):
+            for name, moves in browsers.items():
                 if moves is None:
                     rates[name].append(_steps_per_second(folder))
                 else:
@@ -242,7 +249,9 @@ class _browser:
 
 
 def _act_as_browser(port):
-    """Sends a camera and reads what comes; with --seconds above 0 the camera moves."""
+    """Sends a camera and reads what comes; with --seconds above 0 the camera moves, and below 0 see _BY_ITSELF."""
+    if _SECONDS.value == _BY_ITSELF:
+        return _receive_parameters(port)
     address, name = f"ws://127.0.0.1:{port}", f"viser-v{viser.__version__}"
     angle = 0.0
     options = {"subprotocols": [name], "max_size": None, "compression": None, "origin": f"http://127.0.0.1:{port}"}
@@ -263,6 +272,18 @@ def _act_as_browser(port):
                     socket.recv(timeout=left)
                 except TimeoutError:
                     break
+
+
+def _receive_parameters(port):
+    """Asks for newer parameters every 2 s, as the page does; it does not render them."""
+    step = ""
+    while True:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/scene.bin?step={step}") as answer:
+            if data := answer.read():
+                raw = gzip.decompress(data)
+                length = int(np.frombuffer(raw, "<u4", 1, 8)[0])
+                step = json.loads(raw[12 : 12 + length])["step"]
+        time.sleep(2)
 
 
 def _product(a, b):

@@ -1,8 +1,9 @@
 """Compares exported web pages, drawn by headless Chromium, with the renderer of jaxnerf-eval.
 
-    python experiments/web/web.py --workdirs=W1,W2 [--size=100] [--out=docs/results/web.md]
+    python experiments/web/web.py [--runs=demo,lego,fox] [--workdirs=W1,W2] [--size=100] [--out=docs/results/web.md]
 
-Each run is exported with `--kind=web`. The first three test views, without their lens, are drawn at the same size by
+Each of `--runs` is trained to runs/web/NAME unless it is there, by `jaxnerf-train` with the flags of RUNS. Each run is
+exported with `--kind=web`. The first three test views, without their lens, are drawn at the same size by
 the page, in SwiftShader, which runs WebGL 2 on the CPU, and by the function that jaxnerf-eval and the viewer use.
 "equal to" is the lowest PSNR of the three between both, on 8-bit colours. "loss" is what the export prints: the PSNR of
 the run on up to four test views of its dataset, minus that with the page's textures. Seconds are medians of the
@@ -18,6 +19,7 @@ import os
 import pathlib
 import re
 import statistics
+import subprocess
 import sys
 import time
 
@@ -39,14 +41,26 @@ from jaxnerf.runtime.atomic_files import write_text
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 NUM_VIEWS, TIMEOUT = 3, 300_000  # ms
+RUNS = {
+    "demo": ["--config=quickstart"],
+    "lego": ["--config=lego_fast", "--config.train.max_seconds=60"],
+    "lego_200": ["--config=lego_fast", "--config.data.factor=4", "--config.train.max_seconds=60"],
+    "lego_400": ["--config=lego_fast", "--config.data.factor=2", "--config.train.max_seconds=90"],
+    "fox": ["--config=capture", "--data_dir=fox", "--config.train.max_seconds=60"],
+    "can": ["--config=capture", "--data_dir=can", "--config.train.max_seconds=60"],
+}
+FOLDER = pathlib.Path("runs/web")
 
 
 def main(argv: list[str]) -> None:
     """Exports, draws and compares."""
     del argv
     rows = []
+    chosen = common.chosen("--runs", _RUNS.value, RUNS)
+    for name in chosen:
+        train(name)
     with browser_page() as page:
-        for workdir in _WORKDIRS.value:
+        for workdir in [*(str(FOLDER / name) for name in chosen), *_WORKDIRS.value]:
             said = []
             started = time.perf_counter()
             folder = export_run(workdir, "web", name="study-web", overwrite=True, say=said.append)
@@ -57,7 +71,7 @@ def main(argv: list[str]) -> None:
             lost = re.search(r"PSNR ([\d.]+) dB .* has ([\d.]+) dB; features of (\d+ bits)", said[-1])
             rows.append(
                 [
-                    page.title(),
+                    pathlib.Path(workdir).name,
                     f"{(folder / 'index.html').stat().st_size / 1e6:.1f}",
                     lost[3],
                     f"{float(lost[2]):.2f}",
@@ -77,6 +91,13 @@ def main(argv: list[str]) -> None:
     if _OUT.value:
         head = ["# Web pages", "", *common.provenance(), "", *__doc__.strip().split("\n\n")[2].splitlines(), ""]
         write_text(_OUT.value, "\n".join([*head, *lines, ""]))
+
+
+def train(name: str) -> None:
+    """Trains a run of RUNS unless it has a checkpoint."""
+    if not (FOLDER / name / "checkpoints").exists():
+        command = [sys.executable, "-m", "jaxnerf.train", "--config.train.preview_every=0", *RUNS[name]]
+        subprocess.run([*command, f"--workdir={FOLDER / name}"], check=True)
 
 
 @contextlib.contextmanager
@@ -166,7 +187,8 @@ def num_samples(run, variables, rays) -> int:
 
 
 if __name__ == "__main__":
-    _WORKDIRS = flags.DEFINE_list("workdirs", None, "Folders of trained runs.", required=True)
+    _WORKDIRS = flags.DEFINE_list("workdirs", [], "Folders of trained runs.")
+    _RUNS = flags.DEFINE_list("runs", list(RUNS), "Of RUNS.")
     _SIZE = flags.DEFINE_integer("size", 100, "px, the longer side of what is drawn.")
     _OUT = flags.DEFINE_string("out", None, "Markdown page; replaces it.")
     cli.run(main)

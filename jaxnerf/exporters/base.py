@@ -31,7 +31,8 @@ class ExportSettings(NamedTuple):
             `Views.file_origin`.
         size: px, the longer side of the depth images that are rendered; None: it follows the resolution.
         num_views: the largest number of training views whose poses are rendered, spread evenly over all.
-        num_points: the largest number of points or Gaussians.
+        num_points: the largest number of points or Gaussians; None: as many as the exporter selects.
+        fit_steps: of fitting Gaussians; 0: they stay as they are placed.
         format: of a mesh, "ply", "glb" or "obj".
         up: the axis of the dataset's files that is up in a GLB, such as "+z"; None: that of the
             option `data.up`, or as the cameras are held.
@@ -46,7 +47,8 @@ class ExportSettings(NamedTuple):
     box: tuple[float, ...] | None = None
     size: int | None = None
     num_views: int = 100
-    num_points: int = 200_000
+    num_points: int | None = None
+    fit_steps: int = 400
     format: str = "ply"
     up: str | None = None
     closed: bool = False
@@ -111,13 +113,15 @@ def export_run(
     Raises:
         ValueError: if there is no such run, checkpoint or exporter, a setting is out of range, or the folder exists.
     """
-    export = EXPORTERS.get(kind)
+    exporter = EXPORTERS.get(kind)
     settings = settings or ExportSettings()
     _check_settings(settings)
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
     rendered: dict[str, Any] = {} if max_uncertainty is None else {"max_uncertainty": max_uncertainty}
     run = restore_run(workdir, data_dir=data_dir, settings=rendered)
+    if exporter.check is not None:
+        exporter.check(run)
     step = newest_step(run, workdir, step)
     target = pathlib.Path(workdir) / "exports" / (name or f"{kind}-{step}")
     atomic_files.check_tree(target.parent)
@@ -131,7 +135,8 @@ def export_run(
     with atomic_files.partial_folder(target) as partial:
         if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
             say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
-        export(ExportSource(run, step, variables, views, relative_to(settings, views.file_origin), say), partial)
+        relative = relative_to(settings, views.file_origin)
+        exporter.export(ExportSource(run, step, variables, views, relative, say), partial)
         if any(views.file_origin):
             (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
     return target
@@ -154,7 +159,7 @@ def check_memory(needed: float, available: float | None, remedy: str) -> None:
 
 def _check_settings(settings):
     limits = {"resolution": (16, MAX_RESOLUTION), "size": (16, MAX_SIZE), "num_points": (1, MAX_POINTS)}
-    limits |= {"num_views": (1, 100_000), "max_faces": (0, 10**9), "min_piece": (0.0, 1.0)}
+    limits |= {"fit_steps": (0, 1_000_000), "num_views": (1, 100_000), "max_faces": (0, 10**9), "min_piece": (0.0, 1.0)}
     for field, (least, most) in limits.items():
         value = getattr(settings, field)
         if value is not None and not least <= value <= most:

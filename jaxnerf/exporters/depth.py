@@ -8,6 +8,7 @@ import numpy as np
 from jaxnerf.evaluation.output_images import write_image
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.surfaces import inside, render_depth_images
+from jaxnerf.registry import Exporter
 from jaxnerf.runtime import atomic_files
 
 
@@ -37,3 +38,6 @@ def export_depth(source: ExportSource, folder: pathlib.Path) -> None:
     content = {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **lens, "depth_unit_scale_factor": 1.0}
     atomic_files.write_text(folder / "transforms.json", json.dumps({**content, "frames": frames}, indent=1) + "\n")
     source.say(f"{len(images)} depth images of {camera.width} x {camera.height} px, float32, in the dataset's units")
+
+
+EXPORTER = Exporter(export_depth)

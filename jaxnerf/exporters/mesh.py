@@ -25,6 +25,7 @@ from jaxnerf.data.geometry.poses import AXES, axis_of, up_of
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.exporters.base import ExportSource, check_memory
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
+from jaxnerf.registry import Exporter
 from jaxnerf.runtime import atomic_files, memory
 
 _BYTES_PER_VOXEL = 16  # of the dense field, its index and what marching cubes keeps
@@ -70,6 +71,9 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
             mesh.export(path)
     sides = " x ".join(f"{side:.4g}" for side in mesh.extents)
     source.say(f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {sides} in the dataset's units")
+
+
+EXPORTER = Exporter(export_mesh)
 
 
 def write_glb(mesh: trimesh.Trimesh, path: pathlib.Path, *, up: Float[np.ndarray, "3"]) -> None:

@@ -8,7 +8,9 @@ import numpy as np
 
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
+from jaxnerf.registry import Exporter
 
+_NUM_POINTS = 200_000  # by default
 _TYPES = {"f": ("float", "<f4"), "u": ("uchar", "u1")}
 
 
@@ -22,7 +24,7 @@ def export_points(source: ExportSource, folder: pathlib.Path) -> None:
     images = render_depth_images(source, settings.image_size)
     box = export_box(source, images)
     points, normals, rgb = surface_points(images, box)[:3]
-    chosen = thinned(points, settings.num_points)
+    chosen = thinned(points, settings.num_points or _NUM_POINTS)
     write_ply(
         folder / "points.ply",
         {
@@ -32,6 +34,9 @@ def export_points(source: ExportSource, folder: pathlib.Path) -> None:
         },
     )
     source.say(f"{len(chosen):,} points with normals and colours, in the dataset's units")
+
+
+EXPORTER = Exporter(export_points)
 
 
 def surface_points(images: Sequence[DepthImage], box: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -6,7 +6,6 @@ checksum finds a broken file. It is inside the page or, with --split, in a file 
 
 import base64
 import gzip
-import html
 import importlib.resources
 import json
 import pathlib
@@ -19,14 +18,15 @@ import numpy as np
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.views import Views
+from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import gaze_center, up_of
 from jaxnerf.evaluation.paths import camera_path
-from jaxnerf.evaluation.paths.render_path import select_kind
-from jaxnerf.evaluation.restore import refined_views
+from jaxnerf.evaluation.restore import TrainedRun, refined_views
 from jaxnerf.exporters import web_scene
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.web_scene import WebScene
 from jaxnerf.fields.hash_grid import HashGrid
+from jaxnerf.registry import Exporter
 
 MAGIC = b"JAXNERF1"
 MAX_LOSS = 0.05  # dB that 8-bit features may cost; otherwise they have 16
@@ -45,22 +45,19 @@ class Score(NamedTuple):
 
 
 def export_web(source: ExportSource, folder: pathlib.Path) -> None:
-    """Writes index.html, which holds the scene; with `split` the scene is in scene.bin beside it.
-
-    Raises:
-        ValueError: if the shader cannot render the run: names the reason.
-    """
-    network, experiment = network_of(source), source.run.experiment
+    """Writes index.html, which holds the scene; with `split` the scene is in scene.bin beside it."""
+    experiment = source.run.experiment
     split = experiment.config.eval.split
     views = refined_views(source.run, experiment.load_split(split), split, source.variables[0])
     for precision in web_scene.PRECISIONS:
-        scene = scene_of(source, network, precision)
-        score = measure(source, network, scene, views)
+        scene = scene_of(source.run, source.variables, precision)
+        score = measure(source, scene, views)
         if score.of_run - score.of_page <= MAX_LOSS:
             break
         source.say(f"features of {precision} would lose {score.of_run - score.of_page:.2f} dB")
-    data = encode(scene, about(source, scene, score))
-    (folder / "index.html").write_text(page("scene" if source.settings.split else data))
+    quality = f"PSNR {score.of_page:.1f} dB on {score.num_views} test views"
+    data = encode(scene, about(source, scene, quality))
+    (folder / "index.html").write_text(page(None if source.settings.split else data))
     if source.settings.split:
         (folder / _DATA_FILE).write_bytes(data)
     size = sum(path.stat().st_size for path in folder.iterdir())
@@ -72,13 +69,13 @@ def export_web(source: ExportSource, folder: pathlib.Path) -> None:
         source.say("put both files on a web server: a browser reads no file beside a page that is opened from a folder")
 
 
-def network_of(source: ExportSource) -> HashGrid:
+def network_of(run: TrainedRun) -> HashGrid:
     """Returns the run's hash grid.
 
     Raises:
         ValueError: if the shader cannot render the run: names the reason.
     """
-    config = source.run.experiment.config
+    config = run.experiment.config
     reason = None
     if config.field != "hash_grid":
         reason = f"field is {config.field!r}, expected 'hash_grid'"
@@ -86,8 +83,8 @@ def network_of(source: ExportSource) -> HashGrid:
         reason = f"sampler is {config.sampler!r}, expected 'occupancy'"
     elif config.data.ndc:
         reason = "data.ndc is True, expected False: the page has no normalised device coordinates"
-    elif source.run.experiment.model.needs:
-        reason = f"the field asks for {', '.join(source.run.experiment.model.needs)}, expected position and direction"
+    elif run.experiment.model.needs:
+        reason = f"the field asks for {', '.join(run.experiment.model.needs)}, expected position and direction"
     if reason:
         raise ValueError(f"web: {reason}; export such a run as --kind=splats or --kind=mesh")
     options, occupancy = config.hash_grid, config.occupancy
@@ -96,12 +93,15 @@ def network_of(source: ExportSource) -> HashGrid:
     return HashGrid(lower=occupancy.lower, upper=occupancy.upper, **values)
 
 
-def scene_of(source: ExportSource, network: HashGrid, precision: str) -> WebScene:
-    """Packs the run, with the steps and the early termination of its evaluation."""
-    experiment, (params, grid) = source.run.experiment, source.variables
+EXPORTER = Exporter(export_web, check=network_of)
+
+
+def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:
+    """Packs variables of a run, with the steps and the early termination of its evaluation; see `network_of`."""
+    experiment, (params, grid) = run.experiment, variables
     view = experiment.config.eval
     return web_scene.pack(
-        network,
+        network_of(run),
         params["fine"],
         grid,
         precision=precision,
@@ -111,10 +111,10 @@ def scene_of(source: ExportSource, network: HashGrid, precision: str) -> WebScen
     )
 
 
-def measure(source: ExportSource, network: HashGrid, scene: WebScene, views: Views) -> Score:
+def measure(source: ExportSource, scene: WebScene, views: Views) -> Score:
     """Scores the run, and the run with the features that the textures hold."""
     params, grid = source.variables
-    decoded = {**params, "fine": scene.decoded(params["fine"], network.feature_scale)}
+    decoded = {**params, "fine": scene.decoded(params["fine"], network_of(source.run).feature_scale)}
     squares = []
     count = min(_NUM_SCORED, len(views.size))
     for index in range(count):
@@ -126,19 +126,26 @@ def measure(source: ExportSource, network: HashGrid, scene: WebScene, views: Vie
     return Score(*np.mean(squares, axis=0).tolist(), count)
 
 
-def about(source: ExportSource, scene: WebScene, score: Score) -> dict[str, Any]:
-    """Returns what the page says and where its cameras are; poses are in the run's world."""
+def about(source: ExportSource, scene: WebScene, quality: str) -> dict[str, Any]:
+    """Returns what the page says and where its cameras are; poses are in the run's world.
+
+    Args:
+        source: with the step and the training views.
+        scene: that the page renders.
+        quality: what is known of it, for people; "": nothing.
+    """
     views, config = source.views, source.run.experiment.config
     poses = np.asarray(views.cameras.to_world, np.float64)
     name = pathlib.PurePath(config.data.dir).name or "embedded scene"
     names = views.names or tuple(f"view {index}" for index in range(len(poses)))
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MAX_CAMERAS)).round().astype(int))
-    path = camera_path.make_path(select_kind(None, views, None), views, num_frames=_TOUR_FRAMES)
-    how = f"trained for {source.step:,} steps on {len(poses)} images"
+    kind, _ = path_poses.default_kind(poses, camera_path.up_direction(None, views))
+    path = camera_path.make_path(kind, views, num_frames=_TOUR_FRAMES)
+    how = [f"trained for {source.step:,} steps on {len(poses)} images", quality, "made with jaxnerf"]
     return {
         "name": name,
-        "how": f"{how}; PSNR {score.of_page:.1f} dB on {score.num_views} test views; made with jaxnerf",
-        "psnr": round(score.of_page, 2),
+        "step": source.step,
+        "how": "; ".join(filter(None, how)),
         "cameras": [_camera(views, index, names[index]) for index in some],
         "tour": [_numbers(pose) for pose in path.poses],
         "target": _numbers(gaze_center(poses)),
@@ -161,8 +168,14 @@ def _numbers(values):
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).reshape(-1)]
 
 
-def encode(scene: WebScene, description: dict[str, Any]) -> bytes:
-    """Returns the bytes that the page reads: MAGIC, the length of the JSON (uint32), the JSON, the arrays; gzipped."""
+def encode(scene: WebScene, description: dict[str, Any], *, level: int = 9) -> bytes:
+    """Returns the bytes that the page reads: MAGIC, the length of the JSON (uint32), the JSON, the arrays; gzipped.
+
+    Args:
+        scene: WebScene.
+        description: see `about`.
+        level: of the compression, 0 (none) to 9 (small).
+    """
     arrays, parts, place = [], [], 0
     for name, array in web_scene.textures(scene).items():
         kind = _TYPES[array.dtype.name]
@@ -172,17 +185,23 @@ def encode(scene: WebScene, description: dict[str, Any]) -> bytes:
     content = {**description, "shader": web_scene.shader(scene), "arrays": arrays, "bytes": place}
     text = json.dumps(content).encode()
     text += b" " * (-(len(text) + 12) % 4)  # arrays begin at a multiple of 4 bytes
-    return gzip.compress(MAGIC + np.uint32(len(text)).tobytes() + text + b"".join(parts), mtime=0)
+    return gzip.compress(MAGIC + np.uint32(len(text)).tobytes() + text + b"".join(parts), level, mtime=0)
 
 
-def page(data: bytes | str) -> str:
-    """Returns the page with its scene; "scene": the page reads scene.bin beside it."""
+def page(data: bytes | None, *, live: bool = False) -> str:
+    """Returns the page.
+
+    Args:
+        data: the scene; None: the page reads scene.bin beside it.
+        live: whether the scene is that of a viewer: the page asks for newer ones, and leaves for the viewer's frames
+            where the browser cannot render.
+    """
     files = importlib.resources.files("jaxnerf.exporters") / "web_page"
     text = (files / "index.html").read_text()
-    content = _DATA_FILE if isinstance(data, str) else base64.b64encode(data).decode()
+    content = _DATA_FILE if data is None else base64.b64encode(data).decode()
     parts = {"style": (files / "style.css").read_text()}
     parts |= {name: (files / f"{name}.js").read_text() for name in ("renderer", "camera", "page")}
-    parts |= {"kind": html.escape("file" if isinstance(data, str) else "embedded"), "data": content}
+    parts |= {"kind": "live" if live else "file" if data is None else "embedded", "data": content}
     for name, value in parts.items():
         text = text.replace(f"@@{name}@@", value)
     return text

@@ -303,7 +303,7 @@ def _averaged(frame, camera, side):
     shape = (camera.height, side, camera.width, side)
     middle = frame.distance[side // 2 :: side, side // 2 :: side]
     rgb, opacity = frame.rgb.reshape(*shape, 3).mean((1, 3)), frame.opacity.reshape(shape).mean((1, 3))
-    return Frame(camera, rgb, opacity, middle)
+    return Frame(camera, rgb, opacity, middle, frame.uncertain)
 
 
 def _t_in_ndc(rays, t):

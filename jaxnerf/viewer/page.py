@@ -58,6 +58,8 @@ class Page:
             self._mode = self._add(gui.add_dropdown("Show", self._modes()), self._change_mode)
             self._resolution = self._add(gui.add_dropdown("Resolution (px)", RESOLUTIONS, initial_value="800"))
             self._crop = self._add(gui.add_checkbox("Crop", False))
+            if not self._viewer.client_rendering.refused:
+                gui.add_markdown("[Render in this browser](/?here)")
             lower, upper = self._crop_range()
             self._sliders = [
                 self._add(gui.add_multi_slider(axis, low, high, (high - low) / 200, (low, high)))

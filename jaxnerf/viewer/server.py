@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import TrainedRun
+from jaxnerf.viewer.client_rendering import ClientRendering, answering
 from jaxnerf.viewer.frame_renderer import FrameRenderer
 from jaxnerf.viewer.page import Page
 from jaxnerf.viewer.render_loop import RenderLoop
@@ -73,6 +74,7 @@ class Viewer:
         self.rendering_video = threading.Lock()  # held while a video is rendered; there is one at a time
         self._changed, self._lock, self._pages = changed, threading.Lock(), {}
         self._server = None
+        self.client_rendering = ClientRendering(self, changed)
         self.loop = RenderLoop(self.renderer, self._deliver, failed=self._failed, fraction=fraction)
 
     def listen(self, host: str = HOST, port: int = PORT) -> int:
@@ -88,15 +90,16 @@ class Viewer:
         viser = import_viser()
         check_port(host, port)
         self._only_local = host in _LOOPBACK
-        self._server = _listen(viser, host, port)
+        with answering(self._refusal, self.client_rendering.answer):
+            self._server = _listen(viser, host, port)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
         return self._server.get_port()
 
     @property
     def num_browsers(self) -> int:
-        """The number of pages that are open."""
-        return len(self._pages)
+        """The number of pages that are open; those that render by themselves count as one."""
+        return len(self._pages) + self.client_rendering.is_open
 
     def show(self, step: int, variables: tuple, score: str = "", *, uncertainty_at: Any = None) -> None:
         """Replaces the scene.
@@ -107,11 +110,11 @@ class Viewer:
             score: what is known of its quality, for the page.
             uncertainty_at: see `SceneState`.
         """
-        state = self.renderer.scene_state(step, variables, uncertainty_at)
-        if self.state is None:
+        first, state = self.state is None, self.renderer.scene_state(step, variables, uncertainty_at)
+        self.score, self.state = score, state
+        if first and (self._pages or self._server is None):  # pages that render by themselves need no frames
             self._each(lambda page: page.report("compiling the renderer"))
             self.renderer.compile(state)
-        self.state, self.score = state, score
         self.loop.set_scene(state)
         self._each(lambda page: page.scene_changed())
 
@@ -148,17 +151,21 @@ class Viewer:
         connection = self._server._websock_server._live_connections.get(client.client_id)
         if connection is None:
             return False
-        origin, host = (" ".join(connection.request.headers.get_all(name)) for name in ("Origin", "Host"))
-        why = None
-        if origin and urlsplit(origin).netloc != host:
-            why = "the page of another site"
-        elif self._only_local and urlsplit(f"//{host}").hostname not in _LOOPBACK:
-            why = "another name of this machine than localhost"
-        elif self.num_browsers >= MAX_BROWSERS:
+        why = self._refusal(connection.request.headers)
+        if why is None and len(self._pages) >= MAX_BROWSERS:
             why = f"more than {MAX_BROWSERS} pages"
         if why:
             asyncio.run_coroutine_threadsafe(connection.close(1008, why), self._server.get_event_loop())
         return why is None
+
+    def _refusal(self, headers):
+        """Returns why a request is refused; None: it is not."""
+        origin, host = (" ".join(headers.get_all(name)) for name in ("Origin", "Host"))
+        if origin and urlsplit(origin).netloc != host:
+            return "the page of another site"
+        if self._only_local and urlsplit(f"//{host}").hostname not in _LOOPBACK:
+            return "another name of this machine than localhost"
+        return None
 
     def _deliver(self, client_id, delivery):
         page = self._pages.get(client_id)

@@ -9,12 +9,13 @@ import trimesh
 
 from export_sources import CENTER, RADIUS, SIZE, source_of
 from jaxnerf.core.types import Camera
-from jaxnerf.exporters import base, splats, surfaces
+from jaxnerf.exporters import base, gaussians, surfaces
 from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.exporters.depth import export_depth
 from jaxnerf.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field, write_glb
 from jaxnerf.exporters.points import export_points, thinned
 from jaxnerf.exporters.splats import export_splats, score
+from jaxnerf.registry import Exporter
 from runs import run
 
 IN_FILE = 2 * RADIUS  # the ball's radius there
@@ -177,7 +178,7 @@ def test_thinned_keeps_at_most_so_many():
 
 def test_splats_look_like_the_scene(images, tmp_path):
     lines = []
-    export_splats(source_of(num_points=3000, say=lines.append), tmp_path)
+    export_splats(source_of(num_points=3000, fit_steps=0, say=lines.append), tmp_path)
     data = trimesh.load(tmp_path / "splats.ply").metadata["_ply_raw"]["vertex"]["data"]
     assert data.dtype.names == (
         *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -188,14 +189,14 @@ def test_splats_look_like_the_scene(images, tmp_path):
     assert "PSNR" in lines[0]
     read = splats_of(data)
     image = images[3]
-    drawn = splats.rasterize(read, image.camera)
+    drawn = gaussians.rasterize(read, image.camera)
     error = np.mean((np.clip(drawn, 0, 1) - image.rgb / 255.0) ** 2)
     assert -10 * np.log10(error) > 18
 
 
 def test_splats_are_scored_over_the_color_behind_the_scene():
     """The views are black, and far away Gaussians cover none of them."""
-    none = splats.Gaussians(
+    none = gaussians.Gaussians(
         np.full((1, 3), 1e4), np.float64([[1, 0, 0, 0]]), np.full((1, 3), 1e-3), np.ones(1), np.zeros((1, 9, 3))
     )
     value, _ = score(source_of(background=(0.1, 0.1, 0.1)), none)
@@ -211,7 +212,7 @@ def splats_of(data):
 
     harmonics = np.zeros((len(data), 9, 3))
     harmonics[:, 0] = stack("f_dc_0", "f_dc_1", "f_dc_2")
-    return splats.Gaussians(
+    return gaussians.Gaussians(
         stack("x", "y", "z"),
         stack("rot_0", "rot_1", "rot_2", "rot_3"),
         np.exp(stack("scale_0", "scale_1", "scale_2")),
@@ -227,14 +228,14 @@ def test_the_rasterizer_composites_by_depth():
     )
     harmonics = np.zeros((2, 9, 3))
     harmonics[:, 0] = (np.array([[1, 0, 0], [0, 1, 0]]) - 0.5) / 0.28209479
-    pair = splats.Gaussians(
+    pair = gaussians.Gaussians(
         mean=np.array([[0, 0, -4.0], [0, 0, -2.0]]),
         rotation=np.tile([1.0, 0, 0, 0], (2, 1)),
         scale=np.full((2, 3), 0.1),
         opacity=np.array([0.8, 0.5]),
         harmonics=harmonics,
     )
-    image = splats.rasterize(pair, camera, np.array([0, 0, 1.0]))
+    image = gaussians.rasterize(pair, camera, np.array([0, 0, 1.0]))
     np.testing.assert_allclose(image[8, 8], [0.5 * 0.8, 0.5, 0.5 * 0.2], atol=1e-6)
     np.testing.assert_allclose(image[0, 0], [0, 0, 1], atol=0.02)
     variance = (50 * 0.1 / 2) ** 2 + 0.3  # of the near one, px^2
@@ -274,7 +275,7 @@ def test_an_export_is_whole_or_absent(workdir, monkeypatch):
         if fail[0]:
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(base.EXPORTERS._parts, "test", export)
+    monkeypatch.setitem(base.EXPORTERS._parts, "test", Exporter(export))
     with pytest.raises(OSError, match="No space"):
         export_run(workdir, "test")
     assert list((workdir / "exports").iterdir()) == []
@@ -293,6 +294,26 @@ def test_an_export_is_whole_or_absent(workdir, monkeypatch):
     assert [path.name for path in (workdir / "exports").iterdir()] == ["test-7"]
     with pytest.raises(ValueError, match="expected a plain file name"):
         export_run(workdir, "test", name="../out")
+
+
+def test_a_run_that_cannot_be_exported_is_refused_before_its_grid_is_extracted(monkeypatch, tmp_path):
+    source, calls = source_of(), []
+
+    def restore(workdir, data_dir=None, settings=None):
+        calls.append(settings)
+        return source.run
+
+    def check(run):
+        assert run is source.run
+        raise ValueError("has no colours")
+
+    monkeypatch.setattr(base, "restore_run", restore)
+    source.run.experiment.model.grid_schedule = None
+    monkeypatch.setitem(base.EXPORTERS._parts, "test", Exporter(lambda source, folder: None, check))
+    with pytest.raises(ValueError, match="has no colours"):
+        export_run(tmp_path, "test")
+    assert calls == [None] and not list(tmp_path.iterdir())
+    assert base.EXPORTERS.get("web").check is not None
 
 
 @pytest.mark.parametrize(

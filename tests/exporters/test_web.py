@@ -142,7 +142,7 @@ def test_the_page_holds_everything_and_loads_nothing():
     text = web.page(b"data")
     assert "@@" not in text and "ZGF0YQ==" in text and "default-src 'none'" in text
     assert not [word for word in ("http://", "https://", "<script src", '<link rel="style') if word in text]
-    assert "scene.bin" in web.page("scene")
+    assert "scene.bin" in web.page(None)
 
 
 def test_a_table_that_no_texture_holds_is_refused(monkeypatch):
@@ -172,4 +172,4 @@ def test_a_run_that_the_page_cannot_render_is_refused(options, needs, message):
     config = changed(RunConfig(), {"field": "hash_grid", "sampler": "occupancy", "data.ndc": False, **options})
     experiment = SimpleNamespace(config=config, model=SimpleNamespace(needs=needs))
     with pytest.raises(ValueError, match=message):
-        web.network_of(SimpleNamespace(run=SimpleNamespace(experiment=experiment)))
+        web.network_of(SimpleNamespace(experiment=experiment))

@@ -118,7 +118,7 @@ def test_a_wrong_line_is_named(tum_folder, tmp_path):
 
 
 def test_an_exporter(tmp_path):
-    assert EXPORTERS.get("density") is density_exporter.export_density
+    assert EXPORTERS.get("density").export is density_exporter.export_density
     density_exporter.export_density(export_sources.source_of(resolution=16), tmp_path)
     content = np.load(tmp_path / "density.npz")
     center = (content["upper"] + content["lower"]) / 2

@@ -52,6 +52,7 @@ def main(out):
         a_new_checkpoint_replaces_the_image(page, run, out)
         a_reload_recovers(page)
         closing_all_pages_stops_the_rendering(page, process)
+        a_page_renders_by_itself(browser, port, out)
     with server("train", *TRAIN, f"--workdir={out / 'live'}", "--viewer", flag="viewer_port") as (process, port):
         with chromium() as browser:
             a_training_is_shown_while_it_runs(browser, port, out)
@@ -187,6 +188,19 @@ def closing_all_pages_stops_the_rendering(page, process):
     check(spent < 1.0, f"without a page the server takes {spent:.2f} s of CPU in 5 s")
 
 
+def a_page_renders_by_itself(browser, port, out):
+    page = browser.new_page(viewport={"width": 420, "height": 400})
+    page.set_default_timeout(SECONDS * 1000)
+    page.goto(f"http://127.0.0.1:{port}/")
+    page.wait_for_url("**/frames/")
+    check(True, "a browser without a graphics device leaves for the frames of the server")
+    page.goto(f"http://127.0.0.1:{port}/?here")
+    page.wait_for_function("() => window.jaxnerf && !document.getElementById('message').textContent")
+    check(f"{STEPS + MORE_STEPS} steps" in page.inner_text("#how"), f"the page says {page.inner_text('#how')!r}")
+    page.screenshot(path=out / "by_itself.png")
+    page.close()
+
+
 def a_training_is_shown_while_it_runs(browser, port, out):
     page = open_page(browser, port)
     rest(page)
@@ -217,7 +231,7 @@ def chromium():
 def open_page(browser, port):
     page = browser.new_page()
     page.set_default_timeout(SECONDS * 1000)
-    page.goto(f"http://127.0.0.1:{port}")
+    page.goto(f"http://127.0.0.1:{port}/frames/")
     prepare(page)
     return page
 

@@ -6,6 +6,7 @@
 const FRAME_MS = 33, MIN_PIXELS = 3000;
 const TURN = 0.006, KEY_TURN = 0.06, KEY_MOVE = 0.04, WHEEL = 0.0012;  // radians per px or key; distances; per wheel unit
 const TOUR_FRAMES_PER_SECOND = 8;
+const POLL_MS = 2000;  // between requests for newer parameters of a viewer
 const element = (id) => document.getElementById(id);
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;  // the tour then jumps from camera to camera
 
@@ -23,6 +24,27 @@ async function loadBytes() {
   let binary;
   try { binary = atob(text); } catch (error) { throw new Error("The scene's data is damaged. Export it again."); }
   return Uint8Array.from(binary, (letter) => letter.charCodeAt(0));
+}
+
+// Returns the scene of the viewer, if its step is another than this one; otherwise null.
+async function newerScene(step) {
+  const answer = await fetch(`scene.bin?step=${step}`).catch(() => { throw new Error("The viewer does not answer."); });
+  if (answer.status === 204) return null;
+  if (!answer.ok) throw new Error(await answer.text());
+  return decodeScene(await answer.arrayBuffer());
+}
+
+const wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
+// Returns whether the browser has WebGL 2 on a graphics device: in software, a frame takes seconds.
+function hasDevice() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return false;
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  const ending = gl.getExtension("WEBGL_lose_context");
+  if (ending) ending.loseContext();
+  return !/swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
 class Page {
@@ -88,6 +110,29 @@ class Page {
             shown: this.shown, range};
   }
 
+  // Shows newer parameters of the viewer as they come. Until their frame is complete, the one before is shown.
+  async follow() {
+    while (!this.closed) {
+      await wait(POLL_MS);
+      if (this.heldUp || (this.refining && this.renderer.frame)) continue;
+      try {
+        const scene = await newerScene(this.content.step);
+        if (this.closed || this.heldUp) continue;
+        if (scene) this.replace(scene);
+        if (element("message").textContent) this.redraw();  // the viewer answers again
+      } catch (error) {
+        say(`${error.message} Waiting for it.`);
+      }
+    }
+  }
+
+  replace(scene) {
+    this.content = scene.content;
+    element("how").textContent = scene.content.how;
+    this.renderer.replace(scene);
+    this.start(performance.now(), this.scale, true);
+  }
+
   tick(now) {
     this.request = requestAnimationFrame((later) => this.tick(later));
     if (this.heldUp) {
@@ -119,7 +164,7 @@ class Page {
 
   report(now) {
     const {width, height} = this.renderer.frame.view;
-    element("speed").textContent = `${width} × ${height} px in ${Math.round(now - this.began)} ms`;
+    element("speed").textContent = `${width} × ${height} px in ${Math.max(Math.round(now - this.began), 0)} ms`;
     say("");
   }
 
@@ -265,6 +310,7 @@ class Page {
   }
 
   close() {
+    this.closed = true;
     cancelAnimationFrame(this.request);
     this.stop.abort();
     this.observer.disconnect();
@@ -273,9 +319,20 @@ class Page {
 }
 
 (async () => {
+  const live = element("scene").dataset.kind === "live", frames = element("frames").href;
+  element("frames").hidden = !live;
   try {
-    window.jaxnerf = new Page(await decodeScene(await loadBytes()));
+    if (!live) {
+      window.jaxnerf = new Page(await decodeScene(await loadBytes()));
+      return;
+    }
+    if (location.search !== "?here" && !hasDevice()) throw new Error("This browser has no graphics device.");
+    let scene = null;
+    while (!(scene = await newerScene(""))) await wait(POLL_MS);
+    window.jaxnerf = new Page(scene);
+    window.jaxnerf.follow();
   } catch (error) {
     say(error.message);
+    if (live) location.replace(frames);
   }
 })();

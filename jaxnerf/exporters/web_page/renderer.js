@@ -110,6 +110,19 @@ class Renderer {
     return {program, names};
   }
 
+  // Replaces the scene by another state of the same training; its frame is dropped.
+  replace(scene) {
+    const gl = this.gl, before = this.scene.content.shader;
+    this.drop();
+    this.scene = scene;
+    if (this.lost) return;
+    this.textures.forEach(({texture}) => gl.deleteTexture(texture));
+    this.textures = Object.values(scene.arrays).map((array) => this.upload(array));
+    if (scene.content.shader === before) return;
+    gl.deleteProgram(this.march.program);
+    this.march = this.program(COPY_VERTEX, scene.content.shader);
+  }
+
   upload(array) {
     const gl = this.gl, texture = gl.createTexture();
     const formats = {
