@@ -1,6 +1,6 @@
 """Measures what each part of configs/few_views.py gains: alone, and left away from the whole.
 
-    JAXNERF_SCENES=... python experiments/few_views/ablation.py --out=DIR [--scenes=lego,fern] [--steps=600] \
+    JAXNERF_SCENES=... python experiments/few_views/ablation.py --out=DIR [--scenes=lego,fern] [--steps=500] \
         [--seeds=0] [--only="none,whole"] [--page=docs/results/few_views.md]
 
 Trains on the views that the literature names: lego with 8 views and without use of its alpha, fern with 3. PSNR is the
@@ -39,17 +39,21 @@ SCENES = {
 PARTS = {
     "total_variation": {"losses.total_variation": 10.0},
     "depth_smoothness": {"losses.depth_smoothness": 1.0},
-    "distortion": {"losses.distortion": 0.02},
+    "distortion": {"losses.distortion": 0.01},
     "near_opacity": {"losses.near_opacity": 0.1},
     "opacity_binarity": {"losses.opacity_binarity": 0.01},
     "coarse_to_fine": {"hash_grid.coarse_to_fine": 0.5},
     "viewdirs_from": {"hash_grid.viewdirs_from": 0.5},
 }
+OTHER_WEIGHTS = {
+    "total_variation 1": {"losses.total_variation": 1.0},
+    "depth_smoothness 0.1": {"losses.depth_smoothness": 0.1},
+}
 NONE, WHOLE = "none", "few_views"
 HEADS = ("variant", "held-out PSNR", "to none", "test PSNR", "ms a step")
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs and the measurements.", required=True)
 _SCENES = flags.DEFINE_list("scenes", list(SCENES), f"Scenes to train on, of {tuple(SCENES)}.")
-_STEPS = flags.DEFINE_integer("steps", 600, "Steps of every run.", lower_bound=1)
+_STEPS = flags.DEFINE_integer("steps", 500, "Steps of every run.", lower_bound=1)
 _SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds; every variant is trained with each.")
 _ONLY = flags.DEFINE_list("only", None, "Names of the variants to train; all when not given.")
 _MAX_VIEWS = 25  # of the test views
@@ -63,7 +67,7 @@ def variants() -> dict[str, dict]:
     used = [part for part, fields in PARTS.items() if _values(config, fields) != _values(off, fields)]
     return {
         NONE: off,
-        **{part: off | fields for part, fields in PARTS.items()},
+        **{part: off | fields for part, fields in {**PARTS, **OTHER_WEIGHTS}.items()},
         WHOLE: {},
         **{f"{WHOLE} without {part}": {name: off[name] for name in PARTS[part]} for part in used},
     }
