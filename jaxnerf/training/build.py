@@ -12,7 +12,7 @@ import optax
 
 from jaxnerf.core.fixed_order import with_fixed_order
 from jaxnerf.core.views import Views
-from jaxnerf.data import dataset, ray_batches
+from jaxnerf.data import dataset, patch_rays, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.facts import footprint_radii
 from jaxnerf.data.geometry.free_space import interpolated_depths
@@ -44,6 +44,7 @@ class Experiment(NamedTuple):
         schedule: step -> learning rate.
         load_split: split -> Views.
         draw: (step, positions, TrainData) -> (keys, Batch).
+        draw_patches: (step, count, TrainData) -> (keys, Rays), see `patch_rays.draw_patches`.
         pixel_ids: (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes.
         view_rays: (Views, index, pixels) -> Rays.
         world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
@@ -59,6 +60,7 @@ class Experiment(NamedTuple):
     schedule: Callable[[int], float]
     load_split: Callable[..., Views]
     draw: Callable[..., tuple]
+    draw_patches: Callable[..., tuple]
     pixel_ids: Callable[..., Any]
     view_rays: Callable[..., Any]
     world_depth: Callable[..., Any]
@@ -100,6 +102,10 @@ def build(config: Config) -> Experiment:
             **options,
         )
 
+    def draw_patches(step, count, data):
+        common = {"pixel_offset": given.pixel_offset, "ndc": given.ndc, "needs": model.needs}
+        return patch_rays.draw_patches(data.seed, step, data.views, count=count, **common)
+
     def pixel_ids(step, positions, data):
         return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **options)[1]
 
@@ -112,6 +118,7 @@ def build(config: Config) -> Experiment:
         schedule=schedule,
         load_split=functools.partial(_load_views, given, model.needs),
         draw=draw,
+        draw_patches=draw_patches,
         pixel_ids=pixel_ids,
         view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc, needs=model.needs)),
         world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=given.ndc)),

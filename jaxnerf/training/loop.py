@@ -372,7 +372,12 @@ def _compile(experiment, views, together=()):
         batch_pixels = BatchPixels(rows=rows, shape=pixels.shape)
         data = data._replace(views=dataclasses.replace(data.views, pixels=batch_pixels))
     step = make_train_step(
-        experiment.model, experiment.optimizer, experiment.draw, experiment.losses, experiment.cameras
+        experiment.model,
+        experiment.optimizer,
+        experiment.draw,
+        experiment.losses,
+        experiment.cameras,
+        experiment.draw_patches,
     )
     turns = many and many_runs.runs_in_turn()
     if many and not turns:

@@ -1,6 +1,14 @@
 """The built-in losses of renderings by name: their functions are in `core.losses`."""
 
-from jaxnerf.core.losses import depth_loss, distortion_loss, mse_loss, opaque_loss
+from jaxnerf.core.losses import (
+    depth_loss,
+    depth_smoothness_loss,
+    distortion_loss,
+    mse_loss,
+    near_opacity_loss,
+    opacity_binarity_loss,
+    opaque_loss,
+)
 from jaxnerf.registry import Loss
 
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
@@ -18,6 +26,7 @@ MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over
 DISTORTION = Loss(distortion_loss, help="distortion of the weights (arXiv:2111.12077, Eq. 15)")
 DEPTH = Loss(
     depth_loss,
+    depth_smoothness_loss,
     needs=("depth", "depth_weight"),
     weight="auto",
     infer=_weight_of_depth,
@@ -25,3 +34,15 @@ DEPTH = Loss(
     "arXiv:2107.02791); auto: at the start of training where space is contracted and there are such points",
 )
 OPAQUE = Loss(opaque_loss, needs=("alpha",), help="squared transmittance of rays where the image is opaque")
+OPACITY_BINARITY = Loss(
+    opacity_binarity_loss, help="4 o (1 - o) of the opacity o: rays should hit a surface or nothing; for few views"
+)
+NEAR_OPACITY = Loss(
+    near_opacity_loss, help="opacity in the first fifth of a ray between near and far; for few views (arXiv:2303.07418)"
+)
+DEPTH_SMOOTHNESS = Loss(
+    depth_smoothness_loss,
+    on="patches",
+    help="squared difference of the depths of neighbouring pixels, seen from poses between the training cameras; for "
+    "few views (arXiv:2112.00724)",
+)

@@ -9,14 +9,17 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.core.losses import squared_error
-from jaxnerf.core.types import Renderings
+from jaxnerf.core.types import Renderings, without_samples
 from jaxnerf.core.views import Views
 from jaxnerf.data import ray_batches
 from jaxnerf.data.active_pixels import PixelRuns
+from jaxnerf.data.patch_rays import in_patches
 from jaxnerf.models.base import Model
 from jaxnerf.training.camera_parameters import CameraParameters, networks
 from jaxnerf.training.dead_networks import count_dead_steps
 from jaxnerf.training.state import PROGRESS, TrainState
+
+_RAYS_PER_PATCH = 64  # of a batch: losses of patches then render a quarter more rays
 
 
 class ProgressData(NamedTuple):
@@ -81,6 +84,7 @@ def make_train_step(
     draw: Callable[..., tuple],
     losses: Sequence[StepLoss],
     cameras: CameraParameters | None = None,
+    patches: Callable[..., tuple] | None = None,
 ) -> Callable[..., tuple]:
     """Makes the pure training step.
 
@@ -90,6 +94,7 @@ def make_train_step(
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see `draw_batch`.
         losses: at least one must be a loss of the renderings.
         cameras: the parameters of the training images; None: none.
+        patches: (step, count, data) -> (keys [B], Rays [B]), see `draw_patches`; for losses of patches.
 
     Returns:
         train_step(state, data, positions, *, axis_name=None) -> (state, metrics).
@@ -108,7 +113,8 @@ def make_train_step(
         if the model asks for it.
     """
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
-    regularizers = [loss for loss in losses if loss.on != "renderings"]
+    patch_losses = [loss for loss in losses if loss.on == "patches"]
+    regularizers = [loss for loss in losses if loss.on not in ("renderings", "patches")]
 
     def progress_at(step, data):
         return {PROGRESS: data.progress.at(step)} if PROGRESS in model.needs else {}
@@ -152,6 +158,25 @@ def make_train_step(
             grads |= jax.tree.map(lambda a, b, weight=weight: a + weight * b, networks(grads), gradient)
         return metrics, grads
 
+    def patch_loss_fn(params, grid, step, keys, rays, progress):
+        renderings = model.render(keys, {**params, **progress}, grid, rays, step)
+        renderings = {name: without_samples(rendering) for name, rendering in renderings.items()}
+        renderings, rays = jax.tree.map(in_patches, (renderings, rays))
+        renderings = Renderings(renderings, model.image_networks)
+        complete = (renderings[-1].num_dropped == 0).all(axis=(1, 2))
+        parts = {loss.name: jnp.where(complete, loss.function(renderings, rays), 0).mean() for loss in patch_losses}
+        return sum(_scaled(loss.weight(step), parts[loss.name]) for loss in patch_losses), parts
+
+    def add_patches(state, data, drawn, metrics, grads):
+        """Adds the gradient of the losses of patches; each device computes the same."""
+        keys, rays = patches(state.step, max(drawn // _RAYS_PER_PATCH, 1), data)
+        (value, parts), gradient = jax.value_and_grad(patch_loss_fn, has_aux=True)(
+            networks(state.params), state.grid, state.step, keys, rays, progress_at(state.step, data)
+        )
+        metrics |= {f"loss_{name}": part for name, part in parts.items()}
+        metrics["loss"] += value
+        return metrics, grads | jax.tree.map(jnp.add, networks(grads), gradient)
+
     def train_step(state, data, positions, *, axis_name=None):
         drawn = positions.size * (1 if axis_name is None else jax.lax.axis_size(axis_name))
         total = _sum_over_microbatches(lambda part: microbatch(state, data, part), positions)
@@ -163,9 +188,12 @@ def make_train_step(
         metrics = jax.tree.map(lambda leaf: leaf * scale, sums)
         errors = {name: metrics[f"mse_{name}"] for name in model.image_networks}
         dead = count_dead_steps(state.counters, networks(grads), errors, model.fields, scale)
+        if regularizers or patch_losses:
+            grads, scale = jax.tree.map(lambda leaf: leaf * scale, grads), 1.0
         if regularizers:
-            metrics, grads = regularize(state, metrics, jax.tree.map(lambda leaf: leaf * scale, grads))
-            scale = 1.0
+            metrics, grads = regularize(state, metrics, grads)
+        if patch_losses:
+            metrics, grads = add_patches(state, data, drawn, metrics, grads)
         metrics["grad_norm"] = scale * optax.tree.norm(grads)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
 

@@ -68,6 +68,7 @@ def make_step(weights, packed=False):
         optimizer,
         lambda step, positions, data: draw(data.seed, step, positions, data.views, data.active_pixels),
         losses,
+        patches=experiment.draw_patches,
     )
     return step, (state, data, jnp.arange(RAYS)[None])
 
@@ -98,7 +99,7 @@ def test_a_loss_of_weight_0_is_absent_from_the_step(packed):
         return jax.jit(step).lower(*given).as_text()
 
     alone = text({"mse": 1.0})
-    names = ("distortion", "depth", "opaque", "hash_decay", "total_variation")
+    names = ("distortion", "depth", "opaque", "hash_decay", "total_variation", "depth_smoothness", "near_opacity")
     assert text({"mse": 1.0, **dict.fromkeys(names, 0.0)}) == alone
     assert len(text({"mse": 1.0, "distortion": 0.1})) > len(alone)
 
@@ -123,6 +124,33 @@ def test_a_regularizer_adds_its_gradient():
     assert row["loss"] == pytest.approx(row["loss_mse"] + 0.25 * row["loss_half_squares"], rel=1e-5)
     for without, with_it, value in zip(*map(jax.tree.leaves, (plain.params, decayed.params, start)), strict=True):
         np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.25 * value, atol=1e-6)
+
+
+@pytest.mark.parametrize("packed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_loss_of_patches_adds_its_gradient(packed):
+    """That of the mean over patches, which are rendered from poses between the cameras."""
+    seen = {}
+
+    def opacity(outputs, rays):
+        seen.update(opacity=outputs[-1].opacity.shape, samples=outputs[-1].samples, near=rays.near.shape)
+        return outputs[-1].opacity.mean(axis=(1, 2))
+
+    jaxnerf.register_loss("patch_opacity", opacity, on="patches")
+    plain, _ = train({"mse": 1.0}, packed=packed)
+    moved, (row,) = train({"mse": 1.0, "patch_opacity": 0.5}, packed=packed)
+    assert seen == {"opacity": (1, 4, 4), "samples": None, "near": (1, 4, 4)}
+    assert row["loss"] == pytest.approx(row["mse_fine"] + 0.5 * row["loss_patch_opacity"], rel=1e-5)
+    experiment, _, data = experiment_and_data(packed)
+    start = make_step({"mse": 1.0}, packed)[1][0]
+    keys, rays = jax.jit(experiment.draw_patches, static_argnums=1)(0, 1, data)
+
+    def mean(params):
+        return experiment.model.render(keys, params, start.grid, rays, 0)["fine"].opacity.mean()
+
+    value, slope = jax.jit(jax.value_and_grad(mean))(start.params)
+    assert row["loss_patch_opacity"] == pytest.approx(float(value), rel=1e-5)
+    for without, with_it, each in zip(*map(jax.tree.leaves, (plain.params, moved.params, slope)), strict=True):
+        np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.5 * each, atol=1e-6)
 
 
 @pytest.mark.parametrize("needs", [(), ("alpha",), ("image_index", "pixel")])
