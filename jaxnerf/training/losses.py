@@ -26,7 +26,6 @@ MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over
 DISTORTION = Loss(distortion_loss, help="distortion of the weights (arXiv:2111.12077, Eq. 15)")
 DEPTH = Loss(
     depth_loss,
-    depth_smoothness_loss,
     needs=("depth", "depth_weight"),
     weight="auto",
     infer=_weight_of_depth,
