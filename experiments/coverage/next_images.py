@@ -166,7 +166,8 @@ def table(scene: str, results: dict[str, dict[int, dict[str, float]]]) -> list[s
         versus = [
             _versus(areas[method], areas[other]) if other != method else "-" for other in results if other in BASE
         ]
-        rows.append([method, *cells, f"{mean:.2f} ± {deviation:.2f}", *versus])
+        whole = f"{mean:.2f} ± {deviation:.2f}" if len(by_seed) > 1 else f"{mean:.2f}"
+        rows.append([method, *cells, whole, *versus])
     versus = [f"above {other} (seeds)" for other in results if other in BASE]
     heads = [f"{scene}: images", *counts, "mean over them", *versus]
     return common.markdown(heads, rows)

@@ -89,7 +89,7 @@ class CoverageReport(NamedTuple):
             "",
             "From how far aside what a camera would show has been seen, in degrees, by where it would be",
             f"({_PLACES[self.candidates.kind].format(first=_name(self.views, 0))}).",
-            f"The images themselves have {self.own_angle:.0f} degrees, as directions are rounded:",
+            f"The images themselves have {self.own_angle:.0f} degrees, by rounded directions and by fog:",
             *_table(self.angles, self.candidates),
             "",
             *self._thin(),
