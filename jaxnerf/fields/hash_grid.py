@@ -204,8 +204,8 @@ def hash_grid_field(**options: Any) -> Field:
         for name, function in (("hash_decay", hash_decay), ("total_variation", total_variation))
     }
     # What is not used is bound, so that nothing asks for it.
-    asked = {"radius": network.prefilter, "progress": network.coarse_to_fine or network.viewdirs_from}
-    scene = functools.partial(apply, **{name: None for name, needed in asked.items() if not needed})
+    wanted = {"radius": network.prefilter, "progress": network.coarse_to_fine or network.viewdirs_from}
+    scene = functools.partial(apply, **{name: None for name, needed in wanted.items() if not needed})
     return Field(init, scene, regularizers=regularizers, color_layers=color_layers)
 
 

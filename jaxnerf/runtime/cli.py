@@ -52,7 +52,9 @@ def run(
     signals.handle(signals.interrupt)
     stages.show()
     flags.DEFINE_list(
-        "plugins", [], "Modules to import first: they register fields, samplers, losses, dataset readers or exporters."
+        "plugins",
+        [],
+        "Modules to import first: they register fields, samplers, losses, dataset readers, exporters or estimators.",
     )
 
     def program(argv):

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxnerf.render
 from jaxnerf.core.types import Rays
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
@@ -44,10 +43,6 @@ def test_rays_are_as_dense_as_in_training(distance, focal, expected):
     assert wide.rays_per_side(pose(distance), focal, max_rays=10**6) <= [2]
     flat = FOOTPRINT._replace(distance=np.inf)  # in normalised device coordinates
     assert flat.rays_per_side(pose(distance), focal) == FOOTPRINT.rays_per_side(pose(1), focal)
-
-
-def test_the_flag_has_the_limit_of_the_function():
-    assert jaxnerf.render._MAX_RAYS.default == MAX_RAYS
 
 
 def test_a_small_frame_is_the_mean_of_a_large_one(trained, tmp_path, capsys):

@@ -147,7 +147,7 @@ def frame_bounds(
 
     At the pose of a view they are that view's, so that the frame equals what evaluation renders. Elsewhere they are
     the distances to the near and far planes of the views nearby in position and direction, within the range of the
-    views' near and of their far. For a frame that is farther from what the views look at than all of them, the range
+    views' near and of their far. For a frame that is farther from what the views look at than all of them, far
     ends so much later.
     """
     cameras = np.asarray(views.cameras.to_world, np.float64)
@@ -162,7 +162,7 @@ def frame_bounds(
         apart += np.linalg.norm(pose[:, 2] - cameras[:, :, 2], axis=1)
         weights = np.maximum(apart, 1e-12) ** -_SHEPARD
         result.append(weights @ (bounds + (moved @ pose[:, 2])[:, None]) / weights.sum())
-    latest = bounds.max(axis=0) + beyond[:, None]
+    latest = bounds.max(axis=0) + beyond[:, None] * [0, 1]
     near, far = np.clip(result, bounds.min(axis=0), latest).astype(np.float32).T
     return near, far
 
