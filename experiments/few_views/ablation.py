@@ -43,9 +43,6 @@ PARTS = {
     "depth_smoothness 1": {"losses.depth_smoothness": 1.0},
     "near_opacity 0.1": {"losses.near_opacity": 0.1},
     "distortion 0.01": {"losses.distortion": 0.01},
-    "opacity_binarity 0.01": {"losses.opacity_binarity": 0.01},
-    "coarse_to_fine 0.5": {"hash_grid.coarse_to_fine": 0.5},
-    "viewdirs_from 0.5": {"hash_grid.viewdirs_from": 0.5},
 }
 NONE, WHOLE = "none", "few_views"
 HEADS = ("variant", "held-out PSNR", "to none", "test PSNR")

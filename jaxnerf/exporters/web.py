@@ -86,7 +86,7 @@ def network_of(source: ExportSource) -> HashGrid:
         reason = f"sampler is {config.sampler!r}, expected 'occupancy'"
     elif config.data.ndc:
         reason = "data.ndc is True, expected False: the page has no normalised device coordinates"
-    elif set(source.run.experiment.model.needs) - {"progress"}:
+    elif source.run.experiment.model.needs:
         reason = f"the field asks for {', '.join(source.run.experiment.model.needs)}, expected position and direction"
     if reason:
         raise ValueError(f"web: {reason}; export such a run as --kind=splats or --kind=mesh")
@@ -100,10 +100,9 @@ def scene_of(source: ExportSource, network: HashGrid, precision: str) -> WebScen
     """Packs the run, with the steps and the early termination of its evaluation."""
     experiment, (params, grid) = source.run.experiment, source.variables
     view = experiment.config.eval
-    network, fine = network.without_curricula(params["fine"], params.get("progress", 1.0))
     return web_scene.pack(
         network,
-        fine,
+        params["fine"],
         grid,
         precision=precision,
         step_size=experiment.model.grid_schedule.step_size / view.sample_multiplier,

@@ -27,11 +27,6 @@ _ADDED = {
     "data.background_color": (),
     "data.up": "",
     "data.view_indices": (),
-    **{
-        f"{section}.{name}": 0.0
-        for section in ("coarse", "fine", "hash_grid")
-        for name in ("coarse_to_fine", "viewdirs_from")
-    },
     "occupancy.min_views": 0,
     "occupancy.uniform_fraction": 1.0,
     "train.lr_decay_power": 1.0,
