@@ -128,7 +128,6 @@ LOSSES = Registry(
         "distortion": "jaxnerf.training.losses:DISTORTION",
         "depth": "jaxnerf.training.losses:DEPTH",
         "opaque": "jaxnerf.training.losses:OPAQUE",
-        "opacity_binarity": "jaxnerf.training.losses:OPACITY_BINARITY",
         "near_opacity": "jaxnerf.training.losses:NEAR_OPACITY",
         "depth_smoothness": "jaxnerf.training.losses:DEPTH_SMOOTHNESS",
         "hash_decay": "jaxnerf.fields.hash_grid:HASH_DECAY",

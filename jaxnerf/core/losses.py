@@ -197,31 +197,13 @@ def opaque_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*ba
     return jnp.asarray(batch.alpha) * (1 - outputs[-1].opacity) ** 2
 
 
-def opacity_binarity_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
-    """Computes 4 o (1 - o) of the last rendering's opacity o: every ray should hit a surface or nothing.
-
-    It is the quadratic counterpart of the opacity's entropy, whose gradient is unbounded at 0 and 1. It needs no alpha:
-    in front of a background it holds for all rays of a scene without fog.
-
-    Args:
-        outputs: Renderings [B].
-        batch: not read.
-
-    Returns:
-        [B] in [0, 1].
-    """
-    del batch
-    opacity = jnp.asarray(outputs[-1].opacity)
-    return 4 * opacity * (1 - opacity)
-
-
 def near_opacity_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
     """Computes the last rendering's opacity close to the cameras, where few views leave fog (after arXiv:2303.07418).
 
         sum_k w_k max(0, 1 - s_k / 0.2)
 
-    s_k is the position of a sample as in `distortion_loss`: 0 at near and 1 at far. The regularizer of FreeNeRF
-    (Eq. 8) is the mean density of the first samples; weights have no unit, and a linear cutoff no edge.
+    s_k is the position of a sample as in `distortion_loss`: 0 at near and 1 at far. FreeNeRF's occlusion regularizer is
+    the mean density of the first samples of a ray; weights have no unit, and a linear cutoff no edge.
 
     Args:
         outputs: Renderings [B] with samples; those of a packed rendering may be PackedSamples.
@@ -258,8 +240,9 @@ def depth_smoothness_loss(outputs: Sequence[Rendering], rays: Rays) -> Float[Arr
 
         mean over neighbours i, j in a patch of o_i o_j (s_i - s_j)^2
 
-    s is the expected depth as a fraction of the ray, as in `distortion_loss`, so that the loss has no unit. The
-    opacities o have no gradient: RegNeRF's loss (Eq. 5) also counts the edge between an object and the background.
+    s is the expected depth, or disparity where far is infinite, as a fraction of the ray, see `distortion_loss`: the
+    loss has no unit. Unlike RegNeRF's it is weighted by the opacities o, which get no gradient, so that the edge
+    between an object and the background does not count.
 
     Args:
         outputs: Renderings [P, H, W] of patches.
@@ -275,21 +258,10 @@ def depth_smoothness_loss(outputs: Sequence[Rendering], rays: Rays) -> Float[Arr
     linear = jnp.where(infinite, 0, rendering.depth - near) / span
     s = jnp.where(infinite, 1 - jnp.minimum(start * rendering.disparity, 1), linear)
     opacity = jax.lax.stop_gradient(jnp.asarray(rendering.opacity))
-    total, count = jnp.zeros(near.shape[:-2]), 0
-    for axis in (-2, -1):
-        first, second = (jax.lax.slice_in_dim(s, *ends, axis=axis) for ends in _neighbours(s, axis))
-        both = functools.reduce(
-            jnp.multiply, (jax.lax.slice_in_dim(opacity, *ends, axis=axis) for ends in _neighbours(s, axis))
-        )
-        total += (both * (first - second) ** 2).sum(axis=(-2, -1))
-        count += both.shape[-2] * both.shape[-1]
-    return total / max(count, 1)
-
-
-def _neighbours(values, axis):
-    """Returns the ranges of all but the last and of all but the first places along an axis."""
-    size = values.shape[axis]
-    return (0, size - 1), (1, size)
+    down = opacity[..., 1:, :] * opacity[..., :-1, :] * jnp.diff(s, axis=-2) ** 2
+    right = opacity[..., 1:] * opacity[..., :-1] * jnp.diff(s, axis=-1) ** 2
+    (height, width), total = s.shape[-2:], down.sum(axis=(-2, -1)) + right.sum(axis=(-2, -1))
+    return total / max((height - 1) * width + height * (width - 1), 1)
 
 
 def _samples(function, rendering):

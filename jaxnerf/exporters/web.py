@@ -83,7 +83,7 @@ def network_of(run: TrainedRun) -> HashGrid:
         reason = f"sampler is {config.sampler!r}, expected 'occupancy'"
     elif config.data.ndc:
         reason = "data.ndc is True, expected False: the page has no normalised device coordinates"
-    elif set(run.experiment.model.needs) - {"progress"}:
+    elif run.experiment.model.needs:
         reason = f"the field asks for {', '.join(run.experiment.model.needs)}, expected position and direction"
     if reason:
         raise ValueError(f"web: {reason}; export such a run as --kind=splats or --kind=mesh")
@@ -100,10 +100,9 @@ def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:
     """Packs variables of a run, with the steps and the early termination of its evaluation; see `network_of`."""
     experiment, (params, grid) = run.experiment, variables
     view = experiment.config.eval
-    network, fine = network_of(run).without_curricula(params["fine"], params.get("progress", 1.0))
     return web_scene.pack(
-        network,
-        fine,
+        network_of(run),
+        params["fine"],
         grid,
         precision=precision,
         step_size=experiment.model.grid_schedule.step_size / view.sample_multiplier,

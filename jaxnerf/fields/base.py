@@ -91,7 +91,7 @@ def apply_network(
     params: Any,
     x: Float[ArrayLike, "*batch samples 3"],
     viewdirs: Float[ArrayLike, "*batch #samples 3"],
-    **inputs: Num[ArrayLike, "..."] | None,
+    **inputs: Num[ArrayLike, "..."],
 ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
     """Evaluates a network at positions in a layout that suits a CPU's cache.
 
@@ -104,12 +104,11 @@ def apply_network(
         params: of the network.
         x: [..., S, 3].
         viewdirs: [..., 1 or S, 3].
-        **inputs: what else the network's call takes, by name: each [..., 1 or S], or a number. None is not passed.
+        **inputs: what else the network's call takes, by name: each [..., 1 or S], or a number.
 
     Returns:
         [..., S] and [..., S, 3], the same as without padding.
     """
-    inputs = {name: value for name, value in inputs.items() if value is not None}
     *leading, samples = shape = x.shape[:-1]
     rays = math.prod(leading)
     if not rays * samples or rays * samples % _CACHE_ROW or not is_cpu():

@@ -20,9 +20,8 @@ from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network
-from jaxnerf.fields.curriculum import CurriculumOptions, band_weights, view_weight
 from jaxnerf.fields.mlp import Dense
-from jaxnerf.options import POSITIVE, Changes, Device, Facts, at_least, between, infer, is_auto, option
+from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
 
 _glorot = linen.initializers.glorot_uniform()
@@ -66,7 +65,7 @@ def _wrong_levels(levels):
 
 
 @dataclasses.dataclass(frozen=True)
-class HashGridOptions(CurriculumOptions):
+class HashGridOptions(Options):
     """The options of the hash grid."""
 
     resolutions: tuple[int, ...] = option(
@@ -193,19 +192,22 @@ def hash_grid_field(**options: Any) -> Field:
         inputs = {"radius": jnp.zeros((1, 1))} if network.prefilter else {}
         return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
-    def apply(params, x, viewdirs, *, radius, progress):
-        radius = None if radius is None else jnp.broadcast_to(radius, x.shape[:-1])
-        density, rgb = apply_network(network, params, x, viewdirs, radius=radius, progress=progress)
+    def apply(params, x, viewdirs, **inputs):
+        density, rgb = apply_network(network, params, x, viewdirs, **inputs)
         return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), color_activation(rgb)
+
+    def apply_to_rays(params, x, viewdirs):
+        return apply(params, x, viewdirs)
+
+    def apply_to_cones(params, x, viewdirs, *, radius):
+        return apply(params, x, viewdirs, radius=jnp.broadcast_to(radius, x.shape[:-1]))
 
     color_layers = ("view_0",) if network.view_depth else ("rgb",)
     regularizers = {
         name: functools.partial(function, levels=network.levels())
         for name, function in (("hash_decay", hash_decay), ("total_variation", total_variation))
     }
-    # What is not used is bound, so that nothing asks for it.
-    wanted = {"radius": network.prefilter, "progress": network.coarse_to_fine or network.viewdirs_from}
-    scene = functools.partial(apply, **{name: None for name, needed in wanted.items() if not needed})
+    scene = apply_to_cones if network.prefilter else apply_to_rays
     return Field(init, scene, regularizers=regularizers, color_layers=color_layers)
 
 
@@ -268,7 +270,6 @@ class HashGrid(linen.Module):
         prefilter: whether the features of each level are multiplied by its `damping`, which is an input, too.
         compute_dtype: of the inputs of both networks' layers; parameters, interpolation and outputs keep the
             precision of the table. None: that of the table for all.
-        coarse_to_fine, viewdirs_from: see CurriculumOptions.
     """
 
     lower: Sequence[float]
@@ -284,8 +285,6 @@ class HashGrid(linen.Module):
     feature_scale: float = 4.0
     prefilter: bool = False
     compute_dtype: Any = None
-    coarse_to_fine: float = 0.0
-    viewdirs_from: float = 0.0
 
     @linen.nowrap
     def levels(self) -> tuple[TableLevel, ...]:
@@ -294,22 +293,6 @@ class HashGrid(linen.Module):
         sizes = [vertices(side, resolution) for resolution in self.resolutions]
         ends = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes]).tolist()
         return tuple(TableLevel(size, range(*rows)) for size, rows in zip(sizes, itertools.pairwise(ends), strict=True))
-
-    @linen.nowrap
-    def without_curricula(
-        self, params: Mapping[str, Any], progress: Float[ArrayLike, ""]
-    ) -> tuple["HashGrid", dict[str, Any]]:
-        """Returns a network without curricula, and its parameters with which it is this one at some progress."""
-        params = dict(params)
-        if self.coarse_to_fine:
-            weights = band_weights(progress, len(self.resolutions), self.coarse_to_fine)
-            params["kernel"] = params["kernel"] * jnp.repeat(weights, self.features_per_level)[:, None]
-        if self.viewdirs_from and self.use_viewdirs:
-            layer = "view_0" if self.view_depth else "rgb"
-            kernel = jnp.asarray(params[layer]["kernel"])
-            weight = view_weight(progress, self.viewdirs_from)
-            params[layer] = {**params[layer], "kernel": kernel.at[self.geometry_features :].multiply(weight)}
-        return self.clone(coarse_to_fine=0.0, viewdirs_from=0.0), params
 
     @linen.nowrap
     def _rounded(self, value):
@@ -321,7 +304,6 @@ class HashGrid(linen.Module):
         x: Float[ArrayLike, "*batch samples 3"],
         viewdirs: Float[ArrayLike, "*batch #samples 3"],
         radius: Float[ArrayLike, "*batch samples"] | None = None,
-        progress: Float[ArrayLike, ""] = 1.0,
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N]."""
         shape = x.shape[:-1]
@@ -339,10 +321,6 @@ class HashGrid(linen.Module):
         features = self._rounded(features)
         kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
         bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
-        if self.coarse_to_fine:
-            weights = band_weights(progress, len(levels), self.coarse_to_fine)
-            weights = [jnp.repeat(weights, self.features_per_level), *([weights] if self.prefilter else [])]
-            kernel = kernel * jnp.concatenate(weights)[:, None]
         kernel, bias = self._rounded(kernel), self._rounded(bias)
         hidden = jax.nn.relu(_first_product(kernel, features) + bias[:, None])
         # The logarithm of a density is up to 15, where bfloat16 has steps of 1/16.
@@ -350,10 +328,7 @@ class HashGrid(linen.Module):
         geometry = Dense(1 + self.geometry_features, name="density", **outputs)(hidden)
         density, hidden = geometry[0], self._rounded(geometry[1:])
         if self.use_viewdirs:
-            directions = harmonics(viewdirs)
-            if self.viewdirs_from:
-                directions = directions * view_weight(progress, self.viewdirs_from)
-            directions = jnp.broadcast_to(directions, (*shape, 9))
+            directions = jnp.broadcast_to(harmonics(viewdirs), (*shape, 9))
             hidden = jnp.concatenate([hidden, self._rounded(directions.reshape(-1, 9).T)])
         for layer in range(self.view_depth):
             hidden = jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(hidden))

@@ -1,7 +1,6 @@
 """The paper's network: a multilayer perceptron on encoded positions and directions (Fig. 7)."""
 
 import dataclasses
-import functools
 import math
 from typing import Any
 
@@ -14,8 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.encoding import encode_planes
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
 from jaxnerf.fields.base import Box, Field, apply_network
-from jaxnerf.fields.curriculum import CurriculumOptions, band_weights, view_weight
-from jaxnerf.options import DTYPES, Device, Facts, at_least, between, infer, option
+from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, option
 from jaxnerf.registry import Part
 
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
@@ -26,7 +24,7 @@ DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
 
 
 @dataclasses.dataclass(frozen=True)
-class MlpOptions(CurriculumOptions):
+class MlpOptions(Options):
     """The options of the paper's network (Fig. 7): 595,844 parameters."""
 
     depth: int = option(8, "layers before the density", range=between(1, _MAX_LAYERS))
@@ -90,16 +88,14 @@ def mlp_field(**options: Any) -> Field:
     def init(key):
         return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
 
-    def apply(params, x, viewdirs, *, key=None, density_noise=0.0, progress=None):
-        density, rgb = apply_network(network, params, x, viewdirs, progress=progress)
+    def apply(params, x, viewdirs, *, key=None, density_noise=0.0):
+        density, rgb = apply_network(network, params, x, viewdirs)
         if key is not None and density_noise:
             density = density + density_noise * normal(key, density.shape)
         return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
 
     layers = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
     color_layers = ("view",) if network.use_viewdirs else ("rgb",)
-    if not (network.coarse_to_fine or network.viewdirs_from):
-        apply = functools.partial(apply, progress=None)  # nothing asks for the progress
     return Field(init, apply, tuple(f"trunk_{layer}" for layer in layers), color_layers=color_layers)
 
 
@@ -127,7 +123,6 @@ class MLP(linen.Module):
         density_activation: "relu" or "softplus".
         density_bias: added to the density before its activation.
         compute_dtype: of the layers; the outputs are at least float32.
-        coarse_to_fine, viewdirs_from: see CurriculumOptions.
     """
 
     depth: int = 8
@@ -141,15 +136,10 @@ class MLP(linen.Module):
     density_activation: str = "relu"
     density_bias: float = 0.0
     compute_dtype: Any = jnp.float32
-    coarse_to_fine: float = 0.0
-    viewdirs_from: float = 0.0
 
     @linen.compact
     def __call__(
-        self,
-        x: Float[ArrayLike, "*batch samples 3"],
-        viewdirs: Float[ArrayLike, "*batch #samples 3"],
-        progress: Float[ArrayLike, ""] = 1.0,
+        self, x: Float[ArrayLike, "*batch samples 3"], viewdirs: Float[ArrayLike, "*batch #samples 3"]
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations.
 
@@ -157,11 +147,7 @@ class MLP(linen.Module):
         backward pass read memory contiguously. A small network on a CPU gains most from this.
         """
         shape = x.shape[:-1]
-        encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode)
-        if self.coarse_to_fine and self.encode and self.num_freqs:
-            weights = band_weights(progress, self.num_freqs, self.coarse_to_fine)
-            encoded = encoded * jnp.concatenate([jnp.ones(3), jnp.repeat(weights, 6)])[:, None]
-        encoded = encoded.astype(self.compute_dtype)
+        encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode).astype(self.compute_dtype)
         hidden = ()
         for layer in range(self.depth):
             joins = layer == 0 or layer == self.skip_layer + 1
@@ -172,8 +158,6 @@ class MLP(linen.Module):
         if self.use_viewdirs:
             # The direction is encoded and multiplied once per ray, and broadcast over its samples.
             directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
-            if self.viewdirs_from:
-                directions = directions * view_weight(progress, self.viewdirs_from)
             directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
             bottleneck = Affine(self.width, name="bottleneck")(self.width)
             features = hidden[0].reshape(-1, *shape)

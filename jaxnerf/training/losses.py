@@ -6,7 +6,6 @@ from jaxnerf.core.losses import (
     distortion_loss,
     mse_loss,
     near_opacity_loss,
-    opacity_binarity_loss,
     opaque_loss,
 )
 from jaxnerf.registry import Loss
@@ -33,9 +32,6 @@ DEPTH = Loss(
     "arXiv:2107.02791); auto: at the start of training where space is contracted and there are such points",
 )
 OPAQUE = Loss(opaque_loss, needs=("alpha",), help="squared transmittance of rays where the image is opaque")
-OPACITY_BINARITY = Loss(
-    opacity_binarity_loss, help="4 o (1 - o) of the opacity o: rays should hit a surface or nothing; for few views"
-)
 NEAR_OPACITY = Loss(
     near_opacity_loss, help="opacity in the first fifth of a ray between near and far; for few views (arXiv:2303.07418)"
 )

@@ -31,11 +31,6 @@ _ADDED = {
     "data.up": "",
     "data.view_indices": (),
     "hash_grid.prefilter": False,
-    **{
-        f"{section}.{name}": 0.0
-        for section in ("coarse", "fine", "hash_grid")
-        for name in ("coarse_to_fine", "viewdirs_from")
-    },
     "occupancy.min_views": 0,
     "occupancy.uniform_fraction": 1.0,
     "train.lr_decay_power": 1.0,

@@ -16,7 +16,6 @@ from jaxnerf.core.losses import (
     depth_smoothness_loss,
     mse_loss,
     near_opacity_loss,
-    opacity_binarity_loss,
     opaque_loss,
 )
 from jaxnerf.core.occupancy.grid import is_occupied
@@ -415,13 +414,6 @@ def test_the_opaque_loss_is_the_squared_transmittance_of_opaque_pixels():
     rendering = dataclasses.replace(make_rendering(np.zeros((4, 1)), None, None), opacity=opacity)
     batch = dataclasses.replace(make_batch(np.ones(4), 2.0), alpha=np.float32([1, 1, 1, 0]))
     np.testing.assert_allclose(opaque_loss([rendering], batch), [1, 0.5625, 0, 0])
-
-
-def test_the_binarity_of_opacities_is_greatest_at_one_half():
-    opacity = np.float32([0, 0.25, 0.5, 1])
-    rendering = dataclasses.replace(make_rendering(np.zeros((4, 1)), None, None), opacity=opacity)
-    batch = make_batch(np.ones(4), 2.0)
-    np.testing.assert_allclose(opacity_binarity_loss([rendering], batch), [0, 0.75, 1, 0])
 
 
 @pytest.mark.parametrize("far, t", [(6.0, [1.0, 1.5, 2.0, 5.0]), (np.inf, [1.0, 1 / 0.9, 1.25, 5.0])])

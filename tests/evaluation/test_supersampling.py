@@ -11,7 +11,7 @@ import pytest
 from jaxnerf.core.types import Rays
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.evaluation.supersampling import MAX_RAYS, Footprint, render_pixels, trained_footprint
+from jaxnerf.evaluation.supersampling import Footprint, render_pixels, trained_footprint
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
