@@ -21,7 +21,7 @@ from jaxnerf.runtime.atomic_files import read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
 
 _SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
-_ROUNDING = 1e-5  # of a distance
+_FAR_AWAY = 1.1  # times as far as the farthest view, from where frames have bounds of their own
 _MAX_FRAMES, _MAX_PIXELS = 100_000, 16_384
 _FPS = {"above": 0.01, "below": 1000}
 
@@ -143,15 +143,16 @@ def frame_bounds(
 
     At the pose of a view they are that view's, so that the frame equals what evaluation renders. Elsewhere they are
     the distances to the near and far planes of the views nearby in position and direction, within the range of the
-    views' near and of their far. For a frame that is farther from what the views look at than all of them, the range
-    ends so much later.
+    views' near and of their far. For a frame that is much farther from what the views look at than all of them, the
+    range ends so much later.
     """
     cameras = np.asarray(views.cameras.to_world, np.float64)
     bounds = np.stack([views.near, views.far], axis=-1).astype(np.float64)
     spread = np.linalg.norm(cameras[:, :, 3] - cameras[:, :, 3].mean(axis=0), axis=1).mean()
     look_at, result = LookAt(views), []
     away = np.linalg.norm(np.asarray(poses, np.float64)[:, :, 3] - look_at.center, axis=1)
-    beyond = np.maximum(away - (1 + _ROUNDING) * look_at.distance.max(), 0)
+    farthest = look_at.distance.max()
+    beyond = np.where(away > _FAR_AWAY * farthest, away - farthest, 0)
     for pose in np.asarray(poses, np.float32).astype(np.float64):  # the precision of the views' poses
         moved = pose[:, 3] - cameras[:, :, 3]
         apart = np.linalg.norm(moved, axis=1) / max(spread, 1e-12)
