@@ -24,7 +24,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 
 FOLDER = "camera_paths"  # of path files, in a workdir
 _SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
-_ROUNDING = 1e-5  # of a distance
+_FAR_AWAY = 1.1  # times as far as the farthest view, from where frames have bounds of their own
 _MAX_FRAMES, _MAX_PIXELS = 100_000, 16_384
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _FPS = {"above": 0.01, "below": 1000}
@@ -147,22 +147,23 @@ def frame_bounds(
 
     At the pose of a view they are that view's, so that the frame equals what evaluation renders. Elsewhere they are
     the distances to the near and far planes of the views nearby in position and direction, within the range of the
-    views' near and of their far. For a frame that is farther from what the views look at than all of them, far
-    ends so much later.
+    views' near and of their far. For a frame that is much farther from what the views look at than all of them, the
+    range ends so much later.
     """
     cameras = np.asarray(views.cameras.to_world, np.float64)
     bounds = np.stack([views.near, views.far], axis=-1).astype(np.float64)
     spread = np.linalg.norm(cameras[:, :, 3] - cameras[:, :, 3].mean(axis=0), axis=1).mean()
     look_at, result = LookAt(views), []
     away = np.linalg.norm(np.asarray(poses, np.float64)[:, :, 3] - look_at.center, axis=1)
-    beyond = np.maximum(away - (1 + _ROUNDING) * look_at.distance.max(), 0)
+    farthest = look_at.distance.max()
+    beyond = np.where(away > _FAR_AWAY * farthest, away - farthest, 0)
     for pose in np.asarray(poses, np.float32).astype(np.float64):  # the precision of the views' poses
         moved = pose[:, 3] - cameras[:, :, 3]
         apart = np.linalg.norm(moved, axis=1) / max(spread, 1e-12)
         apart += np.linalg.norm(pose[:, 2] - cameras[:, :, 2], axis=1)
         weights = np.maximum(apart, 1e-12) ** -_SHEPARD
         result.append(weights @ (bounds + (moved @ pose[:, 2])[:, None]) / weights.sum())
-    latest = bounds.max(axis=0) + beyond[:, None] * [0, 1]
+    latest = bounds.max(axis=0) + beyond[:, None]
     near, far = np.clip(result, bounds.min(axis=0), latest).astype(np.float32).T
     return near, far
 
