@@ -96,7 +96,7 @@ def main(argv: list[str]) -> None:
 def train(name: str) -> None:
     """Trains a run of RUNS unless it has a checkpoint."""
     if not (FOLDER / name / "checkpoints").exists():
-        command = [sys.executable, "-m", "jaxnerf.train", "--config.train.preview_every=0", *RUNS[name]]
+        command = [sys.executable, "-m", "jaxnerf.train", *RUNS[name], "--config.train.preview_every=0"]
         subprocess.run([*command, f"--workdir={FOLDER / name}"], check=True)
 
 

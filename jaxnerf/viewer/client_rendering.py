@@ -36,7 +36,7 @@ class ClientRendering:
         """
         self._viewer, self._changed, self._lock = viewer, changed, threading.Lock()
         self._encoded: tuple[SceneState | None, bytes] = None, b""
-        self._asked = -_ABSENT
+        self._requested = -_ABSENT
         try:
             web.network_of(viewer.run)
             self.refused = ""
@@ -46,7 +46,7 @@ class ClientRendering:
     @property
     def is_open(self) -> bool:
         """Whether a page has asked recently."""
-        return time.monotonic() - self._asked < _ABSENT
+        return time.monotonic() - self._requested < _ABSENT
 
     async def answer(self, request: Any) -> tuple[http.HTTPStatus, str, bytes] | None:
         """Returns the status, type and body for a request of a browser; None: it is for the page with frames."""
@@ -54,15 +54,15 @@ class ClientRendering:
         if address.path == FRAMES:
             request.path = "/"  # where viser has its page
         elif address.path == "/" and not self.refused:
-            self._ask()
+            self._note_request()
             return http.HTTPStatus.OK, "text/html; charset=utf-8", web.page(None, live=True).encode()
         elif address.path == "/scene.bin" and not self.refused:
-            self._ask()
+            self._note_request()
             return await self._scene(parse_qs(address.query).get("step", [""])[0])
         return None
 
-    def _ask(self):
-        self._asked = time.monotonic()
+    def _note_request(self):
+        self._requested = time.monotonic()
         self._changed()
 
     async def _scene(self, step):

@@ -76,12 +76,12 @@ def test_a_fit_restores_what_was_disturbed():
         scale=truth.scale * np.float32(1.3),
         harmonics=truth.harmonics * np.float32(0.7),
     )
-    unseen = images_of(truth, 9)[7:]
+    held_out = images_of(truth, 9)[7:]
     fitted = fit_gaussians(moved, images, WHITE, steps=120)
     assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(fitted))
     np.testing.assert_allclose(np.linalg.norm(fitted.rotation, axis=1), 1, atol=1e-5)
     assert error(fitted, images) < 0.05 * error(moved, images)
-    assert error(fitted, unseen) < 0.3 * error(moved, unseen)
+    assert error(fitted, held_out) < 0.3 * error(moved, held_out)
 
 
 def test_no_steps_change_nothing():

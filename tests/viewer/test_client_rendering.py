@@ -84,7 +84,7 @@ def test_parameters_that_cannot_be_shown_are_named(viewer):
     assert status == 503 and b"not finite" in text
 
 
-def test_a_page_that_no_longer_asks_is_forgotten(viewer, monkeypatch):
+def test_a_page_that_sends_no_more_requests_is_forgotten(viewer, monkeypatch):
     get(viewer.port, "/scene.bin")
     assert viewer.num_browsers == 1
     now = client_rendering.time.monotonic()
