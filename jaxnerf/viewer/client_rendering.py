@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
-from unittest import mock
 from urllib.parse import parse_qs, urlsplit
 
 from jaxnerf.exporters import web
@@ -117,5 +116,8 @@ def answering(admits: Callable[[Any], str | None], answer: Callable[[Any], Any])
         times = {"open_timeout": _TRANSFER_SECONDS, "close_timeout": _TRANSFER_SECONDS}
         return serve(*args, process_request=process, **{**options, **times})
 
-    with mock.patch.object(server, "serve", wrapped):
+    server.serve = wrapped
+    try:
         yield
+    finally:
+        server.serve = serve
