@@ -158,7 +158,8 @@ def compile_step(config, views=None) -> Step:
     experiment = build.build(config)
     valid, data = experiment.prepare(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
-    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
+    parts = experiment.model, experiment.optimizer, experiment.draw, experiment.losses
+    step = make_train_step(*parts, patches=experiment.draw_patches)
     positions = jnp.asarray(split_positions(config.train.batch_size, 1, config.train.microbatch_size)[0])
 
     def count_flops():

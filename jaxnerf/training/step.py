@@ -111,9 +111,15 @@ def make_train_step(
         `count_dead_steps`; "num_reinits", which only reinitialization changes; with a grid "rays_dropped",
         the rays that were ignored because some of their samples did not fit into the sample buffer; and "progress"
         if the model asks for it.
+
+    Raises:
+        ValueError: if a loss of patches is given without `patches`.
     """
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
     patch_losses = [loss for loss in losses if loss.on == "patches"]
+    if patch_losses and patches is None:
+        names = ", ".join(loss.name for loss in patch_losses)
+        raise ValueError(f"make_train_step: {names} need patches of rays, and patches is None; pass draw_patches")
     regularizers = [loss for loss in losses if loss.on not in ("renderings", "patches")]
 
     def progress_at(step, data):

@@ -16,7 +16,7 @@ from jaxnerf.registry import FIELDS, LOSSES
 from jaxnerf.training import auto_config
 from jaxnerf.training.build import build, build_losses
 from jaxnerf.training.state import create_state
-from jaxnerf.training.step import make_train_step
+from jaxnerf.training.step import StepLoss, make_train_step
 from runs import PACKED, smoke_config
 
 pytest_plugins = ["run_fixtures"]
@@ -151,6 +151,9 @@ def test_a_loss_of_patches_adds_its_gradient(packed):
     assert row["loss_patch_opacity"] == pytest.approx(float(value), rel=1e-5)
     for without, with_it, each in zip(*map(jax.tree.leaves, (plain.params, moved.params, slope)), strict=True):
         np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.5 * each, atol=1e-6)
+    losses = [StepLoss("patch_opacity", opacity, "patches", lambda step: 1)]
+    with pytest.raises(ValueError, match="patch_opacity need patches of rays"):
+        make_train_step(experiment.model, experiment.optimizer, experiment.draw, losses)
 
 
 @pytest.mark.parametrize("needs", [(), ("alpha",), ("image_index", "pixel")])
