@@ -81,12 +81,16 @@ def test_images_in_another_order_are_no_fold():
     assert folds.judge_folds(*orbit(names), ()) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, fold",
     [
-        pytest.param(name, fold, marks=pytest.mark.scenes(name), id=name)
-        for name, fold in (("can", "0013 and 0014, 0034 and 0035"), ("fern", None), ("fox", None), ("lego", None))
+        pytest.param(name, fold, marks=[pytest.mark.scenes(name), mark], id=name)
+        for name, fold, mark in (
+            ("can", "0013 and 0014, 0034 and 0035", pytest.mark.slow),
+            ("fern", None, pytest.mark.slow),
+            ("fox", None, pytest.mark.extra),
+            ("lego", None, pytest.mark.extra),
+        )
     ],
 )
 def test_real_scenes_have_no_errors_and_only_can_is_folded(scenes_dir, name, fold):

@@ -93,7 +93,7 @@ def dataset(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_a_moving_scene_is_learned_from_images_with_times(dataset, tmp_path):
     """Unseen views at unseen times; with the time frozen the same network shows the bodies at the wrong places."""
     fields = {"data.format": "blender", "data.dir": str(dataset), "data.near": 2.8, "data.far": 5.2}

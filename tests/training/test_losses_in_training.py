@@ -126,7 +126,7 @@ def test_a_regularizer_adds_its_gradient():
         np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.25 * value, atol=1e-6)
 
 
-@pytest.mark.parametrize("packed", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("packed", [False, pytest.param(True, marks=pytest.mark.extra)])
 def test_a_loss_of_patches_adds_its_gradient(packed):
     """That of the mean over patches, which are rendered from poses between the cameras."""
     seen = {}

@@ -38,7 +38,7 @@ def difference(a, b):
     [
         ("packed", False),
         pytest.param("packed", True, marks=pytest.mark.slow),
-        pytest.param("paper", True, marks=pytest.mark.slow),
+        pytest.param("paper", True, marks=pytest.mark.extra),
     ],
 )
 def test_each_run_ends_as_it_does_alone(kind, vmapped, tmp_path, monkeypatch):
