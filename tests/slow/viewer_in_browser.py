@@ -189,7 +189,8 @@ def closing_all_pages_stops_the_rendering(page, process):
 
 
 def a_page_renders_by_itself(browser, port, out):
-    page = browser.new_page(viewport={"width": 420, "height": 400})
+    page = browser.new_page()
+    page.set_viewport_size({"width": 420, "height": 400})
     page.set_default_timeout(SECONDS * 1000)
     page.goto(f"http://127.0.0.1:{port}/")
     page.wait_for_url("**/frames/")
