@@ -31,7 +31,7 @@ RATES = {  # of Adam, for the first step; those of `mean` are in standard deviat
 _LAST_RATE = 0.05  # of the first
 _BETA2, _EPSILON = 0.99, 1e-15
 _GROUP, _VISITS = 16, 2  # images whose pairs are found at once, and the steps for each before they are found again
-_MIN_TRANSMITTANCE = 1e-3  # pairs of a pixel and a Gaussian behind so little light are left out
+_MIN_TRANSMITTANCE = 1e-3  # pairs of a pixel and a Gaussian behind so little light are skipped
 _PADDING = 2**16  # pairs are padded to a multiple of it, so that images share a compiled step
 _OPACITY = (0.005, 0.995)  # the range to begin with
 
@@ -60,7 +60,7 @@ def fit_gaussians(
         gaussians: to begin with.
         images: all of one size.
         background: [3] behind the Gaussians; None: black.
-        box: pixels that show a surface outside of it are left out, as no Gaussian is there; None: all count.
+        box: pixels that show a surface outside it do not count, as no Gaussian is there; None: all count.
         steps: of Adam; its rates decay exponentially.
         seed: of the order of the images.
     """

@@ -84,7 +84,7 @@ def build(config: Config) -> Experiment:
     if cameras is not None:
         model = cameras.added_to(model)
     if train.deterministic:
-        model = _in_fixed_order(model, cameras)
+        model = _in_fixed_order(model, losses, cameras)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
     options = {"batching": train.batching, "extras": extras}
@@ -127,12 +127,16 @@ def build(config: Config) -> Experiment:
     )
 
 
-def _in_fixed_order(model, cameras):
+def _in_fixed_order(model, losses, cameras):
     """Returns a model whose sums have a fixed order."""
-    if cameras is not None and jax.default_backend() != "cpu":
+    others = {"cameras.exposure or cameras.refine": cameras is not None}
+    # The gradient of the depth loss depends on its own sums over rays; those of other losses do not.
+    others["losses.depth"] = any(loss.name == "depth" for loss in losses)
+    found = [name for name, is_on in others.items() if is_on]
+    if found and jax.default_backend() != "cpu":
         raise ValueError(
-            "train.deterministic is True, and exposures or poses of the images are trained, whose gradients have no "
-            "fixed order on an accelerator; set it to False, or turn off cameras.exposure and cameras.refine"
+            f"train.deterministic is True, and {' and '.join(found)} is on, whose gradient has no fixed order on an "
+            "accelerator; set it to False, or turn the other off"
         )
     return model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view))
 

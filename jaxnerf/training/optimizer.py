@@ -162,9 +162,8 @@ def _update_together(schedule, size, grads, state, params):
         return jax.tree.unflatten(structure, turned)
 
     # Without a loop: its iterations are launches, too.
-    once = optax.contrib.scale_by_muon(
-        _ITERATIONS[0], weight_dimension_numbers=optax.contrib.MuonDimensionNumbers(1, 2)
-    )
+    sides = optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2)
+    once = optax.contrib.scale_by_muon(_ITERATIONS[0], len(_ITERATIONS), weight_dimension_numbers=sides)
     stacked = first._replace(mu=stack(first.mu), ns_coeffs=first.ns_coeffs[0])
     directions, stacked = once.update(stack(grads), stacked)
     first = first._replace(mu=unstack(stacked.mu), count=stacked.count)
