@@ -126,6 +126,16 @@ def test_a_deformed_field_is_the_field_until_it_is_moved(contracted):
     np.testing.assert_allclose(change, 1, rtol=1e-5)
 
 
+@pytest.mark.parametrize("damage", [lambda data: data[:100], lambda data: data[:70] + b"?" + data[71:], lambda _: b""])
+def test_a_damaged_posterior_is_computed_again(tmp_path, damage):
+    path, lines = tmp_path / "laplace.npz", []
+    np.savez(path, key="a", std=np.ones((2, 2, 2, 3), np.float32), noise=np.float32(1))
+    assert laplace._stored(path, "a", lines.append) is not None and laplace._stored(path, "b", lines.append) is None
+    path.write_bytes(damage(path.read_bytes()))
+    assert laplace._stored(path, "a", lines.append) is None
+    assert lines == [f"{path}: is damaged, and computed again"]
+
+
 def test_the_uncertainty_at_a_position_is_the_standard_deviation_there():
     std = np.ones((5, 5, 5, 3))
     std[1:] = 0.5, 0.1, 0.1
