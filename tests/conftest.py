@@ -1,5 +1,6 @@
 """Four CPU devices, checks of type annotations, and the real scenes, for every test."""
 
+import gc
 import os
 import pathlib
 import signal
@@ -22,6 +23,8 @@ import type_checks  # noqa: E402
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 type_checks.install("jaxnerf", "test_scenes")
+# The programs of all tests stay in memory; to search them for garbage at the usual rate is a tenth of the time.
+gc.set_threshold(200_000, 20, 100)
 
 
 def pytest_configure(config):

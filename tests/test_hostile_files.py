@@ -67,6 +67,7 @@ def test_only_regular_files_are_read(tmp_path, no_waiting, name, kind):
         READERS[name](path)
 
 
+@pytest.mark.extra
 def test_a_pipe_in_a_checkpoint_is_an_error(trained, tmp_path, no_waiting):
     folder = shutil.copytree(trained, tmp_path / "run")
     metadata = folder / "checkpoints" / "20" / "_CHECKPOINT_METADATA"

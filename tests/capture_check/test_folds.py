@@ -87,7 +87,7 @@ def test_images_in_another_order_are_no_fold():
         pytest.param(name, fold, marks=[pytest.mark.scenes(name), mark], id=name)
         for name, fold, mark in (
             ("can", "0013 and 0014, 0034 and 0035", pytest.mark.slow),
-            ("fern", None, pytest.mark.slow),
+            ("fern", None, pytest.mark.extra),
             ("fox", None, pytest.mark.extra),
             ("lego", None, pytest.mark.extra),
         )

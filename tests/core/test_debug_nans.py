@@ -380,13 +380,9 @@ def total(function, arguments):
 
 # Of the renderers' cases `make test` has these, and of the samplers' those without a key; `make test-extra` has all.
 RENDERED = {
-    "render_samples soft segments ",
     "render_samples solid segments skipped",
-    "render_samples soft gauss far",
     "render_packed soft segments  grid",
     "render_packed solid segments skipped",
-    "render_packed few slots",
-    "render_rays soft disparity",
 }
 QUICK = [name for name in CASES if name in RENDERED or not ("drawn" in name or name.startswith(("render_", "distort")))]
 

@@ -71,7 +71,13 @@ def test_a_function_is_in_fixed_order_only_while_it_is_traced_and_only_on_an_acc
     assert not in_fixed_order()
 
 
-@pytest.mark.parametrize("wrap", [lambda function: function, with_fixed_order], ids=["plain", "fixed order"])
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        pytest.param(lambda function: function, marks=pytest.mark.extra, id="plain"),
+        pytest.param(with_fixed_order, id="fixed order"),
+    ],
+)
 def test_the_hash_grid_of_an_accelerator_is_that_of_a_cpu(monkeypatch, wrap):
     field = hash_grid_field(lower=(-1,) * 3, upper=(1,) * 3, resolutions=(4, 8, 32), table_size=2**9)
     params = field.init(jax.random.key(0))

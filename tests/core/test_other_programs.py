@@ -220,6 +220,7 @@ def test_errors_name_the_function_that_was_called():
         jaxnerf.mlp_field(layers=3)
 
 
+@pytest.mark.extra
 def test_a_pose_is_refined_by_public_functions():
     """Finds the pose of an image by gradient descent from one that is 3 degrees and 0.05 units off."""
     view, pixels = camera(), jaxnerf.pixel_grid(6, 6)

@@ -140,7 +140,7 @@ def test_what_several_sizes_do_not_fit_is_refused(settings, reason):
         build.build(config)
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_a_run_of_several_sizes_is_trained_and_rendered(tmp_path):
     """Pixels of all sizes are drawn, and what an image shows depends on the size of its pixels."""
     config = smoke_config(max_steps=8, lr_steps=8)

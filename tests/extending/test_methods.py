@@ -4,6 +4,7 @@ import coarse_to_fine
 import jax
 import numpy as np
 import proposal_sampler  # noqa: F401
+import pytest
 
 import jaxnerf
 from jaxnerf.evaluation.evaluate import evaluate
@@ -23,6 +24,7 @@ def trained(folder, steps, **fields):
     return read_rows(folder), evaluate(folder)["psnr"]
 
 
+@pytest.mark.extra
 def test_a_proposal_network_with_a_loss_of_its_own(compiled_once, tmp_path):
     network = {
         "depth": 3,

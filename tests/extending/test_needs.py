@@ -44,6 +44,7 @@ def train_at_scales(field, workdir, *, steps, size, num_samples, factors, traine
     return [score(run, cone_field.shrunk(test, factor)) for factor in factors]
 
 
+@pytest.mark.extra
 def test_a_cone_field_learns(tmp_path):
     (quarter,) = train_at_scales("cone", tmp_path / "run", steps=200, size=32, num_samples=24, factors=(4,))
     assert quarter > 20.5
@@ -108,6 +109,7 @@ def test_a_moving_scene_is_learned_from_images_with_times(dataset, tmp_path):
     assert value > 21.5 and value > frozen + 4
 
 
+@pytest.mark.extra
 def test_the_dataset_shows_the_bodies_where_they_are(dataset):
     """A frame equals the closed form at its camera and its time."""
     views = jaxnerf.load_dataset(dataset, split="test", near=2.0, far=6.0)

@@ -144,7 +144,7 @@ def test_lists_of_arrays_of_every_numpy_version_are_read(protocol, numpy_1, tmp_
         np.testing.assert_array_equal(weights.networks[0][name][1], bias)
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_a_converted_run_is_scored_loaded_and_trained_further(compiled_once, tmp_path):
     networks = [random_layers(seed, **SMALL) for seed in (1, 2)]
     files, (_, fine) = write("original", tmp_path / "theirs", networks, step=10)

@@ -24,8 +24,8 @@ STEPS = 40
     [
         ("mlp", "hierarchical"),
         pytest.param("hash_grid", "occupancy", marks=pytest.mark.extra),
-        pytest.param("mlp", "occupancy", marks=pytest.mark.slow),
-        pytest.param("hash_grid", "hierarchical", marks=pytest.mark.slow),
+        pytest.param("mlp", "occupancy", marks=pytest.mark.extra),
+        pytest.param("hash_grid", "hierarchical", marks=pytest.mark.extra),
     ],
 )
 def test_the_loss_falls(field, sampler):

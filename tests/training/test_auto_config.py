@@ -173,6 +173,7 @@ def test_config_of_the_paper_is_resolved_and_logs_nothing_about_a_box(views):
     assert baked.occupancy == got.occupancy and any(line.startswith("box ") for line in lines)
 
 
+@pytest.mark.extra
 def test_rays_that_hit_nothing_have_the_mean_color_of_an_unbounded_capture(views):
     """Black behind a bright scene would be replaced by fog in front of the cameras."""
     given, rgb = auto_config(), np.random.default_rng(0).integers(0, 256, (*views.pixels.shape[:1], 3), np.uint8)

@@ -247,7 +247,7 @@ def test_what_is_off_is_absent(blob_field):
         assert found.keys() == names and all(leaf.shape[:1] in ((), (60,)) for leaf in found.values())
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_a_resumed_run_equals_an_uninterrupted_one(blob_field, tmp_path, capsys):
     options = {"averaging_power": 2.0, "muon": 0.5, "log_every": 5}
     whole, parts = tmp_path / "whole", tmp_path / "parts"

@@ -319,7 +319,7 @@ def test_resumed_run_is_bit_exact_with_its_grid(toy, unoptimized, tmp_path):
     ).any()
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_workdir_restores_the_scene_and_its_images(unoptimized, tmp_path, capsys, monkeypatch):
     """The config has "auto" sizes, and only the workdir is known afterwards."""
     monkeypatch.setattr(processes, "prints_details", lambda: True)

@@ -126,7 +126,7 @@ def test_if_no_checkpoint_can_be_read_none_is_renamed(folder):
     assert Checkpoints(folder).steps() == [10, 15, 20]
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_run_resumes_with_another_number_of_devices(folder, trained):
     """It was trained on four; only the order in which gradients are summed differs."""
     shutil.rmtree(folder / "checkpoints" / "20")
@@ -272,7 +272,9 @@ def test_signal_during_evaluation_keeps_the_checkpoints(folder, monkeypatch, cap
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["SIGHUP", "reader", "closed"])
+@pytest.mark.parametrize(
+    "how", [pytest.param("SIGHUP", marks=pytest.mark.extra), pytest.param("reader", marks=pytest.mark.extra), "closed"]
+)
 def test_run_whose_terminal_or_reader_goes_away_is_saved(compiled_once, tmp_path, how):
     steps = 40 if how == "closed" else 1_000_000
     command = [sys.executable, "-m", "jaxnerf.train", f"--workdir={tmp_path}/run", *SMOKE_FLAGS]

@@ -57,7 +57,7 @@ def test_each_run_ends_as_it_does_alone(kind, vmapped, tmp_path, monkeypatch):
         assert row["rays"] == same["rays"] and row.keys() == same.keys()
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_runs_resume_from_the_newest_step_of_all(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(many_runs, "runs_in_turn", lambda: True)
     folders = [tmp_path / "a", tmp_path / "b"]
@@ -86,6 +86,7 @@ def scene_config(folder, seed):
     return config
 
 
+@pytest.mark.extra
 def test_runs_of_several_scenes_end_as_each_does_alone(tmp_path):
     configs = [scene_config(tmp_path / f"scene{index}", index) for index in range(2)]
     assert jaxnerf.train_many(configs, [tmp_path / "a", tmp_path / "b"])

@@ -59,7 +59,7 @@ def dataset(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module", params=["hierarchical", "occupancy"])
+@pytest.fixture(scope="module", params=[pytest.param("hierarchical", marks=pytest.mark.extra), "occupancy"])
 def workdir(request, dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param, numbered=False) / "run"
     assert jaxnerf.train_and_evaluate(config_of(request.param, dataset), folder)
@@ -115,7 +115,7 @@ def test_images_that_are_not_trained_on_have_the_index_0(workdir):
     assert held_out.time.shape == (2,) and held_out.time.any()
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_it_is_scored_exported_and_viewed(workdir, tmp_path):
     folder = shutil.copytree(workdir, tmp_path / "run")
     assert evaluate(folder, split="held_out")["views"] == 2
