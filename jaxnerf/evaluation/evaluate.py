@@ -106,7 +106,7 @@ def train_observed(
             scored = time.perf_counter()
             lines = previews.summary(views)
             took = f"{scored - started:.1f} s for scoring, " if config.eval.at_end else ""
-            processes.print_once(f"after training {took}{time.perf_counter() - scored:.1f} s for this summary", *lines)
+            processes.print_once(f"afterwards    {took}{time.perf_counter() - scored:.1f} s for this summary", *lines)
         except KeyboardInterrupt:
             processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
             return False
