@@ -4,8 +4,8 @@
         [--page=FILE.md]
 
 Measured are one chunk of the view's rays, spread over the image: all of it; the marching that finds the samples in
-occupied cells; and the field, for as many samples as are evaluated at once. A sample is reached if the transmittance in
-front of it is above `eval.early_stop_eps`. The others of a ray are not evaluated. With --page the table between
+occupied cells; and the field at the samples that are reached. A sample is reached if the transmittance in front of it
+is above `eval.early_stop_eps`; the others of a ray are not evaluated. With --page the table between
 <!-- frame parts --> and <!-- end of frame parts --> in that file is replaced.
 """
 
@@ -22,9 +22,9 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.core.occupancy.grid import is_occupied
-from jaxnerf.core.occupancy.packed import render_packed
+from jaxnerf.core.occupancy.packed import _occupied_words, render_packed
 from jaxnerf.core.occupancy.ray_marching import march_rays
+from jaxnerf.core.rendering import points_on_rays
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.fields.base import field_scene
 from jaxnerf.runtime import cli
@@ -49,7 +49,7 @@ def main(argv: list[str]) -> None:
     if _VIEW.value >= len(views.offset):
         raise ValueError(f"--view={_VIEW.value}: the split {_SPLIT.value!r} has {len(views.offset)} views")
     rays, whole = chunk_of(run, views, _VIEW.value)
-    rows = [*timings(run, variables, rays, whole), *counts(run, variables, rays)]
+    rows = measure(run, variables, rays, whole)
     common.publish([*common.provenance(), "", *common.markdown(HEADS, rows)], "frame parts")
 
 
@@ -63,21 +63,43 @@ def chunk_of(run, views, index):
     return jax.tree.map(lambda leaf: leaf.reshape(height * width, *leaf.shape[2:])[chosen], rays), height * width
 
 
-def timings(run, variables, rays, whole):
-    """Returns rows with the milliseconds of a chunk and of its parts."""
+def measure(run, variables, rays, whole):
+    """Returns rows with the CPU time of a chunk and of its parts, and with what samples it has."""
     options, field = run.experiment.config.eval, run.experiment.model.fields["fine"]
-    scene = jax.jit(lambda params, x, viewdirs: field_scene(field, params)(x, viewdirs))
-    rng, count = np.random.default_rng(0), options.max_samples
-    chosen = rng.integers(rays.near.size, size=count)
-    t = rng.uniform(0.2, 3, (count, 1, 1)).astype(np.float32)
-    x = rays.origins[chosen][:, None] + t * rays.directions[chosen][:, None]
-    march = jax.jit(lambda grid, rays: is_occupied(grid, rays, _samples(run, grid, rays).t))
+
+    @jax.jit
+    def find(variables, rays):
+        scene, grid = field_scene(field, variables[0]), variables[1]
+        return render_packed(scene, grid, rays, _samples(run, grid, rays), max_samples=_MOST_SAMPLES).samples
+
+    @jax.jit
+    def march(grid, rays):
+        return _occupied_words(grid, rays, _samples(run, grid, rays))
+
+    @jax.jit
+    def evaluate(params, x, viewdirs):
+        return jax.lax.map(lambda at: field_scene(field, params)(*at), (x, viewdirs))
+
+    packed = jax.device_get(find(variables, rays))
+    t, ray, weights = (values[packed.used] for values in (packed.t, packed.ray_index, packed.weights.astype(float)))
+    ends, first = np.cumsum(weights), np.flatnonzero(np.diff(ray, prepend=-1))
+    starts = np.repeat(ends[first] - weights[first], np.diff(first, append=len(ray)))
+    reached = 1 - (ends - weights - starts) > options.early_stop_eps
+    each = jax.tree.map(lambda leaf: leaf[ray[reached]], rays)
+    places = points_on_rays(each, t[reached][:, None]), each.viewdirs[:, None]
+    whole_rounds = reached.sum() // options.max_samples * options.max_samples
+    places = [leaf[:whole_rounds].reshape(-1, options.max_samples, 1, 3) for leaf in places]
     calls = {
         f"a chunk of {rays.near.size:,} rays of {whole:,}": lambda: run.render(variables, rays),
-        "marching of the chunk": lambda: march(variables[1], rays),
-        f"the field at {count:,} samples": lambda: scene(variables[0], x, rays.viewdirs[chosen][:, None]),
+        "of it marching": lambda: march(variables[1], rays),
+        f"of it the field, {options.max_samples:,} samples at a time": lambda: evaluate(variables[0], *places),
     }
-    return [(name, f"{1e3 * cpu_seconds(call):.2f} ms of CPU") for name, call in calls.items()]
+    return [
+        *((name, f"{1e3 * cpu_seconds(call):.1f} ms of CPU") for name, call in calls.items()),
+        ("samples in occupied cells, per ray", f"{len(ray) / rays.near.size:.1f}"),
+        ("of them reached, per ray", f"{reached.sum() / rays.near.size:.1f}"),
+        *((f"of these with a weight above {w:.2g}", f"{(weights[reached] > w).mean():.3f}") for w in _WEIGHTS),
+    ]
 
 
 def cpu_seconds(call) -> float:
@@ -89,28 +111,6 @@ def cpu_seconds(call) -> float:
         jax.block_until_ready(call())
         found.append(time.process_time() - started)
     return statistics.median(found)
-
-
-def counts(run, variables, rays):
-    """Returns rows with the numbers of samples per ray, and how many of these weigh how much."""
-    field, eps = run.experiment.model.fields["fine"], run.experiment.config.eval.early_stop_eps
-
-    @jax.jit
-    def find(variables, rays):
-        scene, grid = field_scene(field, variables[0]), variables[1]
-        return render_packed(scene, grid, rays, _samples(run, grid, rays), max_samples=_MOST_SAMPLES).samples
-
-    packed = jax.device_get(find(variables, rays))
-    weights, ray = (np.asarray(values[packed.used]) for values in (packed.weights.astype(np.float64), packed.ray_index))
-    ends = np.cumsum(weights)
-    first = np.flatnonzero(np.diff(ray, prepend=-1))
-    starts = np.repeat(ends[first] - weights[first], np.diff(first, append=len(ray)))
-    reached = 1 - (ends - weights - starts) > eps
-    rows = [
-        ("samples in occupied cells, per ray", f"{len(ray) / rays.near.size:.1f}"),
-        ("of them reached, per ray", f"{reached.sum() / rays.near.size:.1f}"),
-    ]
-    return rows + [(f"of these with a weight above {w:.2g}", f"{(weights[reached] > w).mean():.3f}") for w in _WEIGHTS]
 
 
 def _samples(run, grid, rays):
