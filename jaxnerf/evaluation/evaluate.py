@@ -23,7 +23,7 @@ from jaxnerf.evaluation import aggregate, output_images
 from jaxnerf.evaluation.metrics import image_metrics, object_mask, pixel_mask
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
-from jaxnerf.runtime import atomic_files, processes, shards
+from jaxnerf.runtime import atomic_files, memory, processes, shards, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
@@ -99,10 +99,14 @@ def train_observed(
     previews = Previews(workdir)
 
     def finish(views):
+        started = time.perf_counter()
         try:
             if config.eval.at_end:
-                _score_newest(workdir)
-            processes.print_once(*previews.summary(views))
+                _score_newest(workdir, previews.evaluated_run)
+            scored = time.perf_counter()
+            lines = previews.summary(views)
+            took = f"{scored - started:.1f} s for scoring, " if config.eval.at_end else ""
+            processes.print_once(f"afterwards    {took}{time.perf_counter() - scored:.1f} s for this summary", *lines)
         except KeyboardInterrupt:
             processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
             return False
@@ -111,10 +115,11 @@ def train_observed(
     return train(config, workdir, views=views, preview=previews.write, at_end=finish, observe=observe)
 
 
-def _score_newest(workdir):
-    """Scores the last checkpoint unless it has been scored."""
+def _score_newest(workdir, restore=None):
+    """Scores the last checkpoint unless it has been scored; restore() returns its TrainedRun, restored here if None."""
     if not (pathlib.Path(workdir) / "eval" / str(Checkpoints(workdir).steps()[-1])).exists():
-        evaluate(workdir, shard=(jax.process_index(), jax.process_count()))
+        run = restore_run(workdir) if restore is None else restore()
+        score_run(run, workdir, shard=(jax.process_index(), jax.process_count()))
 
 
 def evaluate(
@@ -170,7 +175,9 @@ def score_run(
     target = result_folder(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
     split = split or run.experiment.config.eval.split
     views = run.experiment.load_split(split) if views is None else views
-    variables = run.variables(step)
+    with stages.stage("reading the checkpoint to score"):
+        variables = run.variables(step)
+        memory.release()
     views = refined_views(run, views, split, variables[0])
     partial, provenance = target.with_name(target.name + ".tmp"), _provenance(run, variables, views, split, step)
     if predictor is not None:

@@ -17,13 +17,16 @@ from jaxnerf.core.views import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_run
+from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, memory, processes, stages
 from jaxnerf.training import metric_log
 from jaxnerf.training.state import TrainState
+from jaxnerf.training.workdir import load_config
 
 _MAX_VIEWS = 8  # of a split that the summary scores
 # What may go wrong with an image must not end a run: files, and the memory of a device that is full of training.
 _FAILURES = (ValueError, OSError, memory.OutOfMemory, jax.errors.JaxRuntimeError)
+_SETTINGS = {"bake_occupancy": False, "max_uncertainty": 1.0}  # of evaluation, replaced by those that take no time
 _MAX_RAYS = 2**16  # of an image; of larger ones only every n-th row and column is rendered
 
 
@@ -73,9 +76,18 @@ class Previews:
             *self._commands(f"--config.{limit}={more:.10g}"),
         ]
 
+    def evaluated_run(self) -> TrainedRun:
+        """Returns the run as evaluation restores it: the one of the previews, whose program is compiled and whose
+        checkpoint is read once, unless its images are those of other settings.
+        """
+        options = load_config(self._workdir).eval
+        same = all(getattr(options, name) == value for name, value in _SETTINGS.items())
+        return self._run if same else restore_run(self._workdir)
+
     @functools.cached_property
     def _run(self):
-        return restore_run(self._workdir, settings={"bake_occupancy": False, "max_uncertainty": 1.0})
+        run = restore_run(self._workdir, settings=_SETTINGS)
+        return run._replace(variables=functools.lru_cache(maxsize=1)(run.variables))
 
     @functools.cached_property
     def _held_out(self):

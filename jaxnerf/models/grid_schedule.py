@@ -1,5 +1,6 @@
 """The occupancy grid of a model: its box, and when training updates which cells."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,7 +34,7 @@ class GridSchedule(NamedTuple):
         lower, upper: [3] world units, the box.
         shape: cells along x, y and z.
         step_size: world units between samples.
-        threshold: 1 / world unit, the density below which a cell is empty, or that of each cell [X, Y, Z].
+        min_opacity: of one step, below which a cell is empty.
         create: (valid, empty=None) -> OccupancyGrid, see InitialCells.
         update: (key, step, params, OccupancyGrid, cells [L] int32, radii=None) -> OccupancyGrid, see `update_grid`.
         contracted: see OccupancyGrid.
@@ -43,7 +44,7 @@ class GridSchedule(NamedTuple):
     upper: Corner
     shape: tuple[int, int, int]
     step_size: float
-    threshold: float | np.ndarray
+    min_opacity: float
     create: Callable[..., OccupancyGrid]
     update: Callable[..., OccupancyGrid]
     contracted: bool = False
@@ -53,6 +54,12 @@ class GridSchedule(NamedTuple):
         """The size of a cell [3], world units."""
         sides = zip(self.lower, self.upper, self.shape, strict=True)
         return tuple((high - low) / count for low, high, count in sides)
+
+    @property
+    def threshold(self) -> float | np.ndarray:
+        """The density below which a cell is empty, 1 / world unit, or that of each cell [X, Y, Z]."""
+        parts = [self.min_opacity / part for part in _spacings(self.step_size, self.shape, self.contracted)]
+        return functools.reduce(np.minimum, parts)
 
     def box(self) -> dict[str, Any]:
         """Returns the arguments with which `visible_grid` creates a grid of the same box."""
@@ -98,8 +105,7 @@ def make_grid_schedule(
         )
     sides = [high - low for low, high in zip(lower, upper, strict=True)]
     shape = tuple(max(round(side / max(sides) * resolution), 1) for side in sides)
-    density, spacing = threshold / step_size, step_size * (_stretches(shape) if contracted else 1)
-    empty_below = threshold / spacing
+    density, spacings = threshold / step_size, _spacings(step_size, shape, contracted)
 
     def create(valid, empty=None):
         # A cell starts at ten times the threshold, so about half a dozen updates empty it.
@@ -133,8 +139,8 @@ def make_grid_schedule(
                 grid,
                 field_scene(field, params),
                 chosen,
-                threshold=empty_below,
-                spacing=spacing,
+                threshold=functools.reduce(jnp.minimum, [threshold / part for part in spacings]),
+                spacing=functools.reduce(jnp.maximum, spacings),
                 spread=young,
                 chunk=update_chunk,
                 radii=radii,
@@ -142,11 +148,15 @@ def make_grid_schedule(
 
         return jax.lax.cond(step % interval == interval - 1, updated, lambda: grid)
 
-    return GridSchedule(tuple(lower), tuple(upper), shape, step_size, empty_below, create, update, contracted)
+    return GridSchedule(tuple(lower), tuple(upper), shape, step_size, threshold, create, update, contracted)
 
 
-def _stretches(shape):
-    """Returns [X, Y, Z], the length of steps in each contracted cell over that of steps in plain space."""
+def _spacings(step_size, shape, contracted):
+    """Returns [X, 1, 1], [1, Y, 1] and [1, 1, Z], whose largest is the spacing of samples in a cell; or one number.
+
+    As one array for all cells it would be a constant of the training step, of which the compiler makes many copies.
+    """
+    if not contracted:
+        return [step_size]
     along = [np.abs(4 * (np.arange(size) + 0.5) / size - 2) for size in shape]
-    largest = np.max(np.meshgrid(*along, indexing="ij"), axis=0)
-    return np.float32(1 / np.minimum(2 - largest, 1) ** 2)
+    return np.ix_(*(step_size * np.float32(1 / np.minimum(2 - each, 1) ** 2) for each in along))

@@ -37,8 +37,9 @@ def compile_step(
 
     Args:
         train_step: see `make_train_step`.
-        state: TrainState, or a function that makes one, which runs while the step compiles. With several
-            processes the state of the first one is used.
+        state: TrainState, or a function that makes one, see `unoptimized`. It runs while the step compiles; on a CPU
+            afterwards, so that less memory is needed at once. With several processes the state of the first one is
+            used.
         data: what the step draws from; copied to every device. The same in all processes.
         batch_size: rays per step, over all devices of all processes.
         microbatch_size: rays whose gradient is computed at once; None, or more than a device has: all of them.
@@ -75,14 +76,17 @@ def compile_step(
     )
     processes.check_same("data or configuration", data)
     data = place(data, everywhere)
+    create = unoptimized(state, devices[0]) if callable(state) else make
     with ThreadPoolExecutor(1) as pool:
-        made = pool.submit(unoptimized(state, devices[0]) if callable(state) else make)
+        made = None if devices[0].platform == "cpu" else pool.submit(create)
         if mode == "pmap" and jax.process_count() > 1:  # JAX compiles this at the first call only
             compiled = _with_global_state(jitted, everywhere)
         else:
             compiled = jitted.lower(shapes, data, positions).compile()
             memory.check(compiled)
-        state = place(processes.broadcast(made.result()), everywhere)
+        memory.release()
+        state = place(processes.broadcast(made.result() if made else create()), everywhere)
+    memory.release()
 
     def run(state, data):
         return compiled(state, data, positions)
@@ -104,9 +108,14 @@ def _sharded(train_step, mesh):
 
 
 def unoptimized(function, device):
-    """Jits a function that runs once: optimizing its code takes longer than running it."""
+    """Jits a function without arguments that runs once: optimizing its code takes longer than running it.
+
+    Arrays that a jax.tree_util.Partial binds are arguments of the program. Those that a function refers to would be
+    constants, of which the compiler makes many copies.
+    """
     options = {"xla_backend_optimization_level": 0} if device.platform == "cpu" else None
-    return jax.jit(function, compiler_options=options)
+    bound = function if isinstance(function, jax.tree_util.Partial) else jax.tree_util.Partial(function)
+    return functools.partial(jax.jit(lambda bound: bound(), compiler_options=options), bound)
 
 
 def _with_global_state(run, everywhere):

@@ -1,5 +1,6 @@
 """Memory: how much is free, whether a program fits, and retrying with smaller parts when it does not."""
 
+import ctypes
 import pathlib
 import sys
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from jaxnerf.core.types import Rays, Rendering
 from jaxnerf.runtime import stages
 
 _HOST_FRACTION = 0.8  # of the host's free memory that a program may take; if it takes more, the system kills processes
+_AMPLE = 0.5  # of the free memory: a program that needs less will not fail for want of it
 _MARGIN = 0.9  # part of what a program needs does not scale with the size of its parts
 
 
@@ -30,13 +32,26 @@ class OutOfMemory(Exception):
 
 def check(compiled: Any) -> None:
     """Raises OutOfMemory if a compiled program's results and temporaries do not fit; its arguments exist already."""
-    stats = compiled.memory_analysis() if hasattr(compiled, "memory_analysis") else None
-    free = available()
-    if stats is None or free is None:
-        return
-    needed = stats.temp_size_in_bytes + stats.output_size_in_bytes - stats.alias_size_in_bytes
-    if needed > free:
+    needed, free = _needed(compiled), available()
+    if needed is not None and free is not None and needed > free:
         raise OutOfMemory(needed, free)
+
+
+def _needed(compiled):
+    """Returns the bytes of a compiled program's results and temporaries; None where they are not known."""
+    stats = compiled.memory_analysis() if hasattr(compiled, "memory_analysis") else None
+    return stats and stats.temp_size_in_bytes + stats.output_size_in_bytes - stats.alias_size_in_bytes
+
+
+def release() -> None:
+    """Returns memory that is free to the system, where the C library is glibc.
+
+    The programs keep it otherwise, see `cli.run`. It is called where a phase ends that needed much more than the next
+    one, such as compiling: it takes milliseconds, and what is used again is cleared by the system first.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim:
+        trim(0)
 
 
 def available() -> float | None:
@@ -110,9 +125,10 @@ def fit_step(
 ) -> tuple[Callable[..., tuple], Any, Any]:
     """Returns what compile_step(state, data, microbatch_size) returns, with smaller microbatches if necessary.
 
-    Whether a size fits is checked when the step is compiled, and again by the first step, which is repeated
-    with a smaller size if memory runs out. Later steps need no more than the first. The batch stays the same,
-    so the step's result does, too, except for rounding.
+    Whether a size fits is checked when the step is compiled. Unless it needs less than half of the free memory, it is
+    checked again by the first step, which is repeated with a smaller size if memory runs out; a copy of the state is
+    kept for that. Later steps need no more than the first. The batch stays the same, so the step's result does, too,
+    except for rounding.
 
     Args:
         compile_step: (state, data, microbatch size) -> run, state, data; see `devices.compile_step`.
@@ -123,6 +139,9 @@ def fit_step(
     if jax.process_count() > 1:
         options["least"] = microbatch_size  # all processes run the same program, so one cannot change it
     (run, state, data), size = back_off(lambda size: compile_step(state, data, size), microbatch_size, **options)
+    needed, free = _needed(getattr(run, "compiled", None)), available()
+    if needed is not None and free is not None and needed < _AMPLE * free:
+        return run, state, data
     tried = False
 
     def run_once_or_retry(state, data):
@@ -169,6 +188,7 @@ def image_renderer(
                     # For the arrays themselves, not only their shapes: the call would compile again for arrays that are
                     # bound to a device.
                     check(render.lower(variables, rays).compile())
+                    release()
                     checked.add((size, key))
                 return render(variables, rays)
 

@@ -15,7 +15,7 @@ class Stage:
     """A stage of a program's work; see `stage`."""
 
     def __init__(self, text: str, note: str = ""):
-        self._text, self._note, self._started = text, note, time.perf_counter()
+        self.text, self._note, self._started = text, note, time.perf_counter()
         self._done, self._total = 0, 0
 
     def update(self, done: int, total: int) -> None:
@@ -26,13 +26,19 @@ class Stage:
         """Returns what the stage is doing, since when, and how far it is."""
         seconds = f"for {time.perf_counter() - self._started:.0f} s"
         done = f", {self._done:,} of {self._total:,} done" if self._total else ""
-        return f"working       {self._text} {seconds}{done}{self._note}"
+        return f"working       {self.text} {seconds}{done}{self._note}"
 
 
 def show(shown: bool = True) -> None:
     """Sets whether the stages of this process are shown."""
     global _shown
     _shown = shown
+
+
+def innermost() -> str | None:
+    """Returns what the innermost stage of a program is doing; None between stages, and where nothing is shown."""
+    running = _running[-1:]
+    return running[0].text if running else None
 
 
 @contextlib.contextmanager

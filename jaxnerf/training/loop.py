@@ -304,8 +304,9 @@ def _run_all(experiments, all_views, folders, *, preview=None, observe=None):
                 recent = []
                 runs.check_finite(rows)
             if save:
-                with clock.paused():
+                with clock.paused(), stages.stage("saving the checkpoint"):
                     runs.save(state)
+                    memory.release()
             if last:
                 break
             if processes.any_of(previews.is_due(clock.seconds()), step):
@@ -365,6 +366,7 @@ def _compile(experiment, views, together=()):
     if many:
         data, own = many_runs.stack_data(each_data, [str(folder) for *_, folder in together])
     prepared = time.perf_counter()
+    memory.release()
     pixels = each_data[0].views.pixels
     gather = not many and _stay_on_host(pixels)
     if gather:
@@ -384,10 +386,14 @@ def _compile(experiment, views, together=()):
         step = many_runs.step_of_all(step, own)
 
     def initial_state(run=0):
-        return create_state(experiment.model, experiment.optimizer, seeds[run], cells[run])
+        create = functools.partial(create_state, experiment.model, experiment.optimizer, seeds[run])
+        return jax.tree_util.Partial(create, cells[run])
 
     def initial_states():
-        return many_runs.stack_states([initial_state(run) for run in range(len(seeds))])
+        return jax.tree_util.Partial(
+            lambda each: many_runs.stack_states([create() for create in each]),
+            list(map(initial_state, range(len(seeds)))),
+        )
 
     def compile_steps(count):
         def compile_step(state, data, microbatch_size):
@@ -396,7 +402,7 @@ def _compile(experiment, views, together=()):
 
         run, state, placed = memory.fit_step(
             compile_step,
-            initial_states if many and not turns else initial_state,
+            initial_states() if many and not turns else initial_state(),
             each_data[0] if turns else data,
             min(options.microbatch_size, options.batch_size // len(devices.devices_of(options.parallel))),
         )
@@ -407,9 +413,7 @@ def _compile(experiment, views, together=()):
             sharding = state.step.sharding
             # As the first one is made: another compilation would round the initial parameters differently.
             device = next(iter(sharding.device_set))
-            others = [
-                devices.unoptimized(functools.partial(initial_state, index), device)() for index in range(1, len(seeds))
-            ]
+            others = [devices.unoptimized(initial_state(index), device)() for index in range(1, len(seeds))]
             states = (state, *devices.place(others, sharding))
             taken = devices.place([many_runs.taken_leaves(each, own) for each in each_data], sharding)
             return many_runs.in_turn(run, taken, own), states, placed

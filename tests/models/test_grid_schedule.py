@@ -48,6 +48,20 @@ def updates_of_cells(num_steps, num_cells, **options):
     return counts.round().astype(int)[:, cells], np.delete(counts, cells, axis=1)
 
 
+def test_thresholds_of_contracted_cells_follow_their_stretch_and_are_no_constants_of_a_program():
+    """Far from the center a step is longer by the square of the distance there, and absorbs as much at less density."""
+    schedule = a_schedule(box=((-2.0, -2.0, -1.0), (2.0, 2.0, 1.0)), contracted=True, resolution=16)
+    places = [np.abs(4 * (np.arange(size) + 0.5) / size - 2) for size in schedule.shape]
+    largest = np.max(np.meshgrid(*places, indexing="ij"), axis=0)
+    expected = 0.01 / STEP_SIZE * np.minimum(2 - largest, 1) ** 2
+    np.testing.assert_allclose(schedule.threshold, expected, rtol=1e-6)
+    assert a_schedule().threshold == pytest.approx(0.01 / STEP_SIZE)
+    grid, cells = schedule.create(np.ones(schedule.shape, bool)), np.arange(8)
+    update = jax.make_jaxpr(lambda grid, cells: schedule.update(KEY, 0, {"fine": None}, grid, cells))(grid, cells)
+    sizes = [np.size(const) for const in update.consts]
+    assert max(sizes, default=0) <= max(schedule.shape), "the compiler copies constants many times"
+
+
 def test_cells_are_cubes_along_all_sides():
     schedule = a_schedule(resolution=20)
     assert schedule.shape == (20, 20, 15) and schedule.cell == pytest.approx((0.15, 0.15, 2.3 / 15))

@@ -117,6 +117,16 @@ def test_step_that_does_not_fit_runs_in_smaller_microbatches(when, capsys):
     assert len(err) == 2 and "training step with 8 rays per microbatch (--batch)" in err[1]
 
 
+@pytest.mark.parametrize("scale", [1.9, 2.1])
+def test_a_copy_of_the_state_is_kept_only_for_a_step_that_needs_over_half_of_the_memory(monkeypatch, scale):
+    stats = types.SimpleNamespace(temp_size_in_bytes=60, output_size_in_bytes=50, alias_size_in_bytes=10)
+    run = lambda *given: given  # noqa: E731
+    run.compiled = types.SimpleNamespace(memory_analysis=lambda: stats)
+    monkeypatch.setattr(memory, "available", lambda: 100 * scale)
+    found, _, _ = memory.fit_step(lambda *given: (run, None, None), None, None, 16)
+    assert (found is run) == (scale > 2)
+
+
 def test_chunk_that_does_not_fit_is_halved_and_the_image_is_the_same(monkeypatch, capsys):
     rays, tried = jax.tree.map(jnp.asarray, random_rays(0, (6, 7))), []
 
