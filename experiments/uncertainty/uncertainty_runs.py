@@ -21,8 +21,9 @@ def config_of(scene: str, folder: pathlib.Path, *, seed: int = 0) -> Any:
     """Returns the config of a scene.
 
     Args:
-        scene: "still", the embedded one; "lego"; "lego8" with 8 training views; "can" and "fox", images of a phone;
-            "fern"; "room20" or "room70", the embedded room with so many views, whose test views are far from them.
+        scene: "still", the embedded one; "demo", the same by configs/quickstart.py; "lego"; "lego8" with 8 training
+            views; "can" and "fox", images of a phone; "fern"; "room20" or "room70", the embedded room with so many
+            views, whose test views are far from them.
         folder: of all runs, where the captures of the room are.
         seed: of the run.
     """
@@ -31,6 +32,8 @@ def config_of(scene: str, folder: pathlib.Path, *, seed: int = 0) -> Any:
     if scene == "still":
         fields = {"data.size": 100, "data.hold_out": 5, "train.max_seconds": 20.0}
         return common.configuration("quickstart", fields, seed=seed)
+    if scene == "demo":
+        return common.configuration("quickstart", seed=seed)
     if scene == "lego":
         return common.configuration("lego_fast", {**lego, "data.hold_out": 10, "train.max_seconds": 40.0}, seed=seed)
     if scene == "lego8":
