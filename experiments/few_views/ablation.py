@@ -55,7 +55,7 @@ def variants() -> dict[str, dict]:
     off = {name: 0.0 for fields in PARTS.values() for name in fields}
     off["losses.distortion"] = common.configuration("capture").losses.distortion
     config = flatten(common.configuration("few_views").to_dict())
-    used = [name for name in off if config[name] != off[name]]
+    used = [name for name in off if config[name] not in (off[name], "auto")]
     return {
         NONE: off,
         **{name: off | fields for name, fields in PARTS.items()},

@@ -28,12 +28,12 @@ _WHITE = {"occupancy.use_alpha": False}  # the images have a white background, a
 _FERN = {"data.dir": "fern", "data.factor": 8}
 # By row: its changes of the config, and the training steps.
 ROWS = {
-    "lego 200 px": ({"data.dir": "lego", "data.factor": 4, **_EIGHT, **_WHITE}, 4000),
-    "lego 200 px with alpha": ({"data.dir": "lego", "data.factor": 4, **_EIGHT}, 4000),
+    "lego 200 px": ({"data.dir": "lego", "data.factor": 4, **_EIGHT, **_WHITE}, 6000),
+    "lego 200 px with alpha": ({"data.dir": "lego", "data.factor": 4, **_EIGHT}, 6000),
     "lego 400 px": ({"data.dir": "lego", "data.factor": 2, **_EIGHT, **_WHITE}, 6000),
     "lego 400 px with alpha": ({"data.dir": "lego", "data.factor": 2, **_EIGHT}, 6000),
-    "mic 200 px": ({"data.dir": "mic", "data.factor": 4, **_EIGHT, **_WHITE}, 4000),
-    "mic 200 px with alpha": ({"data.dir": "mic", "data.factor": 4, **_EIGHT}, 4000),
+    "mic 200 px": ({"data.dir": "mic", "data.factor": 4, **_EIGHT, **_WHITE}, 6000),
+    "mic 200 px with alpha": ({"data.dir": "mic", "data.factor": 4, **_EIGHT}, 6000),
     "fern 504 px 3 views": ({**_FERN, "data.view_indices": (0, 8, 16)}, 1000),
     "fern 504 px 6 views": ({**_FERN, "data.view_indices": (0, 3, 6, 10, 13, 16)}, 1500),
     "fern 504 px 9 views": ({**_FERN, "data.view_indices": (0, 2, 4, 6, 8, 10, 12, 14, 16)}, 2000),
