@@ -32,8 +32,8 @@ MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over
 DISTORTION = Loss(
     distortion_loss,
     infer=_weight_of_distortion,
-    help="distortion of the weights (arXiv:2111.12077, Eq. 15); auto, for few views: 0.01 where a box bounds the scene, "
-    "otherwise 0.001",
+    help="distortion of the weights (arXiv:2111.12077, Eq. 15); auto, for few views: 0.01 where a box bounds the "
+    "scene, otherwise 0.001",
 )
 DEPTH = Loss(
     depth_loss,
