@@ -84,10 +84,9 @@ def measure(workdir: pathlib.Path, members: list[str], places: dict[str, str]):
     """
     run = restore_run(workdir)
     variables = run.variables(newest_step(run, workdir))
-    predictors = {
-        "laplace": make_predictor(run, workdir, "laplace", say=logging.info),
-        "ensemble": make_predictor(run, workdir, "ensemble", members=members, say=logging.info),
-    }
+    predictors = {"laplace": make_predictor(run, workdir, "laplace", say=logging.info)}
+    if members:
+        predictors["ensemble"] = make_predictor(run, workdir, "ensemble", members=members, say=logging.info)
     for split, place in places.items():
         views = refined_views(run, run.experiment.load_split(split), split, variables[0])
         rows, psnr = _scored(run, variables, views, predictors)
