@@ -16,10 +16,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from absl import flags
 
+from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
+from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.runtime.atomic_files import partial_file, write_text
 from jaxnerf.runtime.devices import split_positions
 from jaxnerf.training import auto_config, build
@@ -113,6 +116,24 @@ def load_split(config, split: str) -> Views:
         _splits.pop(next(iter(_splits)))
     _splits[key] = views
     return views
+
+
+def mean_psnr(run, variables, views: Views, *, most: int = 25) -> float:
+    """Returns the mean PSNR, dB, over views of a split, at most `most` of them, evenly spread over all.
+
+    Args:
+        run: a TrainedRun.
+        variables: of its checkpoint.
+        views: of the split; pixels that a mask excludes do not count.
+        most: number of views that are scored.
+    """
+    found = []
+    for index in np.unique(np.linspace(0, len(views.names) - 1, most).astype(int)):
+        height, width = (int(side) for side in views.size[index])
+        pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
+        rgb = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
+        found.append(image_metrics(rgb, views.image(index), pixel_mask(views, index))["psnr"])
+    return statistics.fmean(found)
 
 
 def plain_config(config) -> dict[str, Any]:

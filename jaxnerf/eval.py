@@ -44,11 +44,10 @@ _BAKE_OCCUPANCY = flags.DEFINE_bool(
     "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
     "config.eval.bake_occupancy.",
 )
-_MAX_UNCERTAINTY = flags.DEFINE_float(
+_MAX_UNCERTAINTY = cli.define_number(
     "max_uncertainty",
-    None,
-    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; 1: off. It overrides "
-    "config.eval.max_uncertainty.",
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
+    "allow; 1: off. It overrides config.eval.max_uncertainty.",
 )
 _ERROR_BUDGET = flags.DEFINE_float(
     "error_budget",

@@ -13,15 +13,12 @@ import pathlib
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from absl import flags
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
-from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.core.metrics import mse
 from jaxnerf.evaluation import evaluate, restore
 from jaxnerf.runtime import cli
 from jaxnerf.training.config import flatten
@@ -51,7 +48,6 @@ _SCENES = flags.DEFINE_list("scenes", list(SCENES), f"Scenes to train on, of {tu
 _STEPS = flags.DEFINE_integer("steps", 500, "Steps of every run.", lower_bound=1)
 _SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds; every variant is trained with each.")
 _ONLY = flags.DEFINE_list("only", None, "Names of the variants to train; all when not given.")
-_MAX_VIEWS = 25  # of the test views
 
 
 def variants() -> dict[str, dict]:
@@ -59,7 +55,7 @@ def variants() -> dict[str, dict]:
     off = {name: 0.0 for fields in PARTS.values() for name in fields}
     off["losses.distortion"] = common.configuration("capture").losses.distortion
     config = flatten(common.configuration("few_views").to_dict())
-    used = [name for name in off if config[name] != off[name]]
+    used = [name for name in off if config[name] not in (off[name], "auto")]
     return {
         NONE: off,
         **{name: off | fields for name, fields in PARTS.items()},
@@ -104,20 +100,9 @@ def _measure(scene, name, seed, folder):
     run = restore.restore_run(folder)
     variables = run.variables(run.steps()[-1])
     splits = ("held_out", "test") if name in (NONE, WHOLE) else ("held_out",)
-    found = {split: _psnr(run, variables, run.experiment.load_split(split)) for split in splits}
+    found = {split: common.mean_psnr(run, variables, run.experiment.load_split(split)) for split in splits}
     jax.clear_caches()  # no other run has this step and this renderer
     return found
-
-
-def _psnr(run, variables, views):
-    """Returns the mean PSNR of some views, spread over all."""
-    values = []
-    for index in np.unique(np.linspace(0, len(views.offset) - 1, _MAX_VIEWS).astype(int)):
-        height, width = (int(value) for value in views.size[index])
-        pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
-        image = run.render_image(variables, run.experiment.view_rays(views, index, pixels))
-        values.append(-10 * np.log10(float(mse(jnp.clip(image.rgb, 0, 1), views.image(index)))))
-    return float(np.mean(values))
 
 
 def report(rows: dict) -> list[str]:

@@ -1,7 +1,7 @@
 """Measures what cleaning does: PSNR near the training views and far from them against `eval.max_uncertainty`.
 
     JAXNERF_SCENES=... python experiments/uncertainty/cleaning.py [--folder=runs/uncertainty] \
-        [--scenes=room20,room70,lego8,can] [--limits=1,0.95,0.9,0.8,0.7,0.5] [--views=12] \
+        [--scenes=room20,room70,lego8,can,demo] [--limits=1,0.95,0.9,0.8,0.7,0.5,auto] [--views=12] \
         [--page=docs/results/uncertainty.md]
 
 It trains what it needs in --folder, see uncertainty_runs.py, and keeps it there. The views of room20 and room70 are
@@ -28,13 +28,19 @@ from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import cli
 
 _NEAR_AND_FAR = {"val": "near", "test": "far"}
-SCENES = {"room20": _NEAR_AND_FAR, "room70": _NEAR_AND_FAR, "lego8": {"test": "far"}, "can": {"test": "near"}}
+SCENES = {
+    "room20": _NEAR_AND_FAR,
+    "room70": _NEAR_AND_FAR,
+    "lego8": {"test": "far"},
+    "can": {"test": "near"},
+    "demo": {"test": "near"},
+}
 HEADS = ("scene", "limit", "cells removed, %", "PSNR near, dB", "change", "PSNR far, dB", "change", "s per frame")
 
 _FOLDER = flags.DEFINE_string("folder", "runs/uncertainty", "Of the runs, which are kept.")
 _SCENES = flags.DEFINE_list("scenes", list(SCENES), f"Of {', '.join(SCENES)}.")
 _LIMITS = flags.DEFINE_list(
-    "limits", ["1", "0.95", "0.9", "0.8", "0.7", "0.5"], "Of eval.max_uncertainty; the first one is 1."
+    "limits", ["1", "0.95", "0.9", "0.8", "0.7", "0.5", "auto"], "Of eval.max_uncertainty; the first one is 1."
 )
 _VIEWS = flags.DEFINE_integer("views", 12, "Views of each split, spread evenly over all.", lower_bound=1)
 
@@ -45,11 +51,11 @@ def main(argv: list[str]) -> None:
     folder, rows = pathlib.Path(_FOLDER.value), []
     for scene in common.chosen("--scenes", _SCENES.value, SCENES):
         workdir, first, whole = runs.trained(scene, folder), {}, None
-        for limit in map(float, _LIMITS.value):
+        for limit in [each if each == "auto" else float(each) for each in _LIMITS.value]:
             found, cells, seconds = measure(workdir, limit, SCENES[scene])
             first, whole = first or found, whole or cells
             scores = [part for place in ("near", "far") for part in _change(found.get(place), first.get(place))]
-            rows.append([scene, f"{limit:g}", f"{100 * (1 - cells / whole):.1f}", *scores, f"{seconds:.3f}"])
+            rows.append([scene, str(limit), f"{100 * (1 - cells / whole):.1f}", *scores, f"{seconds:.3f}"])
     common.publish([*common.provenance(), "", *common.markdown(HEADS, rows)], "cleaning")
 
 
@@ -57,7 +63,7 @@ def _change(score, first):
     return ["-", "-"] if score is None else [f"{score:.2f}", f"{score - first:+.2f}"]
 
 
-def measure(workdir: pathlib.Path, limit: float, places: dict[str, str]) -> tuple[dict[str, float], int, float]:
+def measure(workdir: pathlib.Path, limit: float | str, places: dict[str, str]) -> tuple[dict[str, float], int, float]:
     """Returns the mean PSNR by place, the occupied cells, and the median time of a frame.
 
     Args:

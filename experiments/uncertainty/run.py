@@ -1,10 +1,12 @@
-"""Measures predicted errors of trained runs against true ones: coverage, interval, AUSE, and the time of laplace.
+"""Measures predicted errors of trained runs against true ones: coverage, interval, AUSE, PSNR, and laplace's time.
 
     JAXNERF_SCENES=... python experiments/uncertainty/run.py [--folder=runs/uncertainty] [--scenes=still,lego] \
         [--views=25] [--page=docs/results/uncertainty.md]
 
 It trains what it needs in --folder, see uncertainty_runs.py, and keeps it there. Intervals are for 90 % of the errors,
-and calibrated on held-out training views; test views are scored once.
+and calibrated on held-out training views; test views are scored once. Of the embedded room, room70, views near the
+training views and views far from all of them are scored, which no run has seen. The predicted PSNR of a view is that of
+the mean square of its pixels' predicted errors.
 """
 
 import pathlib
@@ -28,57 +30,89 @@ from jaxnerf.evaluation.uncertainty.calibration import figures, pixel_error, sco
 from jaxnerf.evaluation.uncertainty.predict import make_predictor
 from jaxnerf.runtime import cli
 
-SCENES = ("still", "lego")
+SCENES = {
+    "still": {"test": "still"},
+    "lego": {"test": "lego"},
+    "room70": {"val": "room, near", "test": "room, far"},
+    "fern": {"test": "fern"},
+    "fox": {"test": "fox"},
+}
 HEADS = ("scene", "estimator", "coverage, %", "mean half width", "AUSE (RMSE)", "AUSE (MAE)", "on the object", "(MAE)")
+PSNR = ("views", "number", "estimator", "true PSNR", "predicted", "median difference of a view")
 TIMES = ("scene", "training, s", "laplace, s", "of the training's time")
 
 _FOLDER = flags.DEFINE_string("folder", "runs/uncertainty", "Of the runs, which are kept.")
-_SCENES = flags.DEFINE_list("scenes", list(SCENES), f"Of {', '.join(SCENES)}.")
+_SCENES = flags.DEFINE_list("scenes", ["still", "lego"], f"Of {', '.join(SCENES)}.")
 _VIEWS = flags.DEFINE_integer("views", 25, "Test views of each scene, spread evenly over all.", lower_bound=1)
 
 
 def main(argv: list[str]) -> None:
     """Trains, measures and prints the tables."""
     del argv
-    folder, rows, times = pathlib.Path(_FOLDER.value), [], []
-    for scene in common.chosen("--scenes", _SCENES.value, SCENES):
+    folder, rows, levels, times = pathlib.Path(_FOLDER.value), [], [], []
+    scenes = common.chosen("--scenes", _SCENES.value, SCENES)
+    for scene in scenes:
         workdir, members = runs.trained(scene, folder), runs.members_of(scene, folder)
-        for name, found in measure(workdir, members):
+        for place, name, found, psnr in measure(workdir, members, SCENES[scene]):
             covered = ["-", "-"]
             if "coverage" in found:
                 covered = [f"{100 * found['coverage']:.1f}", f"{found['interval']:.4f}"]
+                levels.append([place, str(len(psnr)), name, *_compared(np.array(psnr))])
             keys = ("ause_rmse", "ause_mae", "ause_rmse_object", "ause_mae_object")
-            rows.append([scene, name, *covered, *(f"{found[key]:.3f}" if key in found else "-" for key in keys)])
+            rows.append([place, name, *covered, *(f"{found[key]:.3f}" if key in found else "-" for key in keys)])
         training, seconds = runs.training_seconds(workdir), laplace_seconds(workdir)
         times.append([scene, f"{training:.0f}", f"{seconds:.1f}", f"{100 * seconds / training:.0f} %"])
-    lines = [*common.provenance(), "", *common.markdown(HEADS, rows), "", *common.markdown(TIMES, times)]
-    common.publish(lines, "predicted errors")
+    tables = (common.markdown(heads, lines) for heads, lines in ((HEADS, rows), (PSNR, levels), (TIMES, times)))
+    lines = common.provenance()
+    for table in tables:
+        lines += ["", *table]
+    common.publish(lines, f"predicted errors {' '.join(scenes)}")
 
 
-def measure(workdir: pathlib.Path, members: list[str]):
-    """Yields (estimator, figures) of a run, those of the baselines last."""
+def _compared(psnr):
+    true, predicted = psnr.T
+    return [f"{true.mean():.2f}", f"{predicted.mean():.2f}", f"{np.median(np.abs(predicted - true)):.2f}"]
+
+
+def measure(workdir: pathlib.Path, members: list[str], places: dict[str, str]):
+    """Yields (place, estimator, figures, [(true, predicted PSNR) of each view]) of a run, the baselines last.
+
+    Args:
+        workdir: of the run.
+        members: see `UncertaintySource`.
+        places: by split, the name of its views.
+    """
     run = restore_run(workdir)
-    variables, experiment = run.variables(newest_step(run, workdir)), run.experiment
-    views = refined_views(run, experiment.load_split("test"), "test", variables[0])
-    predictors = {
-        "laplace": make_predictor(run, workdir, "laplace", say=logging.info),
-        "ensemble": make_predictor(run, workdir, "ensemble", members=members, say=logging.info),
-    }
+    variables = run.variables(newest_step(run, workdir))
+    predictors = {"laplace": make_predictor(run, workdir, "laplace", say=logging.info)}
+    if members:
+        predictors["ensemble"] = make_predictor(run, workdir, "ensemble", members=members, say=logging.info)
+    for split, place in places.items():
+        views = refined_views(run, run.experiment.load_split(split), split, variables[0])
+        rows, psnr = _scored(run, variables, views, predictors)
+        for name, found in rows.items():
+            yield place, name, figures(found), psnr.get(name)
+
+
+def _scored(run, variables, views, predictors):
+    """Returns the rows of each view by estimator and baseline, and the true and predicted PSNR by estimator."""
     rows = {name: [] for name in (*predictors, "1 - opacity", "constant")}
-    count = len(views.names)
+    psnr, count = {name: [] for name in predictors}, len(views.names)
     for index in np.unique(np.linspace(0, count - 1, min(_VIEWS.value, count)).astype(int)):
         height, width = (int(side) for side in views.size[index])
-        rays = experiment.view_rays(views, index, pixel_grid(height, width, offset=experiment.config.data.pixel_offset))
+        pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
+        rays = run.experiment.view_rays(views, index, pixels)
         image, truth = run.render_image(variables, rays), views.image(index)
         mask, on_object = pixel_mask(views, index), object_mask(views, index)
-        for name, predictor in predictors.items():
-            rows[name].append(predictor.scored(rays, image.rgb, truth, mask, on_object)[1])
         kept = np.ones((height, width), bool) if mask is None else np.asarray(mask, bool)
         error = pixel_error(image.rgb, truth)
+        for name, predictor in predictors.items():
+            predicted, row = predictor.scored(rays, image.rgb, truth, mask, on_object)
+            rows[name].append(row)
+            psnr[name].append([-10 * np.log10((each[kept] ** 2).mean()) for each in (error, predicted)])
         rows["1 - opacity"].append(score_order(error, 1 - image.opacity, kept, on_object))
         rows["constant"].append(score_order(error, np.zeros_like(error), kept, on_object))
-    for name, found in rows.items():
-        yield name, figures(found)
+    return rows, psnr
 
 
 def laplace_seconds(workdir: pathlib.Path) -> float:

@@ -11,7 +11,8 @@ from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.training import metric_log
 from test_scenes import synthetic_capture
 
-NUM_MEMBERS = 3  # of an ensemble
+_NUM_MEMBERS, _LESS = 3, {"room70": 2, "fern": 1, "fox": 1}  # of an ensemble; one run is none
+_HOLD_OUT = {"fern": 4, "fox": 8, "room70": 8}
 _CAPTURE = {"width": 96, "height": 72, "num_held_out": 10, "num_far": 12}  # of a capture
 _LEGO_VIEWS = (26, 86, 2, 55, 75, 93, 16, 73)  # of DietNeRF and later papers
 
@@ -20,8 +21,9 @@ def config_of(scene: str, folder: pathlib.Path, *, seed: int = 0) -> Any:
     """Returns the config of a scene.
 
     Args:
-        scene: "still", the embedded one; "lego"; "lego8" with 8 training views; "can", images of a phone; "room20" or
-            "room70", the embedded room with so many training views, whose test views are far from them.
+        scene: "still", the embedded one; "demo", the same by configs/quickstart.py; "lego"; "lego8" with 8 training
+            views; "can" and "fox", images of a phone; "fern"; "room20" or "room70", the embedded room with so many
+            views, whose test views are far from them.
         folder: of all runs, where the captures of the room are.
         seed: of the run.
     """
@@ -30,13 +32,15 @@ def config_of(scene: str, folder: pathlib.Path, *, seed: int = 0) -> Any:
     if scene == "still":
         fields = {"data.size": 100, "data.hold_out": 5, "train.max_seconds": 20.0}
         return common.configuration("quickstart", fields, seed=seed)
+    if scene == "demo":
+        return common.configuration("quickstart", seed=seed)
     if scene == "lego":
         return common.configuration("lego_fast", {**lego, "data.hold_out": 10, "train.max_seconds": 40.0}, seed=seed)
     if scene == "lego8":
         fields = {"data.view_indices": _LEGO_VIEWS, "train.max_seconds": 40.0}
         return common.configuration("lego_fast", {**lego, **fields}, seed=seed)
-    dataset = scenes / scene if scene == "can" else folder / f"{scene}_capture"
-    fields = {"data.dir": str(dataset), "train.max_seconds": 60.0}
+    dataset = folder / f"{scene}_capture" if scene.startswith("room") else scenes / scene
+    fields = {"data.dir": str(dataset), "data.hold_out": _HOLD_OUT.get(scene, 0), "train.max_seconds": 60.0}
     return common.configuration("capture", fields, seed=seed)
 
 
@@ -67,4 +71,4 @@ def training_seconds(workdir: pathlib.Path) -> float:
 
 def members_of(scene: str, folder: pathlib.Path) -> Sequence[str]:
     """Returns the workdirs of the other runs of an ensemble, trained."""
-    return [str(trained(scene, folder, seed=seed)) for seed in range(1, NUM_MEMBERS)]
+    return [str(trained(scene, folder, seed=seed)) for seed in range(1, _LESS.get(scene, _NUM_MEMBERS))]

@@ -88,7 +88,7 @@ def export_run(
     *,
     step: int | None = None,
     data_dir: str | None = None,
-    max_uncertainty: float | None = None,
+    max_uncertainty: float | str | None = None,
     settings: ExportSettings | None = None,
     name: str | None = None,
     overwrite: bool = False,
@@ -101,7 +101,7 @@ def export_run(
         kind: the name of an exporter.
         step: of the checkpoint; the newest when None.
         data_dir: see `restore_run`.
-        max_uncertainty: in place of the config's `eval.max_uncertainty`, unless it is None.
+        max_uncertainty: a number or "auto", in place of the config's `eval.max_uncertainty`, unless it is None.
         settings: its defaults when None.
         name: of the folder; KIND-STEP when None.
         overwrite: whether an existing folder of that name is replaced.

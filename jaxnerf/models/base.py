@@ -37,8 +37,11 @@ class ViewOptions(Options):
     max_uncertainty: float = option(
         1.0,
         "with a grid: cells that are more uncertain are empty, so that floaters go. The uncertainty of a cell is how "
-        "far the training images let it be displaced, over how far it could be without them; 1: off",
+        "far the training images let it be displaced, over how far it could be without them. auto: as low as training "
+        "rays allow, see docs/guides/uncertainty.md; 1: off",
         range=FRACTION,
+        auto=True,
+        late=True,
         changes=Changes.IMAGES,
     )
     max_samples: int = option(

@@ -157,6 +157,11 @@ def define_count(name: str, help: str) -> flags.FlagHolder:
     return flags.DEFINE(_Count(), name, None, help)
 
 
+def define_number(name: str, help: str) -> flags.FlagHolder:
+    """Defines a flag that is "auto" or a number; None when it is not given."""
+    return flags.DEFINE(_Number(), name, None, help)
+
+
 def use_data(config, data_dir: str | None, format: str | None = None):
     """Puts --data_dir and --format into a config and returns it.
 
@@ -215,6 +220,18 @@ class _Count(flags.ArgumentParser):
         if not str(argument).isdecimal() or int(argument) < 1:
             raise ValueError(f"expected {self.syntactic_help}")
         return int(argument)
+
+
+class _Number(flags.ArgumentParser):
+    syntactic_help = "auto, or a number"
+
+    def parse(self, argument):
+        if argument == "auto":
+            return argument
+        try:
+            return float(argument)
+        except ValueError:
+            raise ValueError(f"expected {self.syntactic_help}") from None
 
 
 def _keep_memory():

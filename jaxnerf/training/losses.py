@@ -21,8 +21,20 @@ def _weight_of_depth(facts):
     return _DEPTH_WEIGHT, line
 
 
+def _weight_of_distortion(facts):
+    bounded = not (facts.ndc or facts.contracted)
+    weight = 0.01 if bounded else 0.001
+    where = "a box bounds the scene" if bounded else "the scene is seen as far as it reaches"
+    return weight, f"distortion    weight {weight:g}, as {where}"
+
+
 MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over all renderings")
-DISTORTION = Loss(distortion_loss, help="distortion of the weights (arXiv:2111.12077, Eq. 15)")
+DISTORTION = Loss(
+    distortion_loss,
+    infer=_weight_of_distortion,
+    help="distortion of the weights (arXiv:2111.12077, Eq. 15); auto, for few views: 0.01 where a box bounds the "
+    "scene, otherwise 0.001",
+)
 DEPTH = Loss(
     depth_loss,
     needs=("depth", "depth_weight"),

@@ -28,7 +28,7 @@ def view_run(
     *,
     data_dir: str | None = None,
     step: int | None = None,
-    max_uncertainty: float | None = None,
+    max_uncertainty: float | str | None = None,
     host: str = HOST,
     port: int = PORT,
     ended: threading.Event | None = None,
@@ -39,7 +39,7 @@ def view_run(
         workdir: the folder that training wrote or writes.
         data_dir: see `restore_run`.
         step: of the only checkpoint to show; None: always the newest.
-        max_uncertainty: in place of the config's `eval.max_uncertainty`, unless it is None.
+        max_uncertainty: a number or "auto", in place of the config's `eval.max_uncertainty`, unless it is None.
         host, port: see `Viewer.listen`.
         ended: set by another thread to stop.
 

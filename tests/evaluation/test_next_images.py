@@ -103,6 +103,14 @@ def test_the_lazy_search_chooses_as_the_full_one(nothing_seen):
         rest.remove(best)
     assert [index for index, _ in lazy] == [index for index, _ in full]
     np.testing.assert_allclose([each.score for _, each in lazy], [each.score for _, each in full], rtol=1e-6)
+    coverage.clear()
+    coverage.add(views, 0)
+    scores = {index: coverage.score(views, index) for index in (1, 2, 3, 4)}
+    angle = lazy[0][1].angle
+    assert choose_views(coverage, views, scores, 3, least_angle=angle - 0.01)[0] == lazy[0]
+    assert all(
+        found.angle >= angle + 0.01 for _, found in choose_views(coverage, views, scores, 3, least_angle=angle + 0.01)
+    )
 
 
 @pytest.mark.slow
@@ -111,6 +119,16 @@ def test_lines_through_matter_are_not_free(nothing_seen):
     starts = np.float32([[4, 0, 0.2], [4, 0, 0.2], [4, 0, 0.2]])
     ends = np.float32([[-4, 0, 0.2], [4, 1, 0.2], [0.2, 0, 0.2]])
     np.testing.assert_array_equal(coverage.is_free(starts, ends), [False, True, False])
+
+
+@pytest.mark.slow
+def test_proposals_spread_where_all_is_well_seen(ball, monkeypatch):
+    monkeypatch.setattr(candidate_poses, "_DIRECTIONS", 40)
+    monkeypatch.setattr(propose, "_THIN", 180.0)
+    report = propose_images(ball, 3)
+    poses = np.asarray(report.views.cameras.to_world)
+    expected = candidate_poses.farthest_poses(poses, report.candidates.poses, 3)
+    np.testing.assert_allclose(report.path.poses, report.candidates.poses[expected])
 
 
 @pytest.mark.slow

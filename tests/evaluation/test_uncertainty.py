@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from jaxnerf.core.occupancy.grid import create_grid, is_occupied
-from jaxnerf.core.types import Rays
+from jaxnerf.core.types import Batch, Rays
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
 from jaxnerf.evaluation.restore import TrainedRun, restore_run
-from jaxnerf.evaluation.uncertainty import calibration, laplace, predict
+from jaxnerf.evaluation.uncertainty import calibration, cleaning, laplace, predict
 from jaxnerf.evaluation.uncertainty.base import Estimate
 from jaxnerf.evaluation.uncertainty.cleaning import cell_centers, cleaned
 from jaxnerf.evaluation.uncertainty.laplace import deform, interpolate
@@ -147,9 +147,11 @@ def test_the_uncertainty_at_a_position_is_the_standard_deviation_there():
 
 def stub_run(grid, limit, hold_out=0):
     """Returns a TrainedRun that has nothing but a checkpoint of step 5, with a grid."""
-    config = SimpleNamespace(data=SimpleNamespace(hold_out=hold_out), eval=SimpleNamespace(max_uncertainty=limit))
+    data = SimpleNamespace(hold_out=hold_out, pixel_offset=0.5, ndc=False)
+    config = SimpleNamespace(data=data, eval=SimpleNamespace(max_uncertainty=limit))
     views = Views(**dict.fromkeys(field.name for field in dataclasses.fields(Views)))
-    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split: views)
+    model = SimpleNamespace(needs=())
+    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split: views, model=model)
     fields = dict.fromkeys(TrainedRun._fields) | {"experiment": experiment, "identity": "fixed"}
     return TrainedRun(**fields | {"steps": lambda: [5], "variables": lambda step: (np.ones(3), grid)})
 
@@ -170,6 +172,24 @@ def test_cells_that_are_more_uncertain_than_the_limit_are_empty(tmp_path, monkey
     ends = jnp.zeros(len(centers))
     ray = Rays(origins=centers, directions=jnp.ones_like(centers), viewdirs=centers, near=ends, far=ends)
     np.testing.assert_array_equal(is_occupied(found, ray, jnp.zeros((128, 1)))[:, 0], found.occupied.reshape(-1))
+
+
+def test_auto_removes_as_many_cells_as_training_rays_allow(tmp_path, monkeypatch, capsys):
+    """The error of all rays grows by a tenth with the fraction of cells below x = 2 that are gone."""
+    grid = create_grid([-1.0] * 3, [3.0] * 3, np.ones((8, 4, 4), bool), initial_density=1.0)
+    estimate = Estimate(None, "fixed", lambda x: jnp.where(x[..., 0] > 2, 0.96, jnp.where(x[..., 0] > 1, 0.72, 0.3)))
+    monkeypatch.setitem(ESTIMATORS._parts, "laplace", lambda source: estimate)
+    batch = Batch(rays=None, rgb=jnp.full((4, 3), 0.5))
+    monkeypatch.setattr(cleaning, "draw_batch", lambda *_, **__: (None, batch))
+
+    def render_image(variables, rays):
+        missing = 1 - np.asarray(variables[1].occupied)[:6].mean()
+        return SimpleNamespace(rgb=batch.rgb + 0.1 * (1 + 0.1 * missing))
+
+    run = stub_run(grid, "auto")._replace(render_image=render_image)
+    _, found = cleaned(run, tmp_path).variables(5)
+    assert np.asarray(found.occupied).all(axis=(1, 2)).tolist() == [True] * 6 + [False] * 2
+    assert "25.0 % of the occupied cells are more uncertain than 0.75" in capsys.readouterr().err
 
 
 def test_cleaning_is_off_by_default_and_needs_a_grid(tmp_path):

@@ -44,9 +44,10 @@ from jaxnerf.registry import FIELDS
 from jaxnerf.runtime import cli
 
 COUNT = cli.define_count("count", "The number of things.")
+LIMIT = cli.define_number("limit", "The most of a thing.")
 
 def main(argv):
-    print(COUNT.value, *FIELDS.names())
+    print(COUNT.value, *FIELDS.names(), *[LIMIT.value] * (LIMIT.value is not None))
 
 cli.run(main)
 '''
@@ -154,10 +155,18 @@ def test_a_cache_that_cannot_be_used_is_reported(tmp_path, monkeypatch):
     assert code == 0 and "jaxnerf can be written by other users" in err
 
 
-def test_a_wrong_count_is_reported_in_one_line(tmp_path):
-    code, out, err = call(tmp_path, "--count=0")
+@pytest.mark.parametrize(
+    "flag, expected", [("--count=0", "auto, or an integer of at least 1"), ("--limit=half", "auto, or a number")]
+)
+def test_a_wrong_number_is_reported_in_one_line(tmp_path, flag, expected):
+    code, out, err = call(tmp_path, flag)
     assert code == 2 and not out
-    assert "count" in err and "expected auto, or an integer of at least 1" in err and err.count("\n") == 1
+    assert flag[2:7] in err and f"expected {expected}" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("value, printed", [("auto", "auto"), ("0.5", "0.5"), ("1", "1.0")])
+def test_a_limit_is_a_number_or_auto(tmp_path, value, printed):
+    assert call(tmp_path, f"--limit={value}")[1].split()[-1] == printed
 
 
 @pytest.mark.parametrize(

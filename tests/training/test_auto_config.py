@@ -59,6 +59,7 @@ AUTO_FIELDS = {
     "train.lr_steps": 300,
     "eval.sample_multiplier": 3,
     "eval.chunk": 512,
+    "eval.max_uncertainty": 0.75,
     "eval.max_samples": 2048,
 }
 
@@ -160,6 +161,18 @@ def test_every_auto_field_is_inferred_and_logged(resolved):
     for word in ("contraction", "box", "step size", "grid", "hash grid"):
         assert any(line.startswith(f"{word} ") for line in lines), word
     assert f"a pixel covers {PIXEL:.4g}" in "".join(lines)
+
+
+def test_a_value_that_each_checkpoint_has_stays_auto(views):
+    config = changed(read_config(auto_config()), {"eval.max_uncertainty": AUTO})
+    config = resolve_for_device(resolve(config, views).config)[0]
+    assert config.eval.max_uncertainty == AUTO and not auto_fields(config)
+
+
+@pytest.mark.parametrize("contracted, weight", [(False, 0.01), (True, 0.001)])
+def test_distortion_weighs_less_where_nothing_bounds_the_scene(views, contracted, weight):
+    config = changed(read_config(auto_config(contracted=contracted)), {"losses.distortion": AUTO})
+    assert resolve(config, views).config.losses["distortion"] == weight
 
 
 def test_config_of_the_paper_is_resolved_and_logs_nothing_about_a_box(views):

@@ -68,6 +68,40 @@ def candidate_poses(poses: Float[Array | np.ndarray, "V 3 4"], up: Float[np.ndar
     return {"beside": _beside, "around": _around, "turned": _turned}[kind](poses, up, reason)
 
 
+def farthest_poses(
+    poses: Float[Array | np.ndarray, "V 3 4"], candidates: Float[np.ndarray, "N 3 4"], count: int
+) -> list[int]:
+    """Chooses candidates one after another, each the farthest from the nearest of the cameras and of those before it.
+
+    The distance of two poses is that of their positions, over the cameras' mean distance from their mean, plus that of
+    their viewing directions, which are unit vectors.
+
+    Args:
+        poses: of the cameras, which differ in position or direction.
+        candidates: world units.
+        count: of them to choose.
+
+    Returns:
+        Their indices in the order of choice; fewer than count where there are fewer.
+    """
+    poses, candidates = np.asarray(poses, np.float64), np.asarray(candidates, np.float64)
+    spread = np.linalg.norm(poses[:, :, 3] - poses[:, :, 3].mean(axis=0), axis=1).mean() or 1.0
+
+    def distance(others):
+        return sum(
+            np.linalg.norm(candidates[:, None, :, axis] - others[None, :, :, axis], axis=-1) / unit
+            for axis, unit in ((3, spread), (2, 1.0))
+        ).min(axis=1)
+
+    chosen: list[int] = []
+    nearest = distance(poses)
+    for _ in range(min(count, len(candidates))):
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, distance(candidates[chosen[-1:]]))
+        nearest[chosen] = -1
+    return chosen
+
+
 def azimuth_to_right(
     offsets: Float[np.ndarray, "N 3"], first: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, " N"]:

@@ -149,7 +149,7 @@ class ViewCoverage:
 
 
 def choose_views(
-    coverage: ViewCoverage, views: Views, scores: Mapping[int, ViewScore], count: int
+    coverage: ViewCoverage, views: Views, scores: Mapping[int, ViewScore], count: int, *, least_angle: float = 0.0
 ) -> list[tuple[int, ViewScore]]:
     """Chooses the least familiar views one after another; each is added to the coverage before the next is chosen.
 
@@ -161,6 +161,7 @@ def choose_views(
         views: whose cameras are candidates.
         scores: by index of the views that are candidates, their present ones.
         count: number of views to choose.
+        least_angle: degrees; a view that has been seen from less far aside is not chosen.
 
     Returns:
         (index, ViewScore at the time of the choice) of each, in the order of choice.
@@ -170,6 +171,8 @@ def choose_views(
     chosen = []
     while queue and len(chosen) < count:
         found, index, known = heapq.heappop(queue)
+        if found.angle < least_angle:
+            continue
         if known == len(chosen):
             coverage.add(views, index)
             chosen.append((index, found))

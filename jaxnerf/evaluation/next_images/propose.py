@@ -11,7 +11,7 @@ from jaxnerf.core import contraction
 from jaxnerf.core.occupancy.grid import OccupancyGrid
 from jaxnerf.core.types import Camera
 from jaxnerf.core.views import Views
-from jaxnerf.data.geometry.candidate_poses import Candidates, azimuth_to_right, candidate_poses
+from jaxnerf.data.geometry.candidate_poses import Candidates, azimuth_to_right, candidate_poses, farthest_poses
 from jaxnerf.data.geometry.poses import gaze_center, up_of
 from jaxnerf.data.geometry.world import unit_of
 from jaxnerf.evaluation.next_images.coverage import ViewCoverage, choose_views
@@ -171,7 +171,14 @@ def propose_images(
         scores = {index: coverage.score(posed, index) for index in range(len(found.poses))}
         positions, directions = _shown_cells(variables[1], coverage, views, run.experiment.config.data.ndc)
         counts = np.bincount(coverage.num_directions().ravel() + 1, minlength=66)[1:]
-        chosen = choose_views(coverage, posed, scores, count)
+        chosen = choose_views(coverage, posed, scores, count, least_angle=own_angle + _THIN)
+        # Where all is well seen, the least familiar views are those that show most fog, which are neighbours.
+        taken = [index for index, _ in chosen]
+        rest = np.setdiff1d(np.arange(len(found.poses)), taken)
+        seen_from = np.concatenate([poses, found.poses[taken]])
+        for index in map(int, rest[farthest_poses(seen_from, found.poses[rest], count - len(chosen))]):
+            chosen.append((index, coverage.score(posed, index)))
+            coverage.add(posed, index)
     proposals = [
         Proposal(found.poses[index], _words(found, index, views, direction), score.angle) for index, score in chosen
     ]

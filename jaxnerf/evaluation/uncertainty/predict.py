@@ -16,6 +16,7 @@ from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views
 from jaxnerf.evaluation.uncertainty import calibration as calibrations
 from jaxnerf.evaluation.uncertainty.base import Score, UncertaintySource
 from jaxnerf.evaluation.uncertainty.calibration import Calibration, pixel_error, score_order
+from jaxnerf.options import is_auto
 from jaxnerf.registry import ESTIMATORS
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
@@ -139,8 +140,8 @@ def make_predictor(
     source = UncertaintySource.of(run, workdir, step, variables, members=members, say=say)
     key = fingerprint(run.identity, variables[0], *([] if variables[1] is None else [variables[1]]))
     path, limit = source.folder / f"{name}.json", run.experiment.config.eval.max_uncertainty
-    if limit < 1:
-        path = path.with_stem(f"{name}-max_uncertainty-{limit:g}")
+    if limit != 1:
+        path = path.with_stem(f"{name}-max_uncertainty-{limit if is_auto(limit) else f'{limit:g}'}")
     with atomic_files.one_at_a_time(path.with_suffix(".lock"), lambda: say(f"{path}: waits for another process")):
         found = estimate(source)
         key = fingerprint(key, found.identity)

@@ -5,7 +5,7 @@ import pytest
 
 import captures
 from jaxnerf.core.poses import look_at
-from jaxnerf.data.geometry.candidate_poses import azimuth_to_right, candidate_poses
+from jaxnerf.data.geometry.candidate_poses import azimuth_to_right, candidate_poses, farthest_poses
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -35,6 +35,17 @@ def test_no_candidate_is_below_what_an_object_stands_on_unless_a_camera_is():
     assert candidate_poses(ring(height=10.0), UP).poses[:, 2, 3].min() >= 4 * np.sin(np.radians(5)) - 1e-4
     low = candidate_poses(np.concatenate([ring(height=30.0), ring(height=-20.0)]), UP).poses[:, 2, 3]
     assert -4 * np.sin(np.radians(20)) - 1e-4 <= low.min() < -1
+
+
+def test_farthest_poses_spread():
+    """Of candidates on a ring those opposite of the cameras come first, and then what is between."""
+    candidates = ring(12)
+    assert farthest_poses(candidates[:1], candidates, 2) == [6, 3]
+    assert farthest_poses(candidates[[0, 6]], candidates, 4)[:2] == [3, 9]
+    assert sorted(farthest_poses(candidates[:2], candidates[:3], 9)) == [0, 1, 2]
+    turned = candidates.copy()
+    turned[:, :, 3] = 0  # at one place only directions differ
+    assert farthest_poses(turned[:1], turned, 1) == [6]
 
 
 def test_azimuth_grows_to_the_right_of_who_looks_at_the_middle():
