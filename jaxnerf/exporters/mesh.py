@@ -249,8 +249,11 @@ def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray,
     coarse = tuple(size // 2 + 1 for size in fused.shape)
     x = np.float32(fused.lower + 2 * fused.voxel * np.stack(np.indices(coarse), axis=-1))
     free = jnp.zeros(coarse, bool)
-    for image in images:
-        free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
+    with stages.stage("finding free space") as stage:
+        for done, image in enumerate(images):
+            free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
+            jax.block_until_ready(free)
+            stage.update(done + 1, len(images))
     field = 2 * np.asarray(free, np.float32) - 1.01  # nowhere 0 below, which would make degenerate triangles
     for axis, size in enumerate(fused.shape):
         place = np.arange(size)

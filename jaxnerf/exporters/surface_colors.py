@@ -21,6 +21,7 @@ _NUM_VIEWS = 4  # that see a point best; the field is evaluated for each
 _NUM_SAMPLES = 4  # of the field along the ray of each view
 _MIN_COSINE = 0.15  # between ray and normal; a view at a steeper angle does not count
 _OTHER_POSES = 1e-3  # weight of a pose that is not of a training view: the field was not trained for it
+_MIN_OPACITY = 1e-3  # of what a view sees; less has no colour
 _CHUNK = 2**13  # points whose views are selected at once
 _BATCH = 2**7  # of these, points at which the field is evaluated at once: activations stay in the cache of a CPU
 
@@ -35,8 +36,8 @@ def surface_colors(
     """Computes the mean colour of points on surfaces, over the views that see them at the steepest angles.
 
     The colour that a view sees is that of the field along the view's ray, from `reach` in front of the point to as far
-    behind it, composited as in an image (Eq. 3 of arXiv:2003.08934) and divided by its opacity. Views count by the
-    cosine between ray and normal. What the field looks like in detail does not depend on the size of the images.
+    behind it, composited as in an image (Eq. 3 of arXiv:2003.08934). Views count by the cosine between ray and normal
+    and by the opacity there. What the field looks like in detail does not depend on the size of the images.
 
     Args:
         source: the run.
@@ -58,10 +59,11 @@ def surface_colors(
         weights = _weights(cameras, surfaces, trained, points, normals, reach)
         weight, view = jax.lax.top_k(weights.T, min(_NUM_VIEWS, len(images)))
         offset = points[:, None] - cameras.to_world[view, :, 3]
-        rgb = evaluate(params, grid, points, offset / norm(offset)[..., None])
-        total = weight.sum(axis=1)
-        rgb = (weight[..., None] * rgb).sum(axis=1) / jnp.where(total > 0, total, 1)[:, None]
-        return jnp.rint(255 * jnp.clip(rgb, 0, 1)).astype(jnp.uint8), total > 0
+        rgba = evaluate(params, grid, points, offset / norm(offset)[..., None])
+        total = (weight[..., None] * rgba).sum(axis=1)
+        seen = total[:, 3:] > _OTHER_POSES * _MIN_OPACITY
+        rgb = total[:, :3] / jnp.where(seen, total[:, 3:], 1)
+        return jnp.rint(255 * jnp.clip(jnp.where(seen, rgb, 0), 0, 1)).astype(jnp.uint8), seen[:, 0]
 
     count, parts = len(points), [(np.zeros((0, 3), np.uint8), np.zeros(0, bool))]
     with stages.stage("evaluating colours") as stage:
@@ -93,7 +95,7 @@ def _weights(cameras, surfaces, trained, points, normals, reach):
 
 
 def _color_function(source, reach):
-    """Returns the function (params, grid, points [N, 3], directions [N, K, 3]) -> rgb [N, K, 3]."""
+    """Returns the function (params, grid, points [N, 3], directions [N, K, 3]) -> rgb and opacity [N, K, 4]."""
     rotation = np.float32(poses_in_file(np.eye(3, 4)[None], source.views.to_file)[0, :, :3])
     to_field = field_position(source)
     edges = np.linspace(-reach, reach, _NUM_SAMPLES + 1, dtype=np.float32)
@@ -111,11 +113,11 @@ def _color_function(source, reach):
             x, viewdirs = x[:, len(edges) :], jnp.matmul(directions, rotation, precision="highest").reshape(-1, 1, 3)
             density, rgb = scene(x, viewdirs, **cell_inputs("export", scene, grid, x))
             weights = weights_from_density(density, length)
-            rgb = (weights[..., None] * rgb).sum(axis=1) / (weights.sum(axis=1, keepdims=True) + 1e-6)
-            return rgb.reshape(directions.shape)
+            rgba = jnp.concatenate([rgb, jnp.ones_like(rgb[..., :1])], axis=-1)
+            return (weights[..., None] * rgba).sum(axis=1).reshape(*directions.shape[:-1], 4)
 
         parts = tuple(leaf.reshape(-1, _BATCH, *leaf.shape[1:]) for leaf in (points, directions))
-        return jax.lax.map(some, parts).reshape(directions.shape)
+        return jax.lax.map(some, parts).reshape(*directions.shape[:-1], 4)
 
     return evaluate
 
