@@ -1,8 +1,8 @@
 """Exports a trained run for other programs: jaxnerf-export --workdir=DIR --kind=mesh.
 
 `python -m jaxnerf.export` is the same program. It writes DIR/exports/KIND-STEP/, in the units and axes of the dataset's
-files: a mesh with vertex colours, points with normals, depth images with cameras, Gaussian splats, or a web page. All
-but the page need scikit-image, scipy and trimesh: pip install 'jaxnerf[export]'.
+files: a mesh with colours or a texture, points with normals, depth images with cameras, Gaussian splats, or a web page.
+All but the page need scikit-image, scipy and trimesh: pip install 'jaxnerf[export]'.
 """
 
 import sys
@@ -33,8 +33,8 @@ _BOX = flags.DEFINE_list(
 _SIZE = flags.DEFINE_integer(
     "size",
     None,
-    "The longer side in px of the depth images from which everything is made. When it is not given, it is 1.25 times "
-    "the resolution, and for depth that of the dataset's images.",
+    "The longer side in px of the depth images from which everything is made. When it is not given, it is the "
+    "resolution for a mesh, 1.25 times the resolution for points, and for depth that of the dataset's images.",
 )
 _NUM_VIEWS = flags.DEFINE_integer(
     "num_views",
@@ -59,7 +59,14 @@ _UP = flags.DEFINE_enum(
     "are held.",
 )
 _MAX_FACES = flags.DEFINE_integer(
-    "max_faces", 0, "mesh: the number of triangles to which it is decimated; 0: it is not."
+    "max_faces",
+    0,
+    "mesh: the number of triangles to which it is decimated; 0: it is not, or with --texture to 30,000.",
+)
+_TEXTURE = flags.DEFINE_integer(
+    "texture",
+    0,
+    "mesh, as glb or obj: the side of a texture in px, which replaces the colours of vertices; 0: off.",
 )
 _CLOSED = flags.DEFINE_bool(
     "closed",
@@ -72,7 +79,7 @@ _MIN_PIECE = flags.DEFINE_float(
 )
 _SPLIT = flags.DEFINE_bool("split", False, "web: whether the scene's data is in a file beside the page, for hosting.")
 _CONCERN = {  # the flags that only some kinds read
-    ("mesh",): (_FORMAT, _UP, _MAX_FACES, _CLOSED, _MIN_PIECE),
+    ("mesh",): (_FORMAT, _UP, _MAX_FACES, _TEXTURE, _CLOSED, _MIN_PIECE),
     ("points", "splats"): (_NUM_POINTS,),
     ("splats",): (_FIT_STEPS,),
     ("web",): (_SPLIT,),
@@ -94,7 +101,7 @@ def main(argv):
             )
     names = {"size": _SIZE, "num_views": _NUM_VIEWS, "num_points": _NUM_POINTS, "format": _FORMAT}
     names |= {"resolution": _RESOLUTION, "max_faces": _MAX_FACES, "min_piece": _MIN_PIECE, "closed": _CLOSED, "up": _UP}
-    names |= {"split": _SPLIT, "fit_steps": _FIT_STEPS}
+    names |= {"split": _SPLIT, "fit_steps": _FIT_STEPS, "texture": _TEXTURE}
     try:
         box = None if _BOX.value is None else tuple(map(float, _BOX.value))
     except ValueError:

@@ -11,7 +11,8 @@ from jaxnerf import Camera, Views, create_grid, look_at, mask_scene, render_rays
 from jaxnerf.data import ray_batches
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.exporters.base import ExportSettings, ExportSource
-from jaxnerf.training.config import RunConfig
+from jaxnerf.fields.base import Field
+from jaxnerf.training.config import RunConfig, changed
 
 RADIUS, SIZE = 0.5, 48
 # A rotation by 90 degrees about z, twice the size, moved: the world of the dataset's files.
@@ -56,10 +57,16 @@ def source_of(scene=ball, *, say=lambda line: None, background=None, count=14, n
     views = orbit(count)
     render = functools.partial(render_rays, None, num_samples=num_samples, median_depth=True)
     compiled = jax.jit(lambda rays: render(scene, rays))
+
+    def model_with(settings, wrap):
+        field = wrap(Field(init=lambda key: {}, apply=lambda params, x, viewdirs: scene(x, viewdirs)))
+        density = functools.partial(field.apply, None)
+        return SimpleNamespace(view=lambda params, grid, rays, median_depth: render(density, rays), cull=None)
+
     experiment = SimpleNamespace(
         view_rays=functools.partial(ray_batches.view_rays, ndc=False),
         world_depth=ray_batches.world_depth,
-        config=RunConfig(),
+        config=changed(RunConfig(), {"eval.chunk": SIZE**2, "eval.sample_multiplier": 1.0}),
         background=background,
         model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid)),
         load_split=lambda split: views,
@@ -74,7 +81,7 @@ def source_of(scene=ball, *, say=lambda line: None, background=None, count=14, n
         identity="",
         render_image=lambda variables, rays, median_depth=False: compiled(rays),
         variables_of=None,
-        model_with=None,
+        model_with=model_with,
     )
     settings = {"resolution": 32, "size": SIZE, **settings}
     return ExportSource(run, 7, (None, grid), views, ExportSettings(**settings), say)

@@ -7,7 +7,8 @@ sum of two means in world units: from points of the mesh to the bodies, in close
 to the mesh. Points of the mesh that are nearer to the glass (the brick, and that of the lamp) than to an opaque body
 have no counterpart among these and are excluded; "with glass" includes them. All of the bodies' surfaces count, also
 the underside of the plinth, a fifth of their area, which no training view sees: only the closed mesh has a surface
-there. Seconds include compilation. The PSNR of splats is that of the test views.
+there. Seconds include compilation. The CPU seconds of a mesh are those of the functions of the exporter. The PSNR of
+splats is that of the test views.
 """
 
 import functools
@@ -25,6 +26,7 @@ from scipy.spatial import cKDTree
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
+from jaxnerf.exporters import mesh as mesh_exporter
 from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.fields.still_life import BODIES
 from jaxnerf.runtime import cli
@@ -40,6 +42,13 @@ _KINDS = {
     "closed": ("mesh", {"closed": True}),
     "points": ("points", {}),
     "splats": ("splats", {}),
+}
+_STAGES = {  # functions of the exporter of meshes
+    "depth images": "render_depth_images",
+    "fusion": "fuse",
+    "free space": "solid_field",
+    "level set": "level_set",
+    "colours": "surface_colors",
 }
 _SAMPLES = 150_000  # points on each surface
 _EXTENT = 1.2  # half the side of the box that holds the scene
@@ -64,7 +73,7 @@ def main(argv: list[str]) -> None:
     """Exports and measures."""
     del argv
     settings = ExportSettings(resolution=_RESOLUTION.value, num_points=_NUM_POINTS.value)
-    rows, measured = [], []
+    rows, measured, profiles, spent = [], [], [], timed_stages()
     for name in common.chosen("--exports", _EXPORTS.value, _KINDS):
         kind, options = _KINDS[name]
         said, started, cpu = [], time.perf_counter(), time.process_time()
@@ -84,13 +93,34 @@ def main(argv: list[str]) -> None:
             both = found["accuracy"] + found["completeness"]
             numbers = (found["accuracy"], found["completeness"], both, both + found["glass"])
             measured.append([name, *(f"{number:.4f}" for number in numbers), f"{found['within']:.0%}"])
+            profiles.append([name, *(f"{spent.pop(stage, 0):.1f}" for stage in _STAGES), f"{seconds[1]:.1f}"])
     heads = ("mesh to bodies", "bodies to mesh", "chamfer distance", "with glass", "of the bodies within 0.02")
     lines = [*common.markdown(("mesh", *heads), measured), ""] if measured else []
+    lines += [*common.markdown(("CPU seconds", *_STAGES, "all"), profiles), ""] if profiles else []
     lines += common.markdown(("export", "seconds", "CPU seconds", "MB", "what the program says"), rows)
     print("\n".join(lines))
     if _OUT.value:
         head = ["# Exports", "", *common.provenance(), "", *__doc__.strip().split("\n\n", 2)[2].splitlines(), ""]
         write_text(_OUT.value, "\n".join([*head, *lines, ""]))
+
+
+def timed_stages() -> dict[str, float]:
+    """Returns CPU seconds by stage, to which each call of the exporter's functions adds its own."""
+    spent: dict[str, float] = {}
+
+    def timed(stage, function):
+        def call(*args, **options):
+            started = time.process_time()
+            result = function(*args, **options)
+            spent[stage] = spent.get(stage, 0) + time.process_time() - started
+            return result
+
+        return call
+
+    for stage, name in _STAGES.items():
+        if hasattr(mesh_exporter, name):
+            setattr(mesh_exporter, name, timed(stage, getattr(mesh_exporter, name)))
+    return spent
 
 
 def chamfer(mesh: trimesh.Trimesh) -> dict[str, float]:

@@ -15,6 +15,8 @@ from jaxnerf.registry import EXPORTERS
 from jaxnerf.runtime import atomic_files
 
 MAX_RESOLUTION, MAX_SIZE, MAX_POINTS = 1024, 4096, 10_000_000
+TEXTURE_SIZES = (64, 8192)
+TEXTURED_FACES = 30_000  # the detail is in the texture
 FORMATS = ("ply", "glb", "obj")
 
 
@@ -29,7 +31,8 @@ class ExportSettings(NamedTuple):
         box: [6] the lower and the upper corner of what is exported, in units of the dataset's files; None: all of a
             bounded scene, and of an unbounded one what is between the cameras. An exporter receives it relative to
             `Views.file_origin`.
-        size: px, the longer side of the depth images that are rendered; None: it follows the resolution.
+        size: px, the longer side of the depth images that are rendered; None: it follows the resolution, see the
+            exporters.
         num_views: the largest number of training views whose poses are rendered, spread evenly over all.
         num_points: the largest number of points or Gaussians; None: as many as the exporter selects.
         fit_steps: of fitting Gaussians; 0: they stay as they are placed.
@@ -38,7 +41,9 @@ class ExportSettings(NamedTuple):
             option `data.up`, or as the cameras are held.
         closed: whether a mesh has no holes: where no training view looks, it has the surfaces of the field, which was
             not trained there, and what nothing shows to be free is solid.
-        max_faces: the number of triangles to which a mesh is decimated; 0: it is not.
+        max_faces: the number of triangles to which a mesh is decimated; 0: it is not, or with a texture to
+            `TEXTURED_FACES`.
+        texture: texels along a side of a mesh's texture; 0: its vertices have colours.
         min_piece: connected pieces of a mesh with fewer triangles than this fraction of all are dropped.
         split: whether the data of a web page is in a file beside it.
     """
@@ -53,12 +58,13 @@ class ExportSettings(NamedTuple):
     up: str | None = None
     closed: bool = False
     max_faces: int = 0
+    texture: int = 0
     min_piece: float = 0.005
     split: bool = False
 
     @property
     def image_size(self) -> int:
-        """The longer side of the depth images, px."""
+        """The longer side of the depth images of points and splats, px."""
         return self.size or round(_PIXELS_PER_VOXEL * self.resolution)
 
 
@@ -164,6 +170,13 @@ def _check_settings(settings):
         value = getattr(settings, field)
         if value is not None and not least <= value <= most:
             raise ValueError(f"{field} is {value}, expected {least} to {most:,}; correct --{field}")
+    if settings.texture and not TEXTURE_SIZES[0] <= settings.texture <= TEXTURE_SIZES[1]:
+        least, most = TEXTURE_SIZES
+        raise ValueError(f"texture is {settings.texture}, expected {least} to {most:,}, or 0; correct --texture")
+    if settings.texture and settings.format == "ply":
+        raise ValueError(
+            f"texture is {settings.texture} and format is 'ply', expected 'glb' or 'obj'; give --format=glb or drop it"
+        )
     if settings.format not in FORMATS:
         raise ValueError(f"format is {settings.format!r}, expected one of {', '.join(FORMATS)}; correct --format")
     if settings.up is not None:

@@ -4,6 +4,7 @@ Depth images are fused into a truncated signed distance field, whose zero level 
 1996). Only voxels near a surface of some depth image are stored and updated, a few per cent of the box.
 """
 
+import functools
 import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -23,16 +24,18 @@ from skimage import measure
 from jaxnerf.core.cameras import project
 from jaxnerf.data.geometry.poses import AXES, axis_of, up_of
 from jaxnerf.data.geometry.world import poses_in_file
-from jaxnerf.exporters.base import ExportSource, check_memory
+from jaxnerf.exporters.base import TEXTURED_FACES, ExportSource, check_memory
+from jaxnerf.exporters.surface_colors import surface_colors
 from jaxnerf.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
+from jaxnerf.exporters.texture import textured
 from jaxnerf.registry import Exporter
-from jaxnerf.runtime import atomic_files, memory
+from jaxnerf.runtime import atomic_files, memory, stages
 
 _BYTES_PER_VOXEL = 16  # of the dense field, its index and what marching cubes keeps
 _TRUNCATION = 2.5  # voxels
 _FREE = 3.0  # truncations in front of a surface, from which on space counts as free whatever the surface's normal
 _MIN_WEIGHT = 0.05  # of all views of a vertex; one that sees an opaque surface at 45 degrees has 0.7
-_CHUNK = 2**18  # vertices updated at once
+_CHUNK = 2**15  # vertices updated at once
 _NEARLY_AXIS = 15.0  # degrees from an axis of the files, within which up may be meant to be that axis
 _EMPTY_WEIGHT = 0.3  # of a pixel that shows empty space
 
@@ -40,21 +43,32 @@ _EMPTY_WEIGHT = 0.3  # of a pixel that shows empty space
 def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     """Writes mesh.ply, mesh.glb or mesh.obj: median depths, fused into a signed distance field.
 
+    A texture is in the .glb, or in mesh.png beside the .obj and its mesh.mtl.
+
     Raises:
         ValueError: if no surface is in the box, or the field does not fit into memory.
     """
     settings = source.settings
-    images = render_depth_images(source, settings.image_size, all_around=True)
+    images = render_depth_images(source, settings.size or settings.resolution, all_around=True, colors=False)
     box = export_box(source, images)
-    _, shape = grid_shape(box, settings.resolution)
+    voxel, shape = grid_shape(box, settings.resolution)
     check_memory(_BYTES_PER_VOXEL * float(np.prod(shape)), memory.available(), "give a smaller --resolution or --box")
     fused = fuse(images, box, settings.resolution, closed=settings.closed)
-    vertices, faces, rgb = level_set(fused, solid_field(images, fused) if settings.closed else None)
-    if not len(faces):
-        raise ValueError(f"no surface is in the box {np.round(box, 4).tolist()}; give another --box")
-    kept = keep_large_pieces(faces, settings.min_piece)
-    mesh = decimated(trimesh.Trimesh(vertices, faces[kept], vertex_colors=rgb, process=False), settings.max_faces)
-    mesh.remove_unreferenced_vertices()
+    with stages.stage("extracting the surface"):
+        vertices, faces = level_set(fused, solid_field(images, fused) if settings.closed else None)
+        if not len(faces):
+            raise ValueError(f"no surface is in the box {np.round(box, 4).tolist()}; give another --box")
+        surface = trimesh.Trimesh(vertices, faces[keep_large_pieces(faces, settings.min_piece)], process=False)
+        surface.remove_unreferenced_vertices()
+        mesh = decimated(surface, settings.max_faces or (TEXTURED_FACES if settings.texture else 0))
+
+    def colors(points):
+        return surface_colors(source, images, *on_surface(surface, points), reach=_TRUNCATION * voxel)
+
+    if settings.texture:
+        mesh = textured(mesh, settings.texture, colors)
+    else:
+        mesh.visual.vertex_colors = colors(mesh.vertices)
     path = folder / f"mesh.{settings.format}"
     with atomic_files.naming(path):
         if settings.format == "glb":
@@ -68,45 +82,56 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
                 source.say(f"up is {where}, by how the cameras are held; --up={nearest} sets it")
             write_glb(mesh, path, up=up)
         else:
-            mesh.export(path)
+            mesh.export(path, **{"mtl_name": "mesh.mtl"} if settings.texture else {})
     sides = " x ".join(f"{side:.4g}" for side in mesh.extents)
-    source.say(f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {sides} in the dataset's units")
+    texture = f"a texture of {settings.texture} x {settings.texture}, " if settings.texture else ""
+    count = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
+    source.say(f"{count}, {texture}{sides} in the dataset's units")
 
 
 EXPORTER = Exporter(export_mesh)
 
 
 def write_glb(mesh: trimesh.Trimesh, path: pathlib.Path, *, up: Float[np.ndarray, "3"]) -> None:
-    """Writes a mesh with vertex colours as glTF 2.0 defines it.
+    """Writes a mesh with vertex colours or a texture as glTF 2.0 defines it.
 
-    Colours become linear, in float32, as 8 bits of linear light would show bands in dark places. The material is not
-    lit, since the colours hold the light of the scene. A node turns the mesh, whose vertices stay in the units and axes
-    of the dataset's files, so that up is y.
+    Colours of vertices become linear, in float32, as 8 bits of linear light would show bands in dark places; a texture
+    is in sRGB. The material is not lit, since the colours hold the light of the scene. A node turns the mesh, whose
+    vertices stay in the units and axes of the dataset's files, so that up is y.
 
     Args:
         mesh: with sRGB colours of 8 bits.
         path: of the file.
         up: unit vector in the axes of the mesh.
     """
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0].as_matrix()
+    has_texture = mesh.visual.kind == "texture"
+
+    def complete(tree):
+        # trimesh writes colours in 8 bits only, and other attributes under names that begin with _.
+        if not has_texture:
+            rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # for programs without the extension
+            tree["materials"] = [{"pbrMetallicRoughness": rough}]
+            for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
+                primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
+                primitive["material"] = 0
+        for material in tree["materials"]:
+            material["extensions"] = {"KHR_materials_unlit": {}}
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh if has_texture else _with_linear_colors(mesh), transform=turn)
+    scene.export(path, file_type="glb", include_normals=True, tree_postprocessor=complete)
+
+
+def _with_linear_colors(mesh):
+    """Returns a mesh with linear colours of vertices as the attribute _COLOR_0."""
     colors = np.asarray(mesh.visual.vertex_colors) / 255
     rgb = np.where(colors[:, :3] <= 0.04045, colors[:, :3] / 12.92, ((colors[:, :3] + 0.055) / 1.055) ** 2.4)
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     bare.vertex_attributes["_COLOR_0"] = np.float32(np.concatenate([rgb, colors[:, 3:]], axis=1))
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0].as_matrix()
-
-    def complete(tree):
-        # trimesh writes colours in 8 bits only, and other attributes under names that begin with _.
-        for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
-            primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
-            primitive["material"] = 0
-        rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # for programs without the extension
-        tree["materials"] = [{"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}]
-        tree["extensionsUsed"] = ["KHR_materials_unlit"]
-
-    scene = trimesh.Scene()
-    scene.add_geometry(bare, transform=turn)
-    scene.export(path, file_type="glb", include_normals=True, tree_postprocessor=complete)
+    return bare
 
 
 def keep_large_pieces(faces: np.ndarray, fraction: float) -> np.ndarray:
@@ -119,17 +144,22 @@ def keep_large_pieces(faces: np.ndarray, fraction: float) -> np.ndarray:
 
 
 def decimated(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
-    """Returns a mesh with at most about max_faces triangles (Garland and Heckbert 1997); 0: as it is.
-
-    Each vertex has the colour of the nearest one before.
-    """
+    """Returns a mesh with at most about max_faces triangles (Garland and Heckbert 1997); 0: as it is."""
     if not max_faces or len(mesh.faces) <= max_faces:
-        return mesh
+        return mesh.copy()
     fewer = mesh.simplify_quadric_decimation(face_count=max_faces)
-    nearest = cKDTree(mesh.vertices).query(fewer.vertices)[1]
-    return trimesh.Trimesh(
-        fewer.vertices, fewer.faces, vertex_colors=np.asarray(mesh.visual.vertex_colors)[nearest], process=False
-    )
+    return trimesh.Trimesh(fewer.vertices, fewer.faces, process=False)
+
+
+def on_surface(mesh: trimesh.Trimesh, points: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points [N, 3] moved to the surface of a mesh, and the surface's normals [N, 3] there.
+
+    That is the plane through the nearest vertex, perpendicular to its normal.
+    """
+    nearest = cKDTree(mesh.vertices).query(points)[1]
+    normals = mesh.vertex_normals[nearest]
+    above = ((points - mesh.vertices[nearest]) * normals).sum(axis=1, keepdims=True)
+    return points - above * normals, normals
 
 
 class Fused(NamedTuple):
@@ -149,7 +179,6 @@ class Fused(NamedTuple):
     shape: tuple[int, int, int]
     index: Int[np.ndarray, " M"]
     distance: Float[np.ndarray, " M"]
-    rgb: Float[np.ndarray, "M 3"]
 
 
 def grid_shape(box: Float[np.ndarray, "2 3"], resolution: int) -> tuple[float, tuple[int, int, int]]:
@@ -187,19 +216,21 @@ def fuse(
     index = _vertices_near([points[cosine > 0] for points, _, cosine in surfaces], box[0], voxel, shape)
     x = np.float32(box[0] + voxel * np.stack(np.unravel_index(index, shape), axis=-1))
     x = jnp.asarray(np.resize(x, (-(-max(len(x), 1) // _CHUNK), _CHUNK, 3)))  # padded with copies of the first
-    total = jnp.zeros((*x.shape[:2], 7), jnp.float32)
-    for image, (points, normal, cosine) in zip(images, surfaces, strict=True):
-        absorbed = -np.expm1(-np.maximum(image.extinction, 0) * truncation)
-        weight = np.where(np.isinf(image.depth), _EMPTY_WEIGHT, cosine * absorbed)
-        trained = np.float32((image.depth > 0) & (closed or image.name is not None))
-        planes = [np.stack([image.depth, weight, trained], axis=-1), points, normal, image.rgb]
-        planes = np.concatenate(planes, axis=-1).astype(np.float32)
-        total = _integrate(total, image.camera, planes, x, np.float32(truncation))
-    total = np.asarray(total).reshape(-1, 7)[: len(index)]
-    weight, distance, views, rgb_weight = total[:, 0], total[:, 1], total[:, 2], total[:, 3:4]
+    total = jnp.zeros((*x.shape[:2], 3), jnp.float32)
+    with stages.stage("fusing depth images") as stage:
+        for done, (image, (points, normal, cosine)) in enumerate(zip(images, surfaces, strict=True)):
+            absorbed = -np.expm1(-np.maximum(image.extinction, 0) * truncation)
+            weight = np.where(np.isinf(image.depth), _EMPTY_WEIGHT, cosine * absorbed)
+            plane = (points * normal).sum(axis=-1)
+            planes = np.dstack([image.depth, weight, plane, normal]).astype(np.float32)
+            trained = np.float32(closed or image.name is not None)
+            total = _integrate(total, image.camera, planes, x, np.float32(truncation), trained)
+            jax.block_until_ready(total)
+            stage.update(done + 1, len(images))
+    weight, distance, views = np.moveaxis(np.asarray(total).reshape(-1, 3)[: len(index)], -1, 0)
     seen = (weight > _MIN_WEIGHT) & (views > 0)
     distance = np.where(seen, distance / np.where(seen, weight, 1), np.nan)
-    return Fused(box[0], voxel, shape, index, distance, total[:, 4:] / np.maximum(rgb_weight, 1e-6))
+    return Fused(box[0], voxel, shape, index, distance)
 
 
 def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray, "X Y Z"]:
@@ -218,8 +249,11 @@ def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray,
     coarse = tuple(size // 2 + 1 for size in fused.shape)
     x = np.float32(fused.lower + 2 * fused.voxel * np.stack(np.indices(coarse), axis=-1))
     free = jnp.zeros(coarse, bool)
-    for image in images:
-        free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
+    with stages.stage("finding free space") as stage:
+        for done, image in enumerate(images):
+            free = _mark_free(free, image.camera, image.depth, x, np.float32(_TRUNCATION * fused.voxel))
+            jax.block_until_ready(free)
+            stage.update(done + 1, len(images))
     field = 2 * np.asarray(free, np.float32) - 1.01  # nowhere 0 below, which would make degenerate triangles
     for axis, size in enumerate(fused.shape):
         place = np.arange(size)
@@ -227,9 +261,7 @@ def solid_field(images: Sequence[DepthImage], fused: Fused) -> Float[np.ndarray,
     return field
 
 
-def level_set(
-    fused: Fused, solid: Float[np.ndarray, "X Y Z"] | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def level_set(fused: Fused, solid: Float[np.ndarray, "X Y Z"] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Extracts the surface at distance 0 by marching cubes (Lorensen and Cline 1987, in scikit-image).
 
     Args:
@@ -238,47 +270,31 @@ def level_set(
             meets the border of the grid. None: no face is in a voxel with a corner that no view sees.
 
     Returns:
-        vertices [V, 3] in units of the dataset's files; faces [F, 3], counterclockwise seen from outside; and rgb
-        [V, 3] uint8, where no view sees a surface that of the nearest one. All are empty where there is no surface.
+        vertices [V, 3] in units of the dataset's files; and faces [F, 3], counterclockwise seen from outside. Both are
+        empty where there is no surface.
     """
     known = ~np.isnan(fused.distance)
-    field, row = np.ones(fused.shape, np.float32) if solid is None else solid, np.full(fused.shape, -1, np.int32)
-    field.reshape(-1)[fused.index[known]] = fused.distance[known]
-    row.reshape(-1)[fused.index[known]] = np.flatnonzero(known)
-    if solid is not None:
-        return _closed(fused, field, row)
-    cubes = row >= 0
-    for axis in range(3):  # scikit-image marches the cube below each vertex that is in the mask
-        lower = np.roll(cubes, 1, axis=axis)
-        lower[tuple(0 if i == axis else slice(None) for i in range(3))] = False
-        cubes &= lower
+    index = fused.index[known]
+    if not len(index):
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    field = np.ones(fused.shape, np.float32) if solid is None else solid
+    field.reshape(-1)[index] = fused.distance[known]
+    cubes = None
+    if solid is None:
+        cubes = np.zeros(fused.shape, bool)
+        cubes.reshape(-1)[index] = True
+        for axis in range(3):  # scikit-image marches the cube below each vertex that is in the mask
+            lower = np.roll(cubes, 1, axis=axis)
+            lower[tuple(0 if i == axis else slice(None) for i in range(3))] = False
+            cubes &= lower
+    else:
+        field = np.pad(field, 1, constant_values=1)  # free space around it closes the surface
     try:
         vertices, faces, _, _ = measure.marching_cubes(field, 0.0, mask=cubes, allow_degenerate=False)
     except (ValueError, RuntimeError):  # the level is outside the field's range, or no cube has a surface
-        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
-    return fused.lower + fused.voxel * vertices, faces, _colors(fused, row, vertices)[0]
-
-
-def _closed(fused, field, row):
-    """Returns what level_set does for a field [X, Y, Z] that is known everywhere; row: of each stored vertex, or -1."""
-    field = np.pad(field, 1, constant_values=1)  # free space around it closes the surface
-    if field.min() > 0 or not len(fused.index):
-        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
-    vertices, faces, _, _ = measure.marching_cubes(field, 0.0, allow_degenerate=False)
-    rgb, seen = _colors(fused, row, np.clip(vertices - 1, 0, np.subtract(fused.shape, 1)))
-    if seen.any():
-        rgb[~seen] = rgb[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
-    return fused.lower + fused.voxel * (vertices - 1), faces, rgb
-
-
-def _colors(fused, row, vertices):
-    """Returns rgb [V, 3] uint8 of vertices in voxels, and [V], whether both voxel corners around each are stored."""
-    low, high = np.floor(vertices).astype(int), np.ceil(vertices).astype(int)
-    fraction = (vertices - low).max(axis=1, keepdims=True)  # a vertex is on an edge, between two voxels' corners
-    rows = [row[tuple(ends.T)] for ends in (low, high)]
-    first, second = (fused.rgb[each] for each in rows)
-    rgb = np.rint(np.clip((1 - fraction) * first + fraction * second, 0, 255)).astype(np.uint8)
-    return rgb, (rows[0] >= 0) & (rows[1] >= 0)
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    padding = (field.shape[0] - fused.shape[0]) // 2
+    return fused.lower + fused.voxel * (vertices - padding), faces
 
 
 def _vertices_near(parts, lower, voxel, shape):
@@ -288,7 +304,7 @@ def _vertices_near(parts, lower, voxel, shape):
         place = np.rint((points - lower) / voxel).astype(int)
         place = place[inside(place, np.array([[0, 0, 0], np.subtract(shape, 1)]))]
         near[tuple(place.T)] = True
-    reach = int(np.ceil(_TRUNCATION)) + 1  # a point is up to half a voxel from its vertex, and pixels leave gaps
+    reach = int(np.ceil(_TRUNCATION))  # more than the level set needs, as pixels leave gaps
     for axis in range(3):
         near = ndimage.maximum_filter1d(near, 2 * reach + 1, axis=axis, mode="constant")
     return np.flatnonzero(near)
@@ -311,12 +327,12 @@ def _pixels_of(camera, x, shape):
     return jnp.where(visible, line * width + column, 0), depth, visible
 
 
-@jax.jit
-def _integrate(total, camera, planes, x, truncation):
-    """Returns total [C, N, 7] with what one view sees of vertices x [C, N, 3].
+@functools.partial(jax.jit, donate_argnums=0)
+def _integrate(total, camera, planes, x, truncation, trained):
+    """Returns total [C, N, 3] with what one view sees of vertices x [C, N, 3].
 
-    The sums are those of weights, of weights times distances, of training views, of the weights of colours, and of
-    those times colours.
+    The sums are those of weights, of weights times distances, and of training views. planes [H, W, 6] are the depth,
+    the weight, the distance of the surface's tangent plane from the origin, and its normal.
     """
     height, width = planes.shape[:2]
     rows = planes.reshape(height * width, -1)
@@ -325,15 +341,13 @@ def _integrate(total, camera, planes, x, truncation):
         total, x = part
         pixel, depth, visible = _pixels_of(camera, x, (height, width))
         row = rows[pixel]
-        surface, weight, trained = row[:, 0], row[:, 1], row[:, 2]
-        points, normal, rgb = row[:, 3:6], row[:, 6:9], row[:, 9:12]
+        surface, weight, plane, normal = row[:, 0], row[:, 1], row[:, 2], row[:, 3:]
         ahead = (surface - depth) / truncation
-        distance = jnp.clip(((x - points) * normal).sum(axis=-1) / truncation, -1, 1)
+        distance = jnp.clip(((x * normal).sum(axis=-1) - plane) / truncation, -1, 1)
         distance = jnp.where(ahead > _FREE, 1, distance)
         visible &= ahead > -1
-        weight, trained = jnp.where(visible, weight, 0), jnp.where(visible, trained, 0)
-        colored = jnp.where(ahead > _FREE, 0, weight * (1 - jnp.abs(distance)))[:, None]
-        sums = jnp.stack([weight, weight * distance, trained], axis=-1)
-        return total + jnp.concatenate([sums, colored, colored * rgb], axis=-1)
+        weight = jnp.where(visible, weight, 0)
+        seen = jnp.where(visible & (surface > 0), trained, 0)
+        return total + jnp.stack([weight, weight * distance, seen], axis=-1)
 
     return jax.lax.map(add, (total, x))

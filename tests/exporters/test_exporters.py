@@ -6,6 +6,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from export_sources import CENTER, RADIUS, SIZE, source_of
 from jaxnerf.core.types import Camera
@@ -15,6 +16,7 @@ from jaxnerf.exporters.depth import export_depth
 from jaxnerf.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field, write_glb
 from jaxnerf.exporters.points import export_points, thinned
 from jaxnerf.exporters.splats import export_splats, score
+from jaxnerf.fields.base import Field
 from jaxnerf.registry import Exporter
 from runs import run
 
@@ -29,7 +31,7 @@ def images():
     with pytest.MonkeyPatch.context() as patch:
         for name in ("mesh", "points", "splats", "depth"):
             module = __import__(f"jaxnerf.exporters.{name}", fromlist=["render_depth_images"])
-            patch.setattr(module, "render_depth_images", lambda source, size, all_around=False: rendered)
+            patch.setattr(module, "render_depth_images", lambda source, size, **options: rendered)
         yield rendered
 
 
@@ -51,6 +53,24 @@ def test_depth_images_lie_on_the_surface(images, tmp_path):
         points = (matrix[:3, :3] @ (local * depth[y, x])).T + matrix[:3, 3]
         assert np.median(np.abs(radii(points) - IN_FILE)) < 0.02
         assert np.isinf(image.depth[0, 0])  # empty space
+
+
+def test_depth_images_without_colors_are_at_the_same_depth(images):
+    """Their renderer ends rays behind their median depth, and evaluates no colours."""
+    source, settings = source_of(), []
+    model_with = source.run.model_with
+
+    def spied(given, wrap):
+        settings.append(given)
+        field = wrap(Field(init=lambda key: {}, apply=lambda params, x, viewdirs: (x[..., 0], x)))
+        assert not field.apply(None, np.ones((2, 3)), None)[1].any()
+        return model_with(given, wrap)
+
+    source = source._replace(run=source.run._replace(model_with=spied))
+    for image, other in zip(surfaces.render_depth_images(source, SIZE, colors=False), images, strict=True):
+        assert image.rgb is None
+        np.testing.assert_allclose(image.depth, other.depth, rtol=1e-6)
+    assert settings == [{"early_stop_eps": pytest.approx(0.4), "sample_multiplier": 1.0}]
 
 
 def test_depth_images_of_equal_names_in_several_folders_are_kept(images, tmp_path, monkeypatch):
@@ -138,14 +158,34 @@ def test_a_mesh_is_decimated_on_request(tmp_path):
     assert np.ptp(np.asarray(mesh.visual.vertex_colors)[:, 0]) > 200
 
 
+def test_files_have_the_texture(tmp_path):
+    lines = []
+    for suffix in ("glb", "obj"):
+        export_mesh(source_of(format=suffix, texture=256, max_faces=1000, up="+z", say=lines.append), tmp_path)
+    assert "a texture of 256 x 256" in lines[0]
+    content = (tmp_path / "mesh.glb").read_bytes()
+    tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    assert tree["materials"][0]["extensions"] == {"KHR_materials_unlit": {}}
+    assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert {path.name for path in tmp_path.iterdir()} == {"mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"}
+    assert "Kd 1.0" in (tmp_path / "mesh.mtl").read_text()
+    assert Image.open(tmp_path / "mesh.png").size == (256, 256)
+    for suffix, y in (("glb", lambda x: -x[:, 2]), ("obj", lambda x: x[:, 1])):  # the run's x; z is up in the files
+        mesh = trimesh.load(tmp_path / f"mesh.{suffix}", force="mesh", process=False)
+        assert len(mesh.faces) <= 1000
+        rgb = np.asarray(mesh.visual.to_color().vertex_colors)[:, :3]
+        side = y(mesh.vertices) - CENTER[1]
+        assert (rgb[side > 0.1, 0] > 200).all() and (rgb[side < -0.1, 1] > 200).all()
+
+
 def test_surfaces_that_no_view_sees_are_absent(images):
     """From one side, there is half a ball."""
     front = [image for image in images if image.camera.to_world[2, 3] > CENTER[2] + 2]
     box = np.stack([CENTER - 1.2, CENTER + 1.2])
-    vertices, faces, _ = level_set(fuse(front, box, 32))
+    vertices, faces = level_set(fuse(front, box, 32))
     assert len(faces) and vertices[:, 2].min() > CENTER[2] - 0.8
     fused = fuse(front, box, 32)
-    closed = trimesh.Trimesh(*level_set(fused, solid_field(front, fused))[:2])
+    closed = trimesh.Trimesh(*level_set(fused, solid_field(front, fused)))
     assert closed.is_watertight and closed.volume > 4 / 3 * np.pi * IN_FILE**3  # with what the ball hides
 
 

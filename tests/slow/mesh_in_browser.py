@@ -79,6 +79,7 @@ def main(out):
     field, opacity, camera = render_field()
     glb = export(out)
     files = {"exported": glb, **{name: change(glb) for name, change in WRONG.items()}}
+    files["textured"] = export(out, texture=1024, max_faces=30_000)
     (out / "index.html").write_text(PAGE)
     with serve(out) as port, chromium() as browser:
         page = browser.new_page()
@@ -90,8 +91,8 @@ def main(out):
             drawn = draw(page, path.name, camera)
             iio.imwrite(path.with_suffix(".png"), side_by_side(field + 1 - opacity[..., None], drawn))
             passed, what = compare(field, opacity, drawn)
-            if name == "exported":
-                check(passed, f"three.js draws the mesh as the field is rendered: {what}")
+            if name in ("exported", "textured"):
+                check(passed, f"three.js draws the {name} mesh as the field is rendered: {what}")
             else:
                 check(not passed, f"a mesh with {name} is noticed: {what}")
 
@@ -120,9 +121,10 @@ def scene(x, viewdirs):
     return DENSER * total, (density[..., None] * rgb).sum(axis=-2) / (total[..., None] + 1e-12)
 
 
-def export(folder):
+def export(folder, **settings):
     """Returns the bytes of the GLB."""
-    source = source_of(scene, say=print, count=NUM_VIEWS, num_samples=NUM_SAMPLES, format="glb", up="+z", **SETTINGS)
+    settings = {"format": "glb", "up": "+z", **SETTINGS, **settings}
+    source = source_of(scene, say=print, count=NUM_VIEWS, num_samples=NUM_SAMPLES, **settings)
     export_mesh(source, folder)
     return (folder / "mesh.glb").read_bytes()
 
