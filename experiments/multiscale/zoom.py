@@ -74,7 +74,9 @@ def measure(workdir: pathlib.Path) -> list[tuple[str, ...]]:
         rows.append((workdir.parent.name, name, *row))
     if _IMAGES.value:
         strips = [np.concatenate(video[::10], axis=1) for video in (*videos.values(), exact)]
-        write_image(pathlib.Path(_IMAGES.value) / f"{workdir.parent.name}.png", to_8_bits(np.concatenate(strips)))
+        folder = pathlib.Path(_IMAGES.value)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_image(folder / f"{workdir.parent.name}.png", to_8_bits(np.concatenate(strips)))
     return rows
 
 
