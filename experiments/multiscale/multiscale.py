@@ -6,8 +6,7 @@
 Each scene is trained on images shrunk by --factor, and at four sizes of them (`data.num_scales`) without and with
 `prefilter`; with `lego_fast` the last also with a sample buffer of twice the usual size. Truth at each size is the mean
 over the pixels of the original images. Supersampling renders several rays a pixel, on a regular grid, and averages
-their colours. PSNR at equal seconds is interpolated between the checkpoints of a run, of which there are three, and
-frames are timed alone.
+their colours. Each run has three checkpoints, for equal_seconds.py.
 """
 
 import json
@@ -64,34 +63,23 @@ _MOMENTS = 3  # checkpoints of a run, all scored
 
 
 def main(argv: list[str]) -> None:
-    """Trains, scores and prints the tables."""
+    """Trains, scores and prints both tables."""
     del argv
-    quality, forced, timely = [], [], []
+    quality, forced = [], []
+    usual = {scale: min(scale, _LIMIT) for scale in _SCALES}
     for scene in _SCENES.value:
-        runs = {}
         for name, settings in _VARIANTS[_CONFIG.value].items():
-            folder = pathlib.Path(_OUT.value) / f"{_CONFIG.value}_{scene}_{name.replace(' ', '_').replace(',', '')}"
-            runs[name] = found = measure(scene, settings, folder)
-            one = [found["scores"][f"{scale}x1"] for scale in _SCALES]
-            quality.append([scene, name, *(f"{score['psnr']:.2f}" for score in one), f"{found['seconds']:.0f}"])
-        scores = runs["full size"]["scores"]
-        forced += [supersampled(scene, str(side**2), dict.fromkeys(_SCALES, side), scores) for side in _SCALES]
-        usual = {scale: min(scale, _LIMIT) for scale in _SCALES}
-        forced.append(supersampled(scene, "as jaxnerf-render", usual, scores))
-        timely += at_equal_seconds(scene, runs)
+            folder = f"{_CONFIG.value}_{scene}_{name.replace(' ', '_').replace(',', '')}"
+            scores = measure(scene, settings, pathlib.Path(_OUT.value) / folder)["scores"]
+            quality.append([scene, name, *(f"{scores[f'{scale}x1']['psnr']:.2f}" for scale in _SCALES)])
+            if not settings:
+                forced += [supersampled(scene, str(side**2), dict.fromkeys(_SCALES, side), scores) for side in _SCALES]
+                forced.append(supersampled(scene, "as jaxnerf-render", usual, scores))
     size = f"{800 // _FACTOR.value} px, {_STEPS.value} steps, {_NUM_VIEWS.value} test views"
     lines = [*common.provenance(), "", f"PSNR in dB, one ray a pixel; {size}:", ""]
-    lines += common.markdown(("scene", "trained on", *_NAMES, "seconds of training"), quality)
+    lines += common.markdown(("scene", "trained on", *_NAMES), quality)
     lines += ["", "Supersampling of the runs trained at full size: PSNR in dB, and in brackets seconds a frame.", ""]
     lines += common.markdown(("scene", "rays a pixel", *_NAMES), forced)
-    lines += [
-        "",
-        "PSNR in dB, at full size and at 1/8, after equal seconds of training, and seconds a frame at full size.",
-    ]
-    lines += [
-        "",
-        *common.markdown(("scene", "trained on, rays a pixel at 1/8", "a third", "two thirds", "all", "frame"), timely),
-    ]
     common.publish(lines, "scales" if _CONFIG.value == "lego_fast" else f"scales of {_CONFIG.value}")
 
 
@@ -100,24 +88,6 @@ def supersampled(scene: str, name: str, sides: dict[int, int], scores: dict[str,
     cells = [scores.get(f"{scale}x{side}") for scale, side in sides.items()]
     shown = [f"{cell['psnr']:.2f} ({cell['seconds']:.3f})" if cell else "-" for cell in cells]
     return [scene, name, *shown]
-
-
-def at_equal_seconds(scene: str, runs: dict[str, Any]) -> list[list[str]]:
-    """Returns rows with the PSNR of each run after a third, two thirds and all of the seconds of the shortest."""
-    total = min(found["seconds"] for found in runs.values())
-    rows = []
-    for name, found in runs.items():
-        frame = f"{found['scores']['1x1']['seconds']:.3f}"
-        seconds = [moment["seconds"] for moment in found["moments"]]
-        for small in [key for key in found["moments"][0] if key.startswith("8x")]:
-            cells = []
-            for part in range(1, _MOMENTS + 1):
-                at = total * part / _MOMENTS
-                values = [np.interp(at, seconds, [each[key] for each in found["moments"]]) for key in ("1x1", small)]
-                cells.append(" / ".join(f"{value:.2f}" for value in values) if at >= 0.99 * seconds[0] else "-")
-            rows.append([scene, f"{name}, {int(small[2:]) ** 2}", *cells, frame])
-    rows[0][2:5] = [f"{cell} ({total * part / _MOMENTS:.0f} s)" for part, cell in enumerate(rows[0][2:5], start=1)]
-    return rows
 
 
 def measure(scene: str, settings: dict[str, Any], folder: pathlib.Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Rays inside a pixel, rows at equal seconds, and flicker."""
+"""Rays inside a pixel, scores after equal seconds, and flicker."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from studies import study
 
 multiscale = study("multiscale/multiscale")
 zoom = study("multiscale/zoom")
+equal_seconds = study("multiscale/equal_seconds")
 
 
 @pytest.mark.parametrize("side", [1, 2, 4])
@@ -18,20 +19,11 @@ def test_subpixels_cover_each_pixel_evenly(side):
     np.testing.assert_allclose(steps, 1 / side, atol=1e-6)
 
 
-def test_rows_at_equal_seconds_are_interpolated_between_checkpoints():
-    def run(*seconds, **more):
-        return {
-            "seconds": seconds[-1],
-            "scores": {"1x1": {"psnr": 0.0, "seconds": 0.5}},
-            "moments": [{"seconds": at, "1x1": 10 + at, "8x1": 20 + at, **more} for at in seconds],
-        }
-
-    rows = multiscale.at_equal_seconds("lego", {"full size": run(2, 4, 6, **{"8x4": 30.0}), "other": run(3, 6, 9)})
-    assert rows == [
-        ["lego", "full size, 1", "12.00 / 22.00 (2 s)", "14.00 / 24.00 (4 s)", "16.00 / 26.00 (6 s)", "0.500"],
-        ["lego", "full size, 16", "12.00 / 30.00", "14.00 / 30.00", "16.00 / 30.00", "0.500"],
-        ["lego", "other, 1", "-", "14.00 / 24.00", "16.00 / 26.00", "0.500"],
-    ]
+def test_scores_after_equal_seconds_are_interpolated_between_checkpoints():
+    scores = [{"1x1": 10.0 + at, "8x4": 20.0 + at} for at in (2, 4, 6)]
+    found = equal_seconds.psnr_at([2.0, 5.0, 9.0], [2.0, 4.0, 6.0], scores, "8x4")
+    assert found == ["12.00 / 22.00", "15.00 / 25.00", "16.00 / 26.00"]
+    assert equal_seconds.psnr_at([1.5], [2.0, 4.0, 6.0], scores, "8x4") == ["-"]
 
 
 def test_flicker_is_what_changes_and_should_not():
