@@ -10,7 +10,7 @@ import typing as _typing
 
 import jaxnerf.runtime.quiet_start as _quiet_start  # noqa: F401
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, pixel_radius, project, rays_from_pixels, undistort
-from jaxnerf.core.encoding import positional_encoding
+from jaxnerf.core.encoding import frustum_variance, integrated_encoding, positional_encoding
 from jaxnerf.core.losses import distortion_loss
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
 from jaxnerf.core.occupancy.grid import (
@@ -110,7 +110,8 @@ __all__ = [
     "OccupancyGrid", "PackedSamples", "create_grid", "update_grid", "grid_from_scene", "mask_scene",
     "render_packed",
     # encodings, metrics, losses
-    "positional_encoding", "mse", "psnr", "ssim", "round_to_8_bits", "distortion_loss",
+    "positional_encoding", "integrated_encoding", "frustum_variance", "mse", "psnr", "ssim", "round_to_8_bits",
+    "distortion_loss",
     # data and fields
     "Views", "SparsePoints", "Batch", "load_dataset", "draw_batch", "mlp_field", "hash_grid_field", "still_life",
     # runs

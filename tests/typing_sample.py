@@ -110,7 +110,9 @@ def losses_and_metrics(rays: jaxnerf.Rays, rendering: jaxnerf.Rendering) -> Arra
     loss = jaxnerf.distortion_loss([rendering], batch)
     image = jaxnerf.round_to_8_bits(rendering.rgb)
     scores = jaxnerf.mse(image, image) + jaxnerf.psnr(image, image) + jaxnerf.ssim(image, image)
-    return loss.mean() + scores + jaxnerf.positional_encoding(rendering.rgb, num_freqs=4).mean()
+    variance = jaxnerf.frustum_variance(rendering.rgb, rendering.depth, rendering.opacity)
+    mean = jaxnerf.integrated_encoding(rendering.rgb, variance, num_freqs=4).mean()
+    return loss.mean() + scores + mean + jaxnerf.positional_encoding(rendering.rgb, num_freqs=4).mean()
 
 
 def fields_and_data(folder: str) -> jaxnerf.Views:

@@ -1,15 +1,16 @@
 """Scores runs at the size of their training images, at half of it, a quarter and an eighth.
 
-    python experiments/multiscale/multiscale.py --out=runs/multiscale [--scenes=lego,mic] [--factor=4] [--steps=2000]
-        [--page=docs/results/multiscale.md]
+    python experiments/multiscale/multiscale.py --out=runs/multiscale [--config=lego_fast] [--scenes=lego,mic]
+        [--factor=4] [--steps=2000] [--page=docs/results/multiscale.md]
 
-Each scene is trained with `lego_fast` on images shrunk by --factor, and at four sizes of them (`data.num_scales`)
-without and with `hash_grid.prefilter`, the last with more samples a ray than the usual 10. Truth at each size is the
-mean over the pixels of the original images. Supersampling renders several rays a pixel, on a regular grid, and averages
-their colours.
+Each scene is trained on images shrunk by --factor, and at four sizes of them (`data.num_scales`) without and with
+`prefilter`; with `lego_fast` the last also with a sample buffer of twice the usual size. Truth at each size is the mean
+over the pixels of the original images. Supersampling renders several rays a pixel, on a regular grid, and averages
+their colours. Each run has three checkpoints, for equal_seconds.py.
 """
 
 import json
+import math
 import pathlib
 import statistics
 import sys
@@ -26,50 +27,67 @@ import common
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr
 from jaxnerf.core.views import Views
-from jaxnerf.evaluation import evaluate, restore
+from jaxnerf.evaluation import evaluate, restore, supersampling
 from jaxnerf.runtime import cli
 
+_FOUR = {"data.num_scales": 4}
+_VARIANTS = {
+    "lego_fast": {
+        "full size": {},
+        "four scales": {**_FOUR, "hash_grid.prefilter": False},
+        "four scales, prefilter": {**_FOUR, "hash_grid.prefilter": True},
+        "four scales, prefilter, 10 samples a ray": {
+            **_FOUR,
+            "hash_grid.prefilter": True,
+            "occupancy.pool_samples_per_ray": 10.0,
+        },
+    },
+    "lego_mlp_fast": {
+        "full size": {},
+        "four scales": {**_FOUR, "fine.prefilter": False},
+        "four scales, prefilter": {**_FOUR, "fine.prefilter": True},
+    },
+}
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs; finished ones are not repeated.", required=True)
+_CONFIG = flags.DEFINE_enum("config", "lego_fast", list(_VARIANTS), "Config of the runs.")
 _SCENES = flags.DEFINE_list("scenes", ["lego", "mic"], "Datasets with images of 800 px.")
 _FACTOR = flags.DEFINE_integer("factor", 4, "Full size is that of the images shrunk by this.", lower_bound=1)
-_STEPS = flags.DEFINE_integer("steps", 2000, "Steps of training.", lower_bound=1)
+_STEPS = flags.DEFINE_integer("steps", 2000, "Steps of training.", lower_bound=3)
 _NUM_VIEWS = flags.DEFINE_integer("num_views", 25, "Test views to score, spread evenly.", lower_bound=1)
 _SPLIT = flags.DEFINE_enum("split", "test", ["test", "held_out"], "The views to score; held_out: to choose settings.")
 _SCALES = (1, 2, 4, 8)
-_PREFILTER = {"data.num_scales": 4, "hash_grid.prefilter": True}
-_VARIANTS = {
-    "full size": {},
-    "four scales": {"data.num_scales": 4, "hash_grid.prefilter": False},
-    "four scales, prefilter": _PREFILTER,
-    "four scales, prefilter, 15 samples a ray": {**_PREFILTER, "occupancy.pool_samples_per_ray": 15.0},
-}
 _SIDES = ((1, 2), (1, 2), (1, 2, 4), (1, 2, 4, 8))  # rays along a pixel's side, at each scale
+_LIMIT = math.isqrt(supersampling.MAX_RAYS)  # along a pixel's side, of jaxnerf-render
 _NAMES = ("1", "1/2", "1/4", "1/8")
+_MOMENTS = 3  # checkpoints of a run, all scored
 
 
 def main(argv: list[str]) -> None:
     """Trains, scores and prints both tables."""
     del argv
     quality, forced = [], []
+    usual = {scale: min(scale, _LIMIT) for scale in _SCALES}
     for scene in _SCENES.value:
-        for name, settings in _VARIANTS.items():
-            found = measure(scene, settings, pathlib.Path(_OUT.value) / f"{scene}_{name.replace(' ', '_')}")
-            one = [found["scores"][f"{scale}x1"] for scale in _SCALES]
-            quality.append([scene, name, *(f"{score['psnr']:.2f}" for score in one), f"{found['seconds']:.0f}"])
+        for name, settings in _VARIANTS[_CONFIG.value].items():
+            folder = f"{_CONFIG.value}_{scene}_{name.replace(' ', '_').replace(',', '')}"
+            scores = measure(scene, settings, pathlib.Path(_OUT.value) / folder)["scores"]
+            quality.append([scene, name, *(f"{scores[f'{scale}x1']['psnr']:.2f}" for scale in _SCALES)])
             if not settings:
-                forced += [supersampled(scene, side, found["scores"]) for side in _SCALES]
-    lines = [*common.provenance(), "", "PSNR of test views in dB, one ray a pixel:", ""]
-    lines += common.markdown(("scene", "trained on", *_NAMES, "seconds of training"), quality)
+                forced += [supersampled(scene, str(side**2), dict.fromkeys(_SCALES, side), scores) for side in _SCALES]
+                forced.append(supersampled(scene, "as jaxnerf-render", usual, scores))
+    size = f"{800 // _FACTOR.value} px, {_STEPS.value} steps, {_NUM_VIEWS.value} test views"
+    lines = [*common.provenance(), "", f"PSNR in dB, one ray a pixel; {size}:", ""]
+    lines += common.markdown(("scene", "trained on", *_NAMES), quality)
     lines += ["", "Supersampling of the runs trained at full size: PSNR in dB, and in brackets seconds a frame.", ""]
     lines += common.markdown(("scene", "rays a pixel", *_NAMES), forced)
-    common.publish(lines, "scales")
+    common.publish(lines, "scales" if _CONFIG.value == "lego_fast" else f"scales of {_CONFIG.value}")
 
 
-def supersampled(scene: str, side: int, scores: dict[str, Any]) -> list[str]:
-    """Returns the row of a table with side x side rays a pixel at each scale; "-" where they were not rendered."""
-    cells = [scores.get(f"{scale}x{side}") for scale in _SCALES]
+def supersampled(scene: str, name: str, sides: dict[int, int], scores: dict[str, Any]) -> list[str]:
+    """Returns the row of a table with so many rays along a pixel's side, by scale; "-" where none were rendered."""
+    cells = [scores.get(f"{scale}x{side}") for scale, side in sides.items()]
     shown = [f"{cell['psnr']:.2f} ({cell['seconds']:.3f})" if cell else "-" for cell in cells]
-    return [scene, str(side**2), *shown]
+    return [scene, name, *shown]
 
 
 def measure(scene: str, settings: dict[str, Any], folder: pathlib.Path) -> dict[str, Any]:
@@ -81,13 +99,20 @@ def measure(scene: str, settings: dict[str, Any], folder: pathlib.Path) -> dict[
         folder: of the run and what was measured; a finished one is read.
 
     Returns:
-        {"seconds": of training, "scores": {"SCALExSIDE": {"psnr": mean, "seconds": median of a frame}}}, with
-        SIDE x SIDE rays a pixel.
+        {"seconds": of training, "scores": {"SCALExSIDE": {"psnr": mean, "seconds": median of a frame}}, "moments":
+        [{"seconds": of training, "SCALExSIDE": PSNR} of each checkpoint]}, with SIDE x SIDE rays a pixel.
     """
     steps = {"train.max_steps": _STEPS.value, "train.lr_steps": _STEPS.value, "train.preview_every": 0}
+    every = math.ceil(_STEPS.value / _MOMENTS)
+    steps |= {
+        "train.save_every": every,
+        "train.log_every": every,
+        "train.max_to_keep": _MOMENTS,
+        "train.max_seconds": 0.0,
+    }
     hold_out = {} if _SPLIT.value == "test" else {"data.hold_out": 8}
     settings = {"data.dir": scene, "data.factor": _FACTOR.value, **steps, **hold_out, **settings}
-    config = common.configuration("lego_fast", settings)
+    config = common.configuration(_CONFIG.value, settings)
     origin = {"config": common.plain_config(config), "num_views": _NUM_VIEWS.value, "split": _SPLIT.value}
     kept = common.read_json(folder / "measured.json")
     if kept:
@@ -95,15 +120,23 @@ def measure(scene: str, settings: dict[str, Any], folder: pathlib.Path) -> dict[
         return kept["measured"]
     if not evaluate.train_and_evaluate(config, folder / "run"):
         raise KeyboardInterrupt
-    seconds = json.loads((folder / "run" / "metrics.jsonl").read_text().splitlines()[-1])["seconds"]
+    rows = [json.loads(line) for line in (folder / "run" / "metrics.jsonl").read_text().splitlines()]
+    seconds = {row["step"]: row["seconds"] for row in rows}
     run = restore.restore_run(folder / "run")
-    variables = run.variables(run.steps()[-1])
-    scores = {}
-    for scale, sides in zip(_SCALES, _SIDES, strict=True):
-        views = _views(config, scale, _SPLIT.value)
-        for side in sides if config.data.num_scales == 1 else (1,):
-            scores[f"{scale}x{side}"] = score(run, variables, views, side)
-    measured = {"seconds": seconds, "scores": scores}
+    at_one_size = config.data.num_scales == 1
+    views = {scale: _views(config, scale, _SPLIT.value) for scale in _SCALES}
+    moments = []
+    for step in sorted(run.steps()):
+        variables = run.variables(step)
+        cases = [(1, 1), (8, 1), *([(8, _LIMIT)] if at_one_size else [])]
+        found = {f"{scale}x{side}": score(run, variables, views[scale], side)["psnr"] for scale, side in cases}
+        moments.append({"seconds": seconds[step], **found})
+    scores = {
+        f"{scale}x{side}": score(run, variables, views[scale], side)
+        for scale, sides in zip(_SCALES, _SIDES, strict=True)
+        for side in (sides if at_one_size else (1,))
+    }
+    measured = {"seconds": seconds[step], "scores": scores, "moments": moments}
     common.write_json(folder / "measured.json", {"origin": origin, "measured": measured})
     jax.clear_caches()
     return measured

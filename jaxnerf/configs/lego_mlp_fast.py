@@ -9,6 +9,7 @@ def get_config():
     config.field = "mlp"
     network = config.fine
     network.depth, network.width, network.view_width, network.num_freqs = 4, 64, 32, "auto"
+    network.prefilter = "auto"
     # A dead ReLU has no gradient and cannot recover, and this learning rate is high.
     network.density_activation, network.density_bias = "softplus", -1.0
     config.occupancy.cpu_pool_samples_per_ray = 10.0

@@ -14,9 +14,11 @@ from jaxnerf.core import contraction
 from jaxnerf.core.loops import is_cpu
 from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import SceneFn, Vector
+from jaxnerf.options import Facts
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
 
+_LEAST_SPREAD = 4.0  # of footprints: those of a hand-held capture differ by up to 1.7, those of four scales by 8
 _CACHE_ROW = 512  # float32 numbers, 2 KiB
 _FEW_RAYS = 16  # with fewer rays, padding by a whole ray costs too much
 _MORE_SAMPLES = 32  # padding of each ray, if there are few
@@ -123,3 +125,11 @@ def apply_network(
     padded = {name: pad(value[..., None])[..., 0] if jnp.ndim(value) else value for name, value in inputs.items()}
     density, rgb = network.apply({"params": params}, pad(x), pad(viewdirs), **padded)
     return density[:rays, :samples].reshape(shape), rgb[:rays, :samples].reshape(*shape, 3)
+
+
+def infer_prefilter(facts: Facts) -> tuple[bool, str]:
+    """Returns whether a field should know the size of a pixel's footprint at its samples, and why."""
+    if facts.ndc:
+        return False, "rays in normalised device coordinates have no cones"
+    spread = f"the footprints of pixels differ by a factor of {facts.footprint_spread:.2g}; on from {_LEAST_SPREAD:g}"
+    return facts.footprint_spread >= _LEAST_SPREAD, spread

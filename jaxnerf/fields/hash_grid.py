@@ -19,7 +19,7 @@ from jaxnerf.core.loops import is_cpu
 from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector, check_shapes
-from jaxnerf.fields.base import Box, Field, apply_network
+from jaxnerf.fields.base import Box, Field, apply_network, infer_prefilter
 from jaxnerf.fields.mlp import Dense
 from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
@@ -40,7 +40,6 @@ _FINEST = (32, 256)  # vertices along the longest side, minimum and maximum, of 
 _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
-_LEAST_SPREAD = 4.0  # of footprints: those of a hand-held capture differ by up to 1.7, those of four scales by 8
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
 # A larger table and wider networks take little time on an accelerator: each gained 0.3 dB for lego at 800 x 800 on an
 # H200 (docs/guides/accelerators.md).
@@ -121,10 +120,7 @@ class HashGridOptions(Options):
         rows = 2 ** round(math.log2(min(max(_ROWS_PER_PIXEL * facts.side, _MIN_ROWS), _MAX_ROWS)))
         rows, width = (rows, _CPU_WIDTH) if device.is_cpu else (_ACCELERATOR_ROWS * rows, _ACCELERATOR_WIDTH)
         size = f"{facts.side:.0f} x {facts.side:.0f} px"
-        prefilter = not facts.ndc and facts.footprint_spread >= _LEAST_SPREAD
-        why = f"the footprints of pixels differ by a factor of {facts.footprint_spread:.2g}; on from {_LEAST_SPREAD:g}"
-        if facts.ndc:
-            why = "rays in normalised device coordinates have no cones"
+        prefilter, why = infer_prefilter(facts)
         per_layer = f"hash grid     {width} outputs per hidden layer of the {{}} network, for this device"
         return infer(
             self,

@@ -10,10 +10,10 @@ import numpy as np
 from flax import linen
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxnerf.core.encoding import encode_planes
+from jaxnerf.core.encoding import encode_planes, frustum_variance
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
-from jaxnerf.fields.base import Box, Field, apply_network
-from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, option
+from jaxnerf.fields.base import Box, Field, apply_network, infer_prefilter
+from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Part
 
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
@@ -36,6 +36,12 @@ class MlpOptions(Options):
     num_freqs: int = option(10, "octaves of the position's encoding", range=between(0, _MAX_OCTAVES), auto=True)
     num_view_freqs: int = option(4, "octaves of the direction's encoding", range=between(0, _MAX_OCTAVES))
     encode: bool = option(True, "whether position and direction have a positional encoding")
+    prefilter: bool = option(
+        False,
+        "Whether the position's encoding is its mean over the part of the pixel's cone that a sample stands for "
+        "(integrated positional encoding, arXiv:2103.13415). auto: as for `hash_grid.prefilter`.",
+        auto=True,
+    )
     use_viewdirs: bool = option(True, "whether colour depends on the direction")
     density_activation: str = option("relu", "activation of the density", choices=tuple(sorted(DENSITY_ACTIVATIONS)))
     density_bias: float = option(0.0, "added to the density before its activation")
@@ -44,15 +50,24 @@ class MlpOptions(Options):
     )
 
     def resolve(self, facts: Facts, device: Device) -> tuple["MlpOptions", list[str]]:
-        """Infers the octaves from the size of a pixel."""
+        """Infers the octaves from the size of a pixel, and whether they are averaged from the spread of the sizes."""
         octaves = 1 + math.log2(2 * math.pi / (_PIXELS_PER_WAVE * facts.footprint))
         octaves = min(max(round(octaves), 1), 16)
         line = f"octaves       {octaves} in {{section}}; the shortest wave is four pixels long"
-        return infer(self, num_freqs=(octaves, line))
+        prefilter, why = infer_prefilter(facts)
+        if not self.encode:
+            prefilter, why = False, "positions have no encoding"
+        return infer(
+            self,
+            num_freqs=(octaves, line),
+            prefilter=(prefilter, f"prefilter     {'on' if prefilter else 'off'} in {{section}}: {why}"),
+        )
 
     def check(self) -> None:
         if self.compute_dtype == "float64" and not jax.config.jax_enable_x64:
             raise ValueError("compute_dtype is 'float64', which requires the environment's JAX_ENABLE_X64=1")
+        if self.prefilter and not is_auto(self.prefilter) and not self.encode:
+            raise ValueError("prefilter is True and encode False, which leaves no encoding to average; set one of them")
 
     def bytes_needed(self) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
@@ -69,7 +84,8 @@ def mlp_field(**options: Any) -> Field:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3], key=None, density_noise=0.0)
         returns density [..., S] in 1 / world unit and rgb [..., S, 3] in [0, 1], both float32.
         With a key (one, or one per ray) normal noise of that standard deviation is added to the density
-        before its activation, the paper's regulariser for real scenes.
+        before its activation, the paper's regulariser for real scenes. With prefilter, apply asks for the radius and
+        the length [..., 1 or S] at each sample, too, see `frustum_variance`.
 
     Raises:
         ValueError: if density_activation is unknown.
@@ -86,17 +102,26 @@ def mlp_field(**options: Any) -> Field:
     activation = DENSITY_ACTIVATIONS[network.density_activation]
 
     def init(key):
-        return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
+        inputs = dict.fromkeys(("radius", "length"), jnp.zeros((1, 1))) if network.prefilter else {}
+        return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
     def apply(params, x, viewdirs, *, key=None, density_noise=0.0):
-        density, rgb = apply_network(network, params, x, viewdirs)
+        return evaluate(params, x, viewdirs, key, density_noise)
+
+    def apply_to_cones(params, x, viewdirs, *, radius, length, key=None, density_noise=0.0):
+        radius, length = (jnp.broadcast_to(each, x.shape[:-1]) for each in (radius, length))
+        return evaluate(params, x, viewdirs, key, density_noise, radius=radius, length=length)
+
+    def evaluate(params, x, viewdirs, key, density_noise, **inputs):
+        density, rgb = apply_network(network, params, x, viewdirs, **inputs)
         if key is not None and density_noise:
             density = density + density_noise * normal(key, density.shape)
         return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
 
     layers = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
     color_layers = ("view",) if network.use_viewdirs else ("rgb",)
-    return Field(init, apply, tuple(f"trunk_{layer}" for layer in layers), color_layers=color_layers)
+    scene = apply_to_cones if network.prefilter else apply
+    return Field(init, scene, tuple(f"trunk_{layer}" for layer in layers), color_layers=color_layers)
 
 
 def from_options(options: MlpOptions, box: Box | None) -> Field:
@@ -119,6 +144,8 @@ class MLP(linen.Module):
         num_freqs: octaves of the position's encoding.
         num_view_freqs: octaves of the direction's encoding.
         encode: False: position and direction enter without positional encoding.
+        prefilter: whether the position's encoding is the `integrated_encoding` over the cone at each sample, whose
+            radius and length are inputs, too.
         use_viewdirs: False: colour depends on position alone; there is no bottleneck and no view layer.
         density_activation: "relu" or "softplus".
         density_bias: added to the density before its activation.
@@ -132,6 +159,7 @@ class MLP(linen.Module):
     num_freqs: int = 10
     num_view_freqs: int = 4
     encode: bool = True
+    prefilter: bool = False
     use_viewdirs: bool = True
     density_activation: str = "relu"
     density_bias: float = 0.0
@@ -139,7 +167,11 @@ class MLP(linen.Module):
 
     @linen.compact
     def __call__(
-        self, x: Float[ArrayLike, "*batch samples 3"], viewdirs: Float[ArrayLike, "*batch #samples 3"]
+        self,
+        x: Float[ArrayLike, "*batch samples 3"],
+        viewdirs: Float[ArrayLike, "*batch #samples 3"],
+        radius: Float[ArrayLike, "*batch samples"] | None = None,
+        length: Float[ArrayLike, "*batch samples"] | None = None,
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations.
 
@@ -147,7 +179,9 @@ class MLP(linen.Module):
         backward pass read memory contiguously. A small network on a CPU gains most from this.
         """
         shape = x.shape[:-1]
-        encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode).astype(self.compute_dtype)
+        variance = planes(frustum_variance(viewdirs, radius, length)) if self.prefilter else None
+        encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode, variance=variance)
+        encoded = encoded.astype(self.compute_dtype)
         hidden = ()
         for layer in range(self.depth):
             joins = layer == 0 or layer == self.skip_layer + 1

@@ -26,10 +26,12 @@ except ImportError:  # Windows
 _FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training writes to
 # Options that the config.json of an older version may lack though training depends on them, and what it did instead.
 _ADDED = {
+    "coarse.prefilter": False,
     "data.background_color": (),
     "data.num_scales": 1,
     "data.up": "",
     "data.view_indices": (),
+    "fine.prefilter": False,
     "hash_grid.prefilter": False,
     "occupancy.min_views": 0,
     "occupancy.uniform_fraction": 1.0,

@@ -267,6 +267,10 @@ def cases():
             (density, delta, t, delta, jnp.full(3, jnp.inf))),
         "positional_encoding": (functools.partial(jaxnerf.positional_encoding, num_freqs=4), (small,)),
         "positional_encoding at 0": (functools.partial(jaxnerf.positional_encoding, num_freqs=20), (small * 0,)),
+        "integrated_encoding": (functools.partial(jaxnerf.integrated_encoding, num_freqs=4), (small, small**2)),
+        "integrated_encoding over all": (
+            functools.partial(jaxnerf.integrated_encoding, num_freqs=20), (small, jnp.full(small.shape, jnp.inf))),
+        "frustum_variance": (jaxnerf.frustum_variance, (small, jnp.zeros((2, 5)), jnp.full((2, 5), jnp.inf))),
         "mse": (jaxnerf.mse, (image, other)),
         "mse masked": (lambda a, b: jaxnerf.mse(a, b, mask=image[..., 0] > 0.5), (image, other)),
         "psnr": (jaxnerf.psnr, (image, other)),

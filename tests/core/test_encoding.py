@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from helpers import assert_batch_is_vmap_is_jit, compiled
-from jaxnerf import positional_encoding
+from jaxnerf import frustum_variance, integrated_encoding, positional_encoding
 
 encode = compiled(positional_encoding, "num_freqs", "include_input")
+integrate = compiled(integrated_encoding, "num_freqs", "include_input")
 
 
 def test_order_is_x_then_sine_and_cosine_of_each_octave():
@@ -100,3 +101,107 @@ def test_half_precision_is_raised_first():
     got = encode(x, num_freqs=16)
     assert got.dtype == np.float32
     np.testing.assert_array_equal(got, encode(x.astype(jnp.float32), num_freqs=16))
+
+
+# The mean over a cone.
+
+EXTENTS = [0.0, 1e-30, 1e-12, 1e-3, 0.02, 0.5, 3.0, 1e6, 1e17, 1e25, np.inf]  # of a frustum
+AWAY = np.array([2.0, -1.0, 2.0]) / 3
+
+
+def exact_waves(x, radius, length, num_freqs):
+    """Returns the waves [2 num_freqs, 3] and their derivatives with respect to radius and length, in float64."""
+    octaves = 2.0 ** np.arange(num_freqs)[:, None, None]
+    along, across = AWAY**2 / 12, (1 - AWAY**2) / 4
+    # Where a wave is averaged away, its derivative is 0, too: the product would be that of infinity and 0.
+    radius, length = min(radius, 1e18), min(length, 1e18)
+    decay = np.exp(-(octaves**2) / 2 * (length**2 * along + radius**2 * across))
+    waves = decay * np.stack([np.sin(octaves[:, 0] * x), np.cos(octaves[:, 0] * x)], axis=1)
+    slopes = [-(octaves**2) * waves * extent * of for extent, of in ((radius, across), (length, along))]
+    return [each.reshape(-1, 3) for each in (waves, *slopes)]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("is_radius", [True, False])
+def test_waves_over_a_frustum_and_their_derivatives_are_those_of_float64(is_radius, dtype):
+    x, extents = np.array([0.3, -0.2, 1.5]), np.array(EXTENTS, dtype)
+
+    def waves(extent):
+        radius, length = (extent, jnp.zeros_like(extent)) if is_radius else (jnp.zeros_like(extent), extent)
+        variance = frustum_variance(AWAY.astype(dtype)[None], radius[None], length[None])[0]
+        return integrated_encoding(x.astype(dtype), variance, num_freqs=12, include_input=False)
+
+    with jax.enable_x64(dtype == np.float64):
+        got, slopes = jax.jit(lambda at: (jax.vmap(waves)(at), jax.vmap(jax.jacrev(waves))(at)))(jnp.asarray(extents))
+        assert got.dtype == slopes.dtype == dtype
+    x = x.astype(dtype).astype(np.float64)
+    for value, slope, extent in zip(got, slopes, extents.astype(np.float64), strict=True):
+        want, *derivatives = exact_waves(x, *((extent, 0.0) if is_radius else (0.0, extent)), 12)
+        np.testing.assert_allclose(value.reshape(-1, 3), want, atol=1e-6)
+        np.testing.assert_allclose(slope.reshape(-1, 3), derivatives[not is_radius], rtol=1e-4, atol=1e-3)
+    assert not got[-3:].any() and not slopes[-3:].any() and not slopes[0].any()
+
+
+def test_a_frustum_that_is_a_point_has_the_plain_encoding_and_its_gradient():
+    x = np.random.default_rng(3).uniform(-1e3, 1e3, (50, 3)).astype(np.float32)
+    nothing = np.zeros(50, np.float32)
+    variance = frustum_variance(np.tile(np.float32(AWAY), (50, 1)), nothing, nothing)
+    np.testing.assert_array_equal(integrate(x, variance, num_freqs=16), encode(x, num_freqs=16))
+    np.testing.assert_array_equal(integrate(x, variance, num_freqs=0), x)
+    pull = np.random.default_rng(4).normal(size=(50, 99)).astype(np.float32)
+    plain, mean = (
+        jax.jit(jax.grad(lambda x, function=function: (pull * function(x)).sum()))(x)
+        for function in (
+            lambda x: positional_encoding(x, num_freqs=16),
+            lambda x: integrated_encoding(x, variance, num_freqs=16),
+        )
+    )
+    np.testing.assert_allclose(mean, plain, rtol=1e-6, atol=0.1)  # of 2^15
+
+
+def test_the_integrated_encoding_is_the_mean_over_random_points_of_a_cylinder():
+    rng = np.random.default_rng(0)
+    x, radius, length, count = np.float32([0.3, -0.2, 0.5]), 0.2, 0.5, 400_000
+    side = np.cross(AWAY, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    turn, out = rng.uniform(0, 2 * np.pi, count), radius * np.sqrt(rng.uniform(0, 1, count))
+    across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(AWAY, side)
+    points = x + rng.uniform(-0.5, 0.5, (count, 1)) * length * AWAY + out[:, None] * across
+    angles = 2.0 ** np.arange(3)[:, None] * points[:, None]
+    want = np.concatenate([np.sin(angles), np.cos(angles)], axis=-1).mean(axis=0).reshape(-1)
+    variance = frustum_variance(np.float32(AWAY)[None], np.float32([radius]), np.float32([length]))[0]
+    np.testing.assert_allclose(variance, points.var(axis=0), rtol=0.01)
+    np.testing.assert_allclose(integrate(x, variance, num_freqs=3, include_input=False), want, atol=0.01)
+
+
+@pytest.mark.parametrize("half", [0.001, 0.01, 0.1])
+def test_a_frustum_near_its_apex_differs_by_the_square_of_its_relative_length(half):
+    """Eq. 7 of arXiv:2103.13415, for a sample at a distance of 1 and the stated orders."""
+    square, radius, length = half**2, 0.05, 2 * half
+    mean = 1 + 2 * square / (3 + square)
+    along = square / 3 - 4 / 15 * square**2 * (12 - square) / (3 + square) ** 2
+    across = radius**2 * (1 / 4 + 5 / 12 * square - 4 / 15 * square**2 / (3 + square))
+    with jax.enable_x64(True):
+        found = frustum_variance(np.array([[0.0, 0.0, 1.0]]), np.array([radius]), np.array([length]))[0]
+    order = 2 * square**2
+    assert mean - 1 == pytest.approx(2 / 3 * square, abs=order)
+    assert along / float(found[2]) == pytest.approx(1 - 16 / 15 * square, abs=order)
+    assert across / float(found[0]) == pytest.approx(1 + 5 / 3 * square, abs=order)
+
+
+def test_a_variance_is_never_negative():
+    """Directions of rays are unit vectors but for rounding."""
+    rng = np.random.default_rng(5)
+    viewdirs = rng.normal(size=(1000, 1, 3)) * 10.0 ** rng.uniform(-8, 0, (1000, 1, 3))
+    viewdirs = np.float32(viewdirs / np.linalg.norm(viewdirs, axis=-1, keepdims=True)) * np.float32(1 + 1e-6)
+    variance = frustum_variance(viewdirs, np.full((1000, 2), 1e18, np.float32), np.zeros((1000, 2), np.float32))
+    assert variance.shape == (1000, 2, 3) and (variance >= 0).all()
+
+
+def test_wrong_arguments_of_the_mean():
+    with pytest.raises(ValueError, match="integrated_encoding: num_freqs=0"):
+        integrated_encoding(jnp.ones(3), jnp.ones(3), num_freqs=0, include_input=False)
+    with pytest.raises(ValueError, match=r"integrated_encoding: variance has shape \(2,\)"):
+        integrated_encoding(jnp.ones(3), jnp.ones(2), num_freqs=2)
+    with pytest.raises(ValueError, match=r"frustum_variance: length has shape \(4,\)"):
+        frustum_variance(jnp.ones((3, 3)), jnp.ones(3), jnp.ones(4))

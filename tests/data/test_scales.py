@@ -140,14 +140,26 @@ def test_what_several_sizes_do_not_fit_is_refused(settings, reason):
         build.build(config)
 
 
+MLP = {"field": "mlp", "fine.prefilter": "auto"}
+
+
 @pytest.mark.extra
-def test_a_run_of_several_sizes_is_trained_and_rendered(tmp_path):
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {**PACKED, "hash_grid.prefilter": "auto"},
+        {**PACKED, **MLP},
+        {**MLP, "coarse.prefilter": "auto"},
+    ],
+    ids=["hash_grid", "mlp", "hierarchical"],
+)
+def test_a_run_of_several_sizes_is_trained_and_rendered(tmp_path, settings):
     """Pixels of all sizes are drawn, and what an image shows depends on the size of its pixels."""
     config = smoke_config(max_steps=8, lr_steps=8)
-    config.update_from_flattened_dict({**PACKED, "data.num_scales": 3, "hash_grid.prefilter": "auto"})
+    config.update_from_flattened_dict({**settings, "data.num_scales": 3})
     assert jaxnerf.train_and_evaluate(config, tmp_path / "run")
     run = jaxnerf.restore_run(tmp_path / "run")
-    assert run.experiment.config.hash_grid.prefilter is True and run.experiment.model.needs == ("radius",)
+    assert run.experiment.model.needs == (("length", "radius") if MLP.items() <= settings.items() else ("radius",))
     variables = run.variables(8)
     rays = run.experiment.view_rays(run.experiment.load_split("test"), 0, jaxnerf.pixel_grid(8, 8))
     small, large = (dataclasses.replace(rays, radius=scale * rays.radius) for scale in (1, 4))

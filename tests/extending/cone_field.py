@@ -53,21 +53,6 @@ def make_cone_field(options, box):
     return Field(init, apply)
 
 
-def integrated_encoding(x, viewdirs, radius, length, num_freqs):
-    """Computes the expected positional encoding in the frustum around each sample, [..., S, 6 num_freqs].
-
-    Far from its apex a frustum is nearly a cylinder, whose variance is length^2 / 12 along the ray and radius^2 / 4
-    across it (Eq. 8 of the paper). The expected sin(a x) of a Gaussian is sin(a mean) exp(-a^2 variance / 2), Eq. 14.
-    """
-    squares = viewdirs**2
-    variance = (length**2)[..., None] / 12 * squares + (radius**2)[..., None] / 4 * (1 - squares)
-    sine, cosine, decay, features = jnp.sin(x), jnp.cos(x), jnp.exp(-variance / 2), []
-    for _ in range(num_freqs):
-        features += [decay * sine, decay * cosine]
-        sine, cosine, decay = 2 * sine * cosine, 1 - 2 * sine**2, decay**4  # of the next octave
-    return jnp.concatenate(features, axis=-1)
-
-
 class ConeNetwork(linen.Module):
     """The paper's layers: density from the encoded position, colour from that and the encoded direction."""
 
@@ -79,7 +64,8 @@ class ConeNetwork(linen.Module):
 
     @linen.compact
     def __call__(self, x, viewdirs, radius, length):
-        encoded = hidden = integrated_encoding(x, viewdirs, radius, length, self.num_freqs)
+        variance = jaxnerf.frustum_variance(viewdirs, radius, length)
+        encoded = hidden = jaxnerf.integrated_encoding(x, variance, num_freqs=self.num_freqs, include_input=False)
         for layer in range(self.depth):
             hidden = jax.nn.relu(linen.Dense(self.width)(hidden))
             if layer == self.skip_layer:

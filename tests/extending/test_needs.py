@@ -71,22 +71,6 @@ def render_exactly(rays):
     return jaxnerf.render_rays(None, jaxnerf.still_life, rays, num_samples=384, background=white).rgb
 
 
-def test_the_encoding_is_the_mean_over_the_frustum():
-    """Against the mean of sin and cos over random points of a cylinder around the sample."""
-    rng = np.random.default_rng(0)
-    x, away = np.float32([0.3, -0.2, 0.5]), np.float32([2, -1, 2]) / 3
-    radius, length, count = 0.2, 0.5, 400_000
-    side = np.cross(away, [0.0, 0.0, 1.0])
-    side /= np.linalg.norm(side)
-    turn, out = rng.uniform(0, 2 * np.pi, count), radius * np.sqrt(rng.uniform(0, 1, count))
-    across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(away, side)
-    points = x + rng.uniform(-0.5, 0.5, (count, 1)) * length * away + out[:, None] * across
-    angles = 2.0 ** np.arange(3)[:, None] * points[:, None]
-    want = np.concatenate([np.sin(angles), np.cos(angles)], axis=-1).mean(axis=0).reshape(-1)
-    got = cone_field.integrated_encoding(x[None], away[None], np.float32([radius]), np.float32([length]), 3)
-    np.testing.assert_allclose(got[0], want, atol=0.01)
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("moving")

@@ -7,6 +7,8 @@ import pytest
 
 import oracle
 from helpers import assert_same
+from jaxnerf.core.scene import needs_of
+from jaxnerf.fields.base import contract_field
 from jaxnerf.fields.hash_grid import hash_grid_field
 from jaxnerf.fields.mlp import mlp_field
 
@@ -169,6 +171,80 @@ def test_bfloat16_concerns_the_layers_alone():
 def test_an_unknown_activation_is_named():
     with pytest.raises(ValueError, match="density_activation is 'tanh', expected one of .*relu"):
         mlp_field(density_activation="tanh")
+
+
+# Averages over cones.
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A small network, its twin with prefilter, and parameters that fit both."""
+    options = {"depth": 2, "width": 16, "view_width": 8, "num_freqs": 6}
+    plain, cones = mlp_field(**options), mlp_field(**options, prefilter=True)
+    assert needs_of(plain.apply) == () and needs_of(cones.apply) == ("radius", "length")
+    params = jax.jit(cones.init)(jax.random.key(0))
+    assert_same(params, jax.jit(plain.init)(jax.random.key(0)), rtol=0, atol=0)
+    return plain, cones, jax.tree.map(lambda leaf: leaf + 0.1, params)
+
+
+def extents(shape, radius, length):
+    return {"radius": jnp.full(shape, radius), "length": jnp.full(shape, length)}
+
+
+def test_points_instead_of_cones_are_what_the_plain_network_sees(small):
+    plain, cones, params = small
+    x, viewdirs = inputs()
+    point = jax.jit(cones.apply)(params, x, viewdirs, **extents(x.shape[:-1], 0.0, 0.0))
+    for got, want in zip(point, jax.jit(plain.apply)(params, x, viewdirs), strict=True):
+        np.testing.assert_array_equal(got, want)
+
+
+def test_wide_cones_show_no_waves(small):
+    """What is left is the position itself, so that the result is that of a network without octaves."""
+    _, cones, params = small
+    none = mlp_field(depth=2, width=16, view_width=8, num_freqs=0)
+    kernel = params["trunk_0"]["kernel"]
+    bare = {**params, "trunk_0": {**params["trunk_0"], "kernel": kernel[:3]}}
+    x, viewdirs = inputs()
+    want = none.apply(bare, x, viewdirs)
+    for size in (1e3, jnp.inf):
+        got = jax.jit(cones.apply)(params, x, viewdirs, **extents((6, 1), size, size))
+        assert_same(got, want, rtol=1e-5, atol=1e-5)
+    along = cones.apply(params, x, viewdirs, **extents((6, 1), 0.0, 0.1))
+    across = cones.apply(params, x, viewdirs, **extents((6, 1), 0.1, 0.0))
+    assert min(np.abs(part - want).max() for part, want in zip(along, across, strict=True)) > 1e-3
+
+
+def test_gradients_through_cones_are_finite_at_any_size(small):
+    _, cones, params = small
+    x, viewdirs = inputs()
+
+    @jax.jit
+    def slopes(extent):
+        def total(params, x, radius, length):
+            density, rgb = cones.apply(params, x, viewdirs, radius=radius, length=length)
+            return density.sum() + rgb.sum()
+
+        return jax.grad(total, argnums=(0, 1, 2, 3))(params, x, *extents((6, 4), extent, extent).values())
+
+    for extent in (0.0, 1e-30, 0.1, 1e20, np.inf):
+        found = slopes(extent)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+        assert np.any(found[2]) == np.any(found[3]) == (0 < extent < 1e18)
+
+
+def test_cones_are_smaller_where_space_is_contracted(small):
+    """Far away, an interval of the same contracted length shows the same."""
+    _, cones, params = small
+    field = contract_field(cones, np.full(3, -2.0), np.full(3, 2.0))
+    x, viewdirs = np.float32([[[0.0, 0.0, 1e3]]]), np.float32([[[0.6, 0.0, 0.8]]])
+    far = jax.jit(field.apply)(params, x, viewdirs, **extents((1, 1), 2.0, 2.0))
+    scale = ((2e3 - 1) / 1e9) ** (2 / 3)
+    near = jax.jit(cones.apply)(
+        params, np.float32([[[0.0, 0.0, 2 - 1e-3]]]), viewdirs, **extents((1, 1), 2 * scale, 2 * scale)
+    )
+    assert_same(far, near, rtol=1e-5, atol=1e-5)
+    assert all(np.isfinite(leaf).all() for leaf in field.apply(params, x, viewdirs, **extents((1, 1), np.inf, np.inf)))
 
 
 FIELDS = {

@@ -36,6 +36,8 @@ AUTO_FIELDS = {
     "data.ndc": True,
     "coarse.num_freqs": 7,
     "fine.num_freqs": 7,
+    "coarse.prefilter": True,
+    "fine.prefilter": True,
     "hash_grid.resolutions": (8, 16),
     "hash_grid.table_size": 2**12,
     "hash_grid.width": 32,
@@ -670,9 +672,11 @@ def test_features_are_damped_where_footprints_differ(views, spread, num_scales, 
     focal = np.asarray(views.cameras.focal) / away
     views = dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, focal=focal.astype(np.float32)))
     config = auto_config()
-    config.data.num_scales = num_scales
+    config.data.num_scales, config.fine.prefilter, config.coarse.prefilter = num_scales, "auto", "auto"
+    config.coarse.encode = False
     resolved = resolve(config, views)
-    assert resolved.config.hash_grid.prefilter is (expected == "on")
+    assert resolved.config.hash_grid.prefilter is resolved.config.fine.prefilter is (expected == "on")
+    assert resolved.config.coarse.prefilter is False
     (line,) = (line for line in resolved.lines if line.startswith("prefilter"))
     assert line.startswith(f"prefilter     {expected}: the footprints of pixels differ by a factor of")
 
