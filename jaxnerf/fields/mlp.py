@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.encoding import encode_planes
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
 from jaxnerf.fields.base import Box, Field, apply_network
+from jaxnerf.fields.reflections import HELP, NUM_OUTPUTS, reflection_features
 from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, option
 from jaxnerf.registry import Part
 
@@ -37,6 +38,7 @@ class MlpOptions(Options):
     num_view_freqs: int = option(4, "octaves of the direction's encoding", range=between(0, _MAX_OCTAVES))
     encode: bool = option(True, "whether position and direction have a positional encoding")
     use_viewdirs: bool = option(True, "whether colour depends on the direction")
+    reflections: bool = option(False, HELP)
     density_activation: str = option("relu", "activation of the density", choices=tuple(sorted(DENSITY_ACTIVATIONS)))
     density_bias: float = option(0.0, "added to the density before its activation")
     compute_dtype: str = option(
@@ -53,6 +55,8 @@ class MlpOptions(Options):
     def check(self) -> None:
         if self.compute_dtype == "float64" and not jax.config.jax_enable_x64:
             raise ValueError("compute_dtype is 'float64', which requires the environment's JAX_ENABLE_X64=1")
+        if self.reflections and not self.use_viewdirs:
+            raise ValueError("reflections is True and use_viewdirs False, expected both or neither; correct one")
 
     def bytes_needed(self) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
@@ -69,7 +73,7 @@ def mlp_field(**options: Any) -> Field:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3], key=None, density_noise=0.0)
         returns density [..., S] in 1 / world unit and rgb [..., S, 3] in [0, 1], both float32.
         With a key (one, or one per ray) normal noise of that standard deviation is added to the density
-        before its activation, the paper's regulariser for real scenes.
+        before its activation, the paper's regulariser for real scenes. With reflections the field has normals.
 
     Raises:
         ValueError: if density_activation is unknown.
@@ -89,14 +93,19 @@ def mlp_field(**options: Any) -> Field:
         return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)))["params"]
 
     def apply(params, x, viewdirs, *, key=None, density_noise=0.0):
-        density, rgb = apply_network(network, params, x, viewdirs)
+        density, rgb, *_ = apply_network(network, params, x, viewdirs)
         if key is not None and density_noise:
             density = density + density_noise * normal(key, density.shape)
         return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
 
+    def normals(params, x, viewdirs):
+        return apply_network(network, params, x, viewdirs)[2]
+
     layers = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
     color_layers = ("view",) if network.use_viewdirs else ("rgb",)
-    return Field(init, apply, tuple(f"trunk_{layer}" for layer in layers), color_layers=color_layers)
+    predicted = normals if network.reflections else None
+    input_layers = tuple(f"trunk_{layer}" for layer in layers)
+    return Field(init, apply, input_layers, color_layers=color_layers, normals=predicted)
 
 
 def from_options(options: MlpOptions, box: Box | None) -> Field:
@@ -120,6 +129,7 @@ class MLP(linen.Module):
         num_view_freqs: octaves of the direction's encoding.
         encode: False: position and direction enter without positional encoding.
         use_viewdirs: False: colour depends on position alone; there is no bottleneck and no view layer.
+        reflections: whether colour depends on the reflected direction, too, see `reflection_features`.
         density_activation: "relu" or "softplus".
         density_bias: added to the density before its activation.
         compute_dtype: of the layers; the outputs are at least float32.
@@ -133,6 +143,7 @@ class MLP(linen.Module):
     num_view_freqs: int = 4
     encode: bool = True
     use_viewdirs: bool = True
+    reflections: bool = False
     density_activation: str = "relu"
     density_bias: float = 0.0
     compute_dtype: Any = jnp.float32
@@ -140,8 +151,10 @@ class MLP(linen.Module):
     @linen.compact
     def __call__(
         self, x: Float[ArrayLike, "*batch samples 3"], viewdirs: Float[ArrayLike, "*batch #samples 3"]
-    ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
+    ) -> tuple[Float[Array, "..."], ...]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations.
+
+        With reflections, the predicted normals [..., S, 3] follow.
 
         Arrays inside are [features, N], so that the encoding and all three products of a layer's forward and
         backward pass read memory contiguously. A small network on a CPU gains most from this.
@@ -154,17 +167,21 @@ class MLP(linen.Module):
             inputs = ((encoded,) if joins else ()) + hidden
             hidden = (jax.nn.relu(Dense(self.width, name=f"trunk_{layer}")(*inputs)),)
         dtype = jnp.promote_types(jnp.float32, self.compute_dtype)
-        density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
+        density, normals = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape), ()
         if self.use_viewdirs:
             # The direction is encoded and multiplied once per ray, and broadcast over its samples.
             directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
-            directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
+            directions = (directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1]),)
+            if self.reflections:
+                outputs = Dense(NUM_OUTPUTS, name="reflection")(*hidden).astype(dtype)
+                reflected, *normals = reflection_features(outputs, viewdirs, shape)
+                directions += (reflected.astype(self.compute_dtype).reshape(-1, *shape),)
             bottleneck = Affine(self.width, name="bottleneck")(self.width)
             features = hidden[0].reshape(-1, *shape)
-            view = Dense(self.view_width, name="view")(features, directions, before=bottleneck)
+            view = Dense(self.view_width, name="view")(features, *directions, before=bottleneck)
             hidden = (jax.nn.relu(view).reshape(self.view_width, -1),)
         rgb = Dense(3, name="rgb")(*hidden).astype(dtype)
-        return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
+        return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1), *normals
 
 
 class Affine(linen.Module):
