@@ -12,7 +12,7 @@ from jaxnerf.core.normals import normal_loss
 from jaxnerf.registry import Loss
 
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
-_NORMALS_WEIGHT = 0.1  # where a field predicts normals
+_NORMALS_WEIGHT = 0.01  # where a field predicts normals
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 
 
@@ -55,5 +55,5 @@ NORMALS = Loss(
     weight="auto",
     infer=_weight_of_normals,
     help="squared distance of the normals that a field predicts from those of its density (arXiv:2112.03907, Eq. 10); "
-    "auto: 0.1 where the field predicts normals",
+    "auto: 0.01 where the field predicts normals",
 )
