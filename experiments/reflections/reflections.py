@@ -1,12 +1,13 @@
 """Trains the embedded scene with and without reflections at equal seconds, and measures PSNR and errors of normals.
 
     python experiments/reflections/reflections.py --out=runs/reflections [--finishes=shiny,matt] [--steps=2000]
-        [--factor=1] [--split=test] [--page=docs/results/reflections.md]
+        [--page=docs/results/reflections.md]
 
 A step with reflections takes longer, so that the run without them takes as many steps more: both steps are timed in
 turn, before training. The truth of normals is the closed form at its own median depth. What is compared with it: the
 density's normals by automatic differentiation, those by differences over a step of the ray marching, those through
-the depths of neighbouring pixels, and what the field predicts.
+the depths of neighbouring pixels, and what the field predicts. The views that are held out of
+training are farther from the others than the test views are.
 """
 
 import pathlib
@@ -21,6 +22,7 @@ sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
 from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.normals import density_normals
 from jaxnerf.core.rendering import points_on_rays, render_rays
 from jaxnerf.evaluation import restore
@@ -32,14 +34,13 @@ from jaxnerf.runtime import cli
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs; finished ones are not repeated.", required=True)
 _FINISHES = flags.DEFINE_list("finishes", ["shiny", "matt"], "Finishes of the embedded scene.")
 _STEPS = flags.DEFINE_integer("steps", 2000, "Steps of the runs with reflections.", lower_bound=1)
-_FACTOR = flags.DEFINE_integer("factor", 1, "The images have 100 px a side over this.", lower_bound=1)
-_SPLIT = flags.DEFINE_enum("split", "test", ["test", "held_out"], "The views to score; held_out: to choose settings.")
 _TIMED = flags.DEFINE_integer("timed", 60, "Steps of each kind that are timed.", lower_bound=2)
 _NUM_VIEWS = 3  # whose normals are measured
 _OPAQUE = 0.9  # opacity from which a pixel shows a surface
 _NEAR = 0.05  # world units, between the surface of the run and the true one
 _SAMPLES = 384  # of the closed form, per ray
-_HEADS = ("finish", "reflections", "steps", "ms a step", "PSNR, dB", "density", "differences", "depths", "predicted")
+_HEADS = ("finish", "reflections", "steps", "ms a step", "test views, dB", "held-out views, dB")
+_HEADS += ("density", "differences", "depths", "predicted")
 
 
 def main(argv: list[str]) -> None:
@@ -48,24 +49,33 @@ def main(argv: list[str]) -> None:
     rows = []
     for finish in common.chosen("--finishes", _FINISHES.value, list(FINISHES)):
         configs = {reflects: configuration(finish, reflects) for reflects in (False, True)}
-        folder = pathlib.Path(_OUT.value) / f"{finish}_{_FACTOR.value}_{_STEPS.value}"
+        folder = pathlib.Path(_OUT.value) / f"{finish}_{_STEPS.value}"
         times = step_times(configs, folder / "times.json")
         steps = {True: _STEPS.value, False: round(_STEPS.value * times["on"] / times["off"])}
         for reflects, config in configs.items():
             config = common.changed(config, {f"train.{name}": steps[reflects] for name in ("max_steps", "lr_steps")})
             name = "on" if reflects else "off"
-            results = common.run(config, folder / name, split=_SPLIT.value)
-            errors = normal_errors(folder / name, config)
+            results = common.run(config, folder / name, split="test")
+            run = restore.restore_run(folder / name)
+            scores = results["psnr"], mean_psnr(run, common.load_split(config, "held_out"))
+            errors = normal_errors(run, common.load_split(config, "test"))
             cells = [f"{np.mean(each):.1f} ({np.median(each):.1f})" if len(each) else "" for each in errors]
             rows.append(
-                [finish, name, str(steps[reflects]), f"{1000 * times[name]:.1f}", f"{results['psnr']:.2f}", *cells]
+                [
+                    finish,
+                    name,
+                    str(steps[reflects]),
+                    f"{1000 * times[name]:.1f}",
+                    *(f"{score:.2f}" for score in scores),
+                    *cells,
+                ]
             )
     common.publish([*common.provenance(), "", *common.markdown(_HEADS, rows)], "reflections")
 
 
 def configuration(finish: str, reflects: bool):
     """Returns the config of a run, as of experiments/scene_needs."""
-    data = {"data.format": "synthetic", "data.dir": "", "data.factor": _FACTOR.value, "data.finish": finish}
+    data = {"data.format": "synthetic", "data.dir": "", "data.factor": 1, "data.finish": finish}
     train = {"train.max_seconds": 0.0, "train.save_every": 10**6, "eval.at_end": False}
     return common.configuration(
         "lego_fast", {**data, **train, "data.hold_out": 8, "hash_grid.reflections": reflects, "train.lr_steps": 1000}
@@ -93,10 +103,19 @@ def step_times(configs, path: pathlib.Path) -> dict[str, float]:
     return times
 
 
-def normal_errors(folder: pathlib.Path, config) -> list[np.ndarray]:
+def mean_psnr(run, views) -> float:
+    """Returns the mean PSNR of all views."""
+    variables, found = run.variables(run.steps()[-1]), []
+    for index in range(len(views.size)):
+        pixels = pixel_grid(*(int(side) for side in views.size[index]))
+        image = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
+        found.append(float(psnr(round_to_8_bits(np.clip(image, 0, 1)), views.image(index)[..., :3])))
+    return statistics.fmean(found)
+
+
+def normal_errors(run, views) -> list[np.ndarray]:
     """Returns the angular errors in degrees, [P] for each kind of normals; none of a kind that the run lacks."""
-    run = restore.restore_run(folder)
-    variables, views = run.variables(run.steps()[-1]), common.load_split(config, _SPLIT.value)
+    variables = run.variables(run.steps()[-1])
     model, params = run.experiment.model, variables[0]
     scene, predict = model.scene(*variables), field_normals(model.fields["fine"], params)
     exact = jax.jit(lambda rays: render_rays(None, still_life, rays, num_samples=_SAMPLES, median_depth=True))
