@@ -13,6 +13,7 @@ from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, pixel_radius, p
 from jaxnerf.core.encoding import frustum_variance, integrated_encoding, positional_encoding
 from jaxnerf.core.losses import distortion_loss
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
+from jaxnerf.core.normals import density_normals
 from jaxnerf.core.occupancy.grid import (
     OccupancyGrid,
     create_grid,
@@ -22,6 +23,7 @@ from jaxnerf.core.occupancy.grid import (
 )
 from jaxnerf.core.occupancy.packed import render_packed
 from jaxnerf.core.poses import look_at, se3_exponential, turntable
+from jaxnerf.core.reflections import integrated_directional_encoding
 from jaxnerf.core.rendering import (
     points_on_rays,
     render_hierarchical,
@@ -105,12 +107,13 @@ __all__ = [
     "Rendering", "weights_from_density", "transmittance", "composite", "expected_depth", "expected_disparity",
     "median_depth",
     # renderers
-    "SceneFn", "render_samples", "render_rays", "render_hierarchical", "render_image",
+    "SceneFn", "render_samples", "render_rays", "render_hierarchical", "render_image", "density_normals",
     # occupancy
     "OccupancyGrid", "PackedSamples", "create_grid", "update_grid", "grid_from_scene", "mask_scene",
     "render_packed",
     # encodings, metrics, losses
-    "positional_encoding", "integrated_encoding", "frustum_variance", "mse", "psnr", "ssim", "round_to_8_bits",
+    "positional_encoding", "integrated_encoding", "frustum_variance", "integrated_directional_encoding",
+    "mse", "psnr", "ssim", "round_to_8_bits",
     "distortion_loss",
     # data and fields
     "Views", "SparsePoints", "Batch", "load_dataset", "draw_batch", "mlp_field", "hash_grid_field", "still_life",

@@ -137,6 +137,7 @@ class Facts(NamedTuple):
         contracted: whether the box holds all of space.
         contraction_reason: why.
         sampler: the name of the run's sampler.
+        predicts_normals: whether the run's field predicts normals.
         large_field: whether an update of the field's parameters takes as long as half of a step's rays.
         busy_rays: rays per step that keep the device busy; None: no more than on a CPU.
         batch_size: rays per step; 0 while that is inferred itself.
@@ -156,6 +157,7 @@ class Facts(NamedTuple):
     contracted: bool = False
     contraction_reason: str = ""
     sampler: str = ""
+    predicts_normals: bool = False
     large_field: bool = False
     busy_rays: int | None = None
     batch_size: int = 0

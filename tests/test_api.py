@@ -15,6 +15,8 @@ SURFACE = {
     "positional_encoding": "x | num_freqs include_input=True",
     "integrated_encoding": "x variance | num_freqs include_input=True",
     "frustum_variance": "viewdirs radius length |",
+    "integrated_directional_encoding": "directions roughness | degrees=(1, 2, 4, 8)",
+    "density_normals": "scene x viewdirs | spacing=None **inputs",
     "pixel_grid": "height width | offset=0.5",
     "undistort": "camera pixels |",
     "rays_from_pixels": "camera pixels | near far",

@@ -35,7 +35,15 @@ def view_dependence(config, alpha):
     """Colour does not depend on the view direction."""
     del alpha
     names = _sections(config)
-    return {f"{name}.use_viewdirs": False for name in names if config[name].use_viewdirs}
+    changes = {f"{name}.use_viewdirs": False for name in names if config[name].use_viewdirs}
+    return changes and changes | reflections(config, None)
+
+
+def reflections(config, alpha):
+    """Colour does not depend on the reflected direction."""
+    del alpha
+    names = [name for name in _sections(config) if config[name].reflections]
+    return {f"{name}.reflections": False for name in names} | ({"losses.normals": 0.0} if names else {})
 
 
 def coarse_network(config, alpha):
@@ -111,7 +119,18 @@ def background(config, alpha):
 # that removes the part or makes it smaller; {} where that is impossible.
 PARTS = {
     part.__name__: part
-    for part in (view_dependence, coarse_network, frequencies, width, depth, features, samples, precision, background)
+    for part in (
+        view_dependence,
+        reflections,
+        coarse_network,
+        frequencies,
+        width,
+        depth,
+        features,
+        samples,
+        precision,
+        background,
+    )
 }
 
 _CONFIG = cli.define_config("Config of the complete model: a name, or the path of a file.", required=True)

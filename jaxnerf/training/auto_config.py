@@ -67,6 +67,7 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         for registry, name in ((FIELDS, config.field), (SAMPLERS, config.sampler))
     )
     facts = facts._replace(
+        predicts_normals=getattr(field, "reflections", False),
         large_field=getattr(field, "is_large", False),
         busy_rays=sampler.busy_rays(device) if hasattr(sampler, "busy_rays") else None,
     )

@@ -84,7 +84,7 @@ def build(config: Config) -> Experiment:
     if cameras is not None:
         model = cameras.added_to(model)
     if train.deterministic:
-        model = _in_fixed_order(model, losses, cameras)
+        model, losses = _in_fixed_order(model, losses, cameras)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
     options = {"batching": train.batching, "extras": extras}
@@ -128,7 +128,7 @@ def build(config: Config) -> Experiment:
 
 
 def _in_fixed_order(model, losses, cameras):
-    """Returns a model whose sums have a fixed order."""
+    """Returns a model and losses whose sums have a fixed order."""
     others = {"cameras.exposure or cameras.refine": cameras is not None}
     # The gradient of the depth loss depends on its own sums over rays; those of other losses do not.
     others["losses.depth"] = any(loss.name == "depth" for loss in losses)
@@ -138,7 +138,10 @@ def _in_fixed_order(model, losses, cameras):
             f"train.deterministic is True, and {' and '.join(found)} is on, whose gradient has no fixed order on an "
             "accelerator; set it to False, or turn the other off"
         )
-    return model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view))
+    losses = tuple(
+        loss._replace(function=with_fixed_order(loss.function)) if loss.on == "surfaces" else loss for loss in losses
+    )
+    return model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view)), losses
 
 
 def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) -> Model:

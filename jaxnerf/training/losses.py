@@ -8,9 +8,11 @@ from jaxnerf.core.losses import (
     near_opacity_loss,
     opaque_loss,
 )
+from jaxnerf.core.normals import normal_loss
 from jaxnerf.registry import Loss
 
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
+_NORMALS_WEIGHT = 0.01  # where a field predicts normals
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 
 
@@ -26,6 +28,12 @@ def _weight_of_distortion(facts):
     weight = 0.01 if bounded else 0.001
     where = "a box bounds the scene" if bounded else "the scene is seen as far as it reaches"
     return weight, f"distortion    weight {weight:g}, as {where}"
+
+
+def _weight_of_normals(facts):
+    if not facts.predicts_normals:
+        return 0.0, ""
+    return _NORMALS_WEIGHT, "normals       those that the field predicts are tied to the gradient of its density"
 
 
 MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over all renderings")
@@ -52,4 +60,12 @@ DEPTH_SMOOTHNESS = Loss(
     on="patches",
     help="squared difference of the depths of neighbouring pixels, seen from poses between the training cameras; for "
     "few views (arXiv:2112.00724)",
+)
+NORMALS = Loss(
+    normal_loss,
+    on="surfaces",
+    weight="auto",
+    infer=_weight_of_normals,
+    help="squared distance of the normals that a field predicts from those of its density (arXiv:2112.03907, Eq. 10); "
+    "auto: 0.01 where the field predicts normals",
 )

@@ -9,16 +9,19 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.core.losses import squared_error
+from jaxnerf.core.normals import surface_samples
 from jaxnerf.core.types import Renderings, without_samples
 from jaxnerf.core.views import Views
 from jaxnerf.data import ray_batches
 from jaxnerf.data.active_pixels import PixelRuns
 from jaxnerf.data.patch_rays import in_patches
+from jaxnerf.fields.base import field_normals, field_scene
 from jaxnerf.models.base import Model
 from jaxnerf.training.camera_parameters import CameraParameters, networks
 from jaxnerf.training.dead_networks import count_dead_steps
 from jaxnerf.training.state import PROGRESS, TrainState
 
+_RAYS_PER_SURFACE = 4  # of a batch: a loss of surfaces evaluates the field at one sample of every fourth ray
 _RAYS_PER_PATCH = 64  # of a batch: losses of patches then render a quarter more rays
 
 
@@ -117,10 +120,11 @@ def make_train_step(
     """
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
     patch_losses = [loss for loss in losses if loss.on == "patches"]
+    surface_losses = [loss for loss in losses if loss.on == "surfaces"]
     if patch_losses and patches is None:
         names = ", ".join(loss.name for loss in patch_losses)
         raise ValueError(f"make_train_step: {names} need patches of rays, and patches is None; pass draw_patches")
-    regularizers = [loss for loss in losses if loss.on not in ("renderings", "patches")]
+    regularizers = [loss for loss in losses if loss.on in ("params", "field")]
 
     def progress_at(step, data):
         return {PROGRESS: data.progress.at(step)} if PROGRESS in model.needs else {}
@@ -129,6 +133,7 @@ def make_train_step(
         if cameras is not None:
             batch = cameras.refined_batch(params, batch, views)
         renderings = model.render(keys, {**params, **progress}, grid, batch.rays, step)
+        rendered = renderings
         if cameras is not None:
             renderings = cameras.exposed(params, renderings, batch)
         renderings = Renderings(renderings, model.image_networks)
@@ -139,13 +144,26 @@ def make_train_step(
             return jnp.where(complete, values, 0).sum()
 
         parts = {loss.name: total(loss.function(renderings, batch)) for loss in ray_losses}
-        weighted = sum(_scaled(loss.weight(step), parts[loss.name]) for loss in ray_losses)
+        if surface_losses:
+            parts |= at_surfaces({**params, **progress}, batch.rays, rendered, complete)
+        weighted = sum(_scaled(loss.weight(step), parts[loss.name]) for loss in ray_losses + surface_losses)
         errors = zip(model.image_networks, renderings, strict=True)
         sums = {f"mse_{name}": total(squared_error(rendering, batch)) for name, rendering in errors}
         sums["rays"] = complete.sum(dtype=jnp.int32)
         if len(losses) > 1:
             sums |= {f"loss_{name}": part for name, part in parts.items()}
         return weighted, sums
+
+    def at_surfaces(params, rays, renderings, complete):
+        """Returns the sums of the losses of surfaces, of as many rays as others are summed over."""
+        name = model.image_networks[-1]
+        field = model.fields[name]
+        scene, normals = field_scene(field, params, name), field_normals(field, params, name)
+        samples = surface_samples(scene, rays, renderings[name], every=_RAYS_PER_SURFACE)
+        counted = complete[::_RAYS_PER_SURFACE]
+        scale = complete.size / counted.size
+        values = {loss.name: loss.function(scene, normals, samples) for loss in surface_losses}
+        return {name: scale * jnp.where(counted, value, 0).sum() for name, value in values.items()}
 
     def microbatch(state, data, positions):
         keys, batch = draw(state.step, positions, data)

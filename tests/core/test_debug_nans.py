@@ -203,6 +203,10 @@ def to_world_t(t):
     return jaxnerf.ndc_to_t(t, made)
 
 
+def normals_of(scene, x, **options):
+    return jaxnerf.density_normals(scene, x, jnp.ones((2, 1, 3)) / 3**0.5, **options)
+
+
 def field(make, **options):
     made = make(**options)
     params = made.init(KEY)
@@ -266,6 +270,11 @@ def cases():
             lambda *of: jaxnerf.median_depth(*of[:4], far=of[4], rule="points"),
             (density, delta, t, delta, jnp.full(3, jnp.inf))),
         "positional_encoding": (functools.partial(jaxnerf.positional_encoding, num_freqs=4), (small,)),
+        "integrated_directional_encoding": (
+            jaxnerf.integrated_directional_encoding, (small, jnp.zeros((2, 5)).at[0].set(jnp.inf))),
+        "density_normals": (functools.partial(normals_of, scene), (small,)),
+        "density_normals differences": (functools.partial(normals_of, solid_scene, spacing=0.1), (small,)),
+        "density_normals empty": (functools.partial(normals_of, empty_scene, spacing=0.1), (small,)),
         "positional_encoding at 0": (functools.partial(jaxnerf.positional_encoding, num_freqs=20), (small * 0,)),
         "integrated_encoding": (functools.partial(jaxnerf.integrated_encoding, num_freqs=4), (small, small**2)),
         "integrated_encoding over all": (
@@ -284,6 +293,10 @@ def cases():
         "mlp_field": field(jaxnerf.mlp_field, depth=2, width=16),
         "hash_grid_field": field(
             jaxnerf.hash_grid_field, lower=(-1, -1, -1), upper=(1, 1, 1), table_size=1024, resolutions=(4, 16)),
+        "mlp_field reflections": field(jaxnerf.mlp_field, depth=2, width=16, reflections=True),
+        "hash_grid_field reflections": field(
+            jaxnerf.hash_grid_field, lower=(-1, -1, -1), upper=(1, 1, 1), table_size=1024, resolutions=(4, 16),
+            reflections=True),
         "create_grid": (lambda density: jaxnerf.create_grid(
             jnp.zeros(3), jnp.ones(3), jnp.ones((2, 2, 2), bool), initial_density=density), (numbers((2, 2, 2)),)),
         "render_image": of_rays(render_in_chunks, "soft", rays()),

@@ -100,6 +100,7 @@ def test_a_loss_of_weight_0_is_absent_from_the_step(packed):
 
     alone = text({"mse": 1.0})
     names = ("distortion", "depth", "opaque", "hash_decay", "total_variation", "depth_smoothness", "near_opacity")
+    names += ("normals",)
     assert text({"mse": 1.0, **dict.fromkeys(names, 0.0)}) == alone
     assert len(text({"mse": 1.0, "distortion": 0.1})) > len(alone)
 
@@ -124,6 +125,29 @@ def test_a_regularizer_adds_its_gradient():
     assert row["loss"] == pytest.approx(row["loss_mse"] + 0.25 * row["loss_half_squares"], rel=1e-5)
     for without, with_it, value in zip(*map(jax.tree.leaves, (plain.params, decayed.params, start)), strict=True):
         np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.25 * value, atol=1e-6)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_loss_of_surfaces_evaluates_the_field_at_every_fourth_ray(packed):
+    seen = {}
+
+    def log_density(scene, normals, samples):
+        seen.update(x=samples.x.shape, normals=normals)
+        return jnp.log(scene(samples.x, samples.viewdirs)[0][:, 0])
+
+    jaxnerf.register_loss("log_density", log_density, on="surfaces")
+    plain, _ = train({"mse": 1.0}, packed=packed)
+    moved, (row,) = train({"mse": 1.0, "log_density": 0.5}, packed=packed)
+    assert seen == {"x": (RAYS // 4, 1, 3), "normals": None}
+    assert row["loss"] == pytest.approx(row["mse_fine"] + 0.5 * row["loss_log_density"], rel=1e-5)
+    # The logarithm of the blob's density grows with its parameter by 1 at each sample.
+    without, with_it = (state.params["fine"]["log_density"] for state in (plain, moved))
+    np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.5, atol=1e-5)
+
+
+def test_a_loss_of_normals_needs_a_field_that_predicts_them():
+    with pytest.raises(ValueError, match="normals is None, expected those that the field predicts"):
+        train({"mse": 1.0, "normals": 0.1})
 
 
 @pytest.mark.parametrize("packed", [False, pytest.param(True, marks=pytest.mark.extra)])
