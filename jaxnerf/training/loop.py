@@ -305,6 +305,7 @@ def _run_all(experiments, all_views, folders, *, preview=None, observe=None):
                 runs.check_finite(rows)
             if save:
                 with clock.paused(), stages.stage("saving the checkpoint"):
+                    memory.release()
                     runs.save(state)
                     memory.release()
             if last:
