@@ -45,7 +45,8 @@ class Checkpoints:
         if step not in self.steps():
             try:
                 _silence_orbax()
-                self._open().save(step, state, force=True, custom_metadata={_FINGERPRINT: _fingerprint(state)})
+                with _one_array_at_a_time(state):
+                    self._open().save(step, state, force=True, custom_metadata={_FINGERPRINT: _fingerprint(state)})
             except Exception as error:  # orbax raises many kinds
                 raise ValueError(
                     f"{self._folder / str(step)}: cannot be written ({_reason(error)}); free disk space and "
@@ -140,6 +141,14 @@ class Checkpoints:
 
 def _fingerprint(state):
     return fingerprint(jax.tree.map(np.asarray, state))
+
+
+def _one_array_at_a_time(state):
+    """Returns the context in which orbax has copies of arrays of no more bytes than the largest one has."""
+    context = ocp.Context()
+    # Strictly less than this.
+    context.memory.write_concurrent_bytes = 1 + max(leaf.nbytes for leaf in jax.tree.leaves(state))
+    return context
 
 
 @functools.cache

@@ -115,6 +115,7 @@ def _train_all(configs, folders, views=None, *, preview=None, at_end=None, obser
             )
         processes.print_once(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
         finished = _run_all(experiments, all_views, folders, preview=preview, observe=observe)
+        memory.release()
         return finished and (at_end is None or at_end(views))
 
 
@@ -305,6 +306,7 @@ def _run_all(experiments, all_views, folders, *, preview=None, observe=None):
                 runs.check_finite(rows)
             if save:
                 with clock.paused(), stages.stage("saving the checkpoint"):
+                    memory.release()
                     runs.save(state)
                     memory.release()
             if last:
