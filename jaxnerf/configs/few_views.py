@@ -9,6 +9,5 @@ def get_config():
     config.hash_grid.table_size = 2**17  # so few pixels do not fill larger ones, which train longer
     config.losses.total_variation, config.losses.depth_smoothness, config.losses.near_opacity = 1.0, 0.1, 0.1
     config.losses.distortion = "auto"
-    config.occupancy.cpu_pool_samples_per_ray, config.train.cpu_batch_size = 5.0, 1024  # as in lego_fast.py
     config.train.max_seconds = 180.0
     return config

@@ -190,6 +190,9 @@ def test_auto_removes_as_many_cells_as_training_rays_allow(tmp_path, monkeypatch
     _, found = cleaned(run, tmp_path).variables(5)
     assert np.asarray(found.occupied).all(axis=(1, 2)).tolist() == [True] * 6 + [False] * 2
     assert "25.0 % of the occupied cells are more uncertain than 0.75" in capsys.readouterr().err
+    everywhere = Estimate(None, "fixed", lambda x: jnp.full(x.shape[:-1], 1.0 + 1e-6))
+    monkeypatch.setitem(ESTIMATORS._parts, "laplace", lambda source: everywhere)
+    assert cleaned(run, tmp_path).variables(5)[1] is grid and "no cell is removed" in capsys.readouterr().err
 
 
 def test_cleaning_is_off_by_default_and_needs_a_grid(tmp_path):

@@ -21,7 +21,7 @@ from jaxnerf.registry import ESTIMATORS
 from jaxnerf.runtime import atomic_files
 
 ESTIMATOR = "laplace"  # whose estimate is a function of position
-_LIMITS = (1.0, 0.99, 0.97, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5)  # that "auto" tries
+_LIMITS = (0.99, 0.97, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5)  # that "auto" tries
 _MOST_LOSS = 0.02  # dB, that "auto" may cost
 _NUM_RAYS = 2**14  # by which "auto" measures it
 _LEAST_ERROR = 1 / (12 * 255**2)  # mean square of rounding to 8 bits
@@ -62,6 +62,9 @@ def cleaned(run: TrainedRun, workdir: str | os.PathLike) -> TrainedRun:
             estimate = ESTIMATORS.get(ESTIMATOR)(source)
         uncertainty = jax.jit(lambda planes: jax.lax.map(estimate.uncertainty_at, planes))(cell_centers(grid))
         used = _lowest_limit(source, uncertainty) if is_auto(limit) else limit
+        if used == 1:
+            _say("no limit leaves the PSNR of training rays as it is, and no cell is removed")
+            return params, grid
         found = _without(grid, uncertainty > used)
         removed = 1 - float(found.occupied.sum()) / max(float(grid.occupied.sum()), 1)
         _say(f"{100 * removed:.1f} % of the occupied cells are more uncertain than {used:g}, and removed")
@@ -71,19 +74,23 @@ def cleaned(run: TrainedRun, workdir: str | os.PathLike) -> TrainedRun:
 
 
 def _lowest_limit(source, uncertainty):
-    """Returns the lowest of `_LIMITS` up to which no limit costs training rays more than _MOST_LOSS dB of PSNR."""
+    """Returns the lowest of `_LIMITS` down to which none costs training rays more than _MOST_LOSS dB of PSNR; 1: none.
+
+    Rays through masked pixels count, too.
+    """
     run, (params, grid) = source.run, source.variables
     given, positions = run.experiment.config.data, jnp.arange(_NUM_RAYS)
     options = {"pixel_offset": given.pixel_offset, "ndc": given.ndc, "needs": run.experiment.model.needs}
     draw = jax.jit(functools.partial(draw_batch, **options))
     batch = draw(np.uint32(0), jnp.int32(0), positions, dataclasses.replace(source.views, mask=None, sparse=None))[1]
 
-    def error(limit):
-        rgb = run.render_image((params, _without(grid, uncertainty > limit)), batch.rays).rgb
+    def error(grid):
+        rgb = run.render_image((params, grid), batch.rays).rgb
         return float(((rgb - batch.rgb) ** 2).mean())
 
-    most = max(error(1.0), _LEAST_ERROR) * 10 ** (_MOST_LOSS / 10)
-    return list(itertools.takewhile(lambda limit: limit == 1 or error(limit) <= most, _LIMITS))[-1]
+    most = max(error(grid), _LEAST_ERROR) * 10 ** (_MOST_LOSS / 10)
+    held = itertools.takewhile(lambda limit: error(_without(grid, uncertainty > limit)) <= most, _LIMITS)
+    return min(held, default=1.0)
 
 
 def _without(grid, removed):
