@@ -1,6 +1,6 @@
 """Moves a camera away from a trained scene and measures how much the frames flicker.
 
-    python experiments/multiscale/zoom.py --workdirs=DIR,... [--page=docs/results/multiscale.md]
+    python experiments/multiscale/zoom.py --workdir=DIR,... [--page=docs/results/multiscale.md]
 
 The camera starts at the first training view, and its distance grows to --times as much in equal ratios. Frames are
 rendered with one ray a pixel, with as many as `jaxnerf-render` takes, and with up to 256, the reference. Flicker is
@@ -25,7 +25,7 @@ from jaxnerf.evaluation.output_images import to_8_bits, write_image
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.runtime import cli
 
-_WORKDIRS = flags.DEFINE_list("workdirs", None, "The runs.", required=True)
+_WORKDIRS = flags.DEFINE_list("workdir", None, "The runs.", required=True)
 _FRAMES = flags.DEFINE_integer("frames", 60, "Frames.", lower_bound=2)
 _TIMES = flags.DEFINE_float("times", 8.0, "The last distance over the first.", lower_bound=1.0)
 _CROP = flags.DEFINE_float(
@@ -35,8 +35,8 @@ _CROP = flags.DEFINE_float(
     lower_bound=0.01,
     upper_bound=1.0,
 )
-_IMAGES = flags.DEFINE_string(
-    "images", "", "Folder of a PNG of each run: every tenth frame, a row for each number of rays."
+_IMAGE = flags.DEFINE_string(
+    "image", "", "A PNG to write, its name before that of the run: every tenth frame, a row for each number of rays."
 )
 _LIMITS = {"1": 1, "as jaxnerf-render": supersampling.MAX_RAYS, "reference": 256}
 
@@ -72,11 +72,10 @@ def measure(workdir: pathlib.Path) -> list[tuple[str, ...]]:
         psnr = -10 * np.log10(np.mean((video - exact) ** 2, axis=(1, 2, 3)).clip(1e-10))
         row = (f"{255 * flicker(video, exact):.2f}", f"{psnr.min():.1f}", f"{seconds[name] / len(video):.3f}")
         rows.append((workdir.parent.name, name, *row))
-    if _IMAGES.value:
+    if _IMAGE.value:
         strips = [np.concatenate(video[::10], axis=1) for video in (*videos.values(), exact)]
-        folder = pathlib.Path(_IMAGES.value)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_image(folder / f"{workdir.parent.name}.png", to_8_bits(np.concatenate(strips)))
+        path = pathlib.Path(_IMAGE.value)
+        write_image(path.with_stem(f"{path.stem}_{workdir.parent.name}"), to_8_bits(np.concatenate(strips)))
     return rows
 
 
