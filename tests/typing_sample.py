@@ -110,7 +110,9 @@ def losses_and_metrics(rays: jaxnerf.Rays, rendering: jaxnerf.Rendering) -> Arra
     loss = jaxnerf.distortion_loss([rendering], batch)
     image = jaxnerf.round_to_8_bits(rendering.rgb)
     scores = jaxnerf.mse(image, image) + jaxnerf.psnr(image, image) + jaxnerf.ssim(image, image)
-    return loss.mean() + scores + jaxnerf.positional_encoding(rendering.rgb, num_freqs=4).mean()
+    normals: Array = jaxnerf.density_normals(jaxnerf.still_life, rendering.rgb[None], rendering.rgb[None], spacing=0.01)
+    lobes: Array = jaxnerf.integrated_directional_encoding(normals, normals[..., 0], degrees=(1, 2))
+    return loss.mean() + scores + lobes.mean() + jaxnerf.positional_encoding(rendering.rgb, num_freqs=4).mean()
 
 
 def fields_and_data(folder: str) -> jaxnerf.Views:
