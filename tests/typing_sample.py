@@ -112,7 +112,10 @@ def losses_and_metrics(rays: jaxnerf.Rays, rendering: jaxnerf.Rendering) -> Arra
     scores = jaxnerf.mse(image, image) + jaxnerf.psnr(image, image) + jaxnerf.ssim(image, image)
     variance = jaxnerf.frustum_variance(rendering.rgb, rendering.depth, rendering.opacity)
     mean = jaxnerf.integrated_encoding(rendering.rgb, variance, num_freqs=4).mean()
-    return loss.mean() + scores + mean + jaxnerf.positional_encoding(rendering.rgb, num_freqs=4).mean()
+    normals: Array = jaxnerf.density_normals(jaxnerf.still_life, rendering.rgb[None], rendering.rgb[None], spacing=0.01)
+    lobes: Array = jaxnerf.integrated_directional_encoding(normals, normals[..., 0], degrees=(1, 2))
+    encoded = jaxnerf.positional_encoding(rendering.rgb, num_freqs=4).mean() + lobes.mean() + mean
+    return loss.mean() + scores + encoded
 
 
 def fields_and_data(folder: str) -> jaxnerf.Views:

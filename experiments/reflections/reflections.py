@@ -1,7 +1,7 @@
 """Trains the embedded scene with and without reflections at equal seconds, and measures PSNR and errors of normals.
 
     python experiments/reflections/reflections.py --out=runs/reflections [--finishes=shiny,matt] [--steps=2000]
-        [--page=docs/results/reflections.md]
+        [--page=docs/results/reflections.md --table=reflections]
 
 A step with reflections takes longer, so that the run without them takes as many steps more: both steps are timed in
 turn, before training. The truth of normals is the closed form at its own median depth. What is compared with it: the
@@ -34,6 +34,7 @@ from jaxnerf.runtime import cli
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs; finished ones are not repeated.", required=True)
 _FINISHES = flags.DEFINE_list("finishes", ["shiny", "matt"], "Finishes of the embedded scene.")
 _STEPS = flags.DEFINE_integer("steps", 2000, "Steps of the runs with reflections.", lower_bound=1)
+_TABLE = flags.DEFINE_string("table", "reflections", "Name of the table in the marks of --page.")
 _TIMED = flags.DEFINE_integer("timed", 60, "Steps of each kind that are timed.", lower_bound=2)
 _NUM_VIEWS = 3  # whose normals are measured
 _OPAQUE = 0.9  # opacity from which a pixel shows a surface
@@ -70,7 +71,7 @@ def main(argv: list[str]) -> None:
                     *cells,
                 ]
             )
-    common.publish([*common.provenance(), "", *common.markdown(_HEADS, rows)], "reflections")
+    common.publish([*common.provenance(), "", *common.markdown(_HEADS, rows)], _TABLE.value)
 
 
 def configuration(finish: str, reflects: bool):

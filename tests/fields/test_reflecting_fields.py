@@ -30,6 +30,11 @@ def inside(shape, seed=2):
     return np.random.default_rng(seed).uniform(-0.9, 0.9, size=(*shape, 3)).astype(np.float32)
 
 
+def random_params(field):
+    rng, shapes = np.random.default_rng(3), jax.eval_shape(field.init, jax.random.key(0))
+    return jax.tree.map(lambda leaf: np.float32(rng.normal(scale=0.3, size=leaf.shape)), shapes)
+
+
 def test_colour_reads_the_encoded_reflection_and_the_cosine():
     outputs = np.random.default_rng(0).normal(size=(4, 6)).astype(np.float32)
     view = directions((2, 1))
@@ -59,15 +64,12 @@ def test_normals_of_zero_and_grazing_rays_have_gradients():
 @pytest.mark.parametrize("name", MAKE)
 def test_a_field_predicts_unit_normals_and_its_colour_depends_on_them(name):
     field = MAKE[name](reflections=True)
-    rng = np.random.default_rng(3)
-    shapes = jax.eval_shape(field.init, jax.random.key(0))
-    params = jax.tree.map(lambda leaf: np.float32(rng.normal(scale=0.3, size=leaf.shape)), shapes)
+    params = random_params(field)
     x, view = inside((2, 5)), directions((2, 1))
     normals = compiled(field.normals)(params, x, view)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), np.ones((2, 5)), atol=1e-6)
     gradient = jax.jit(jax.grad(lambda params: field.apply(params, x, view)[1].sum()))(params)
     layer, rows = ("density", slice(16, None)) if name == "hash_grid" else ("reflection", slice(None))
-    assert np.abs(gradient[layer]["kernel"][:, rows]).min(axis=0).max() >= 0
     assert (np.abs(gradient[layer]["kernel"][:, rows]).sum(axis=0) > 0).all()
 
 
@@ -83,7 +85,7 @@ def test_without_reflections_there_are_no_parameters_for_them(name):
 
 def test_normals_of_a_contracted_field_are_those_at_the_contracted_position():
     field = MAKE["hash_grid"](reflections=True)
-    params = jax.jit(field.init)(jax.random.key(0))
+    params = random_params(field)
     contracted = contract_field(field, BOX["lower"], BOX["upper"])
     x, view = jnp.array([[[0.1, -0.2, 0.3], [0.0, 2.0, 0.0]]]), directions((1, 1))
     # Twice as far as the sphere of half the box, a position is three quarters of the way to its end.
