@@ -48,12 +48,6 @@ RUNS = {
     "lego_400": ["--config=lego_fast", "--config.data.factor=2", "--config.train.max_seconds=90"],
     "fox": ["--config=capture", "--data_dir=fox", "--config.train.max_seconds=120"],
     "can": ["--config=capture", "--data_dir=can", "--config.train.max_seconds=60"],
-    # Pages of less than 2 MB, for the gallery.
-    "demo_small": ["--config=quickstart", "--config.hash_grid.table_size=131072"],
-    "fox_small": [
-        *("--config=capture", "--data_dir=fox"),
-        *("--config.hash_grid.table_size=131072", "--config.train.max_seconds=120"),
-    ],
 }
 FOLDER = pathlib.Path("runs/web")
 
