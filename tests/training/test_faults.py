@@ -261,10 +261,10 @@ def test_signal_during_evaluation_keeps_the_checkpoints(folder, monkeypatch, cap
     config = smoke_config()
     config.eval.at_end = True
 
-    def interrupt(folder, shard):
+    def interrupt(run, folder, shard):
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(evaluate, "evaluate", interrupt)
+    monkeypatch.setattr(evaluate, "score_run", interrupt)
     assert not train_and_evaluate(config, folder)
     assert capsys.readouterr().err.splitlines()[-1].startswith("stopped while scoring; the checkpoints are saved")
     (folder / "eval" / "20").mkdir(parents=True)
