@@ -15,6 +15,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.state import TrainState
 
 _FINGERPRINT = "fingerprint"
+_SMALL = 2**25  # bytes of arrays that are copied at once in any case
 
 
 class Checkpoints:
@@ -144,10 +145,13 @@ def _fingerprint(state):
 
 
 def _one_array_at_a_time(state):
-    """Returns the context in which orbax has copies of arrays of no more bytes than the largest one has."""
+    """Returns the context in which orbax has copies of arrays of no more bytes than the largest one has.
+
+    Small states are written at once: one array after another takes more space on the disk.
+    """
     context = ocp.Context()
     # Strictly less than this.
-    context.memory.write_concurrent_bytes = 1 + max(leaf.nbytes for leaf in jax.tree.leaves(state))
+    context.memory.write_concurrent_bytes = 1 + max(_SMALL, *(leaf.nbytes for leaf in jax.tree.leaves(state)))
     return context
 
 
