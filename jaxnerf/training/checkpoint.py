@@ -1,5 +1,6 @@
 """Checkpoints: complete or absent, verified by a fingerprint, the last few kept (orbax v1)."""
 
+import contextlib
 import functools
 import os
 import pathlib
@@ -15,7 +16,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.state import TrainState
 
 _FINGERPRINT = "fingerprint"
-_SMALL = 2**25  # bytes of arrays that are copied at once in any case
+_SMALL = 2**25  # bytes of a state that is copied at once
 
 
 class Checkpoints:
@@ -147,11 +148,13 @@ def _fingerprint(state):
 def _one_array_at_a_time(state):
     """Returns the context in which orbax has copies of arrays of no more bytes than the largest one has.
 
-    Small states are written at once: one array after another takes more space on the disk.
+    A small state is written at once, as one array after another takes a third more of the disk.
     """
+    sizes = [leaf.nbytes for leaf in jax.tree.leaves(state)]
+    if sum(sizes) <= _SMALL:
+        return contextlib.nullcontext()
     context = ocp.Context()
-    # Strictly less than this.
-    context.memory.write_concurrent_bytes = 1 + max(_SMALL, *(leaf.nbytes for leaf in jax.tree.leaves(state)))
+    context.memory.write_concurrent_bytes = 1 + max(sizes)  # strictly less than this
     return context
 
 
