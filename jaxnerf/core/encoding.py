@@ -69,7 +69,8 @@ def integrated_encoding(
     Args:
         x: [..., D] means, any unit.
         variance: [..., D] of each coordinate, in the square of that unit, at least 0.
-        num_freqs, include_input: see `positional_encoding`.
+        num_freqs: see `positional_encoding`.
+        include_input: see `positional_encoding`.
 
     Returns:
         [..., D (1 + 2F)] or [..., D 2F], ordered as in `positional_encoding`, which it equals exactly where the
