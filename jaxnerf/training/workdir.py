@@ -27,11 +27,11 @@ _FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training w
 # Options that the config.json of an older version may lack though training depends on them, and what it did instead.
 _ADDED = {
     "coarse.prefilter": False,
+    "coarse.reflections": False,
     "data.background_color": (),
     "data.num_scales": 1,
     "data.up": "",
     "data.view_indices": (),
-    "coarse.reflections": False,
     "fine.prefilter": False,
     "fine.reflections": False,
     "hash_grid.prefilter": False,

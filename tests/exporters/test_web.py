@@ -1,6 +1,6 @@
 """The export "web": what its textures hold is what the field computes, and what the page cannot render is refused.
 
-tests/slow/web_in_browser.py and experiments/web/web.py draw pages in a browser.
+test_web_in_browser.py and experiments/web/web.py draw pages in a browser.
 """
 
 import gzip
@@ -165,6 +165,7 @@ def test_parameters_that_are_not_finite_are_refused():
         ({"field": "mlp"}, (), "web: field is 'mlp', expected 'hash_grid'"),
         ({"sampler": "hierarchical"}, (), "web: sampler is 'hierarchical', expected 'occupancy'"),
         ({"data.ndc": True}, (), "web: data.ndc is True"),
+        ({"hash_grid.reflections": True}, (), "web: hash_grid.reflections is True"),
         ({}, ("time",), "web: the field asks for time, expected position and direction"),
     ],
 )

@@ -93,6 +93,15 @@ def test_normals_of_a_contracted_field_are_those_at_the_contracted_position():
     np.testing.assert_allclose(jax.jit(contracted.normals)(params, x, view), expected, atol=1e-6)
 
 
+def test_normals_of_cones_without_extent_are_those_of_points():
+    plain, cones = MAKE["mlp"](reflections=True), MAKE["mlp"](reflections=True, prefilter=True)
+    params, x, view = random_params(plain), inside((2, 5)), directions((2, 1))
+    normals = [jax.jit(cones.normals)(params, x, view, radius=size, length=size) for size in (0.0, 0.5)]
+    expected = jax.jit(plain.normals)(params, x, view)
+    np.testing.assert_allclose(normals[0], expected, atol=1e-6)
+    assert np.abs(normals[1] - expected).max() > 0.01
+
+
 @pytest.mark.parametrize("options", [HashGridOptions, MlpOptions])
 def test_reflections_without_view_directions_are_refused(options):
     with pytest.raises(ValueError, match="reflections is True and use_viewdirs False"):
