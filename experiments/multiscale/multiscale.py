@@ -63,31 +63,31 @@ _MOMENTS = 3  # checkpoints of a run, all scored
 
 
 def main(argv: list[str]) -> None:
-    """Trains, scores and prints both tables."""
+    """Trains, scores and prints the tables of each scene."""
     del argv
-    quality, forced = [], []
+    size = f"{800 // _FACTOR.value} px, {_STEPS.value} steps, {_NUM_VIEWS.value} {_SPLIT.value} views"
     usual = {scale: min(scale, _LIMIT) for scale in _SCALES}
     for scene in _SCENES.value:
+        quality, forced = [], []
         for name, settings in _VARIANTS[_CONFIG.value].items():
             folder = f"{_CONFIG.value}_{scene}_{name.replace(' ', '_').replace(',', '')}"
             scores = measure(scene, settings, pathlib.Path(_OUT.value) / folder)["scores"]
-            quality.append([scene, name, *(f"{scores[f'{scale}x1']['psnr']:.2f}" for scale in _SCALES)])
+            quality.append([name, *(f"{scores[f'{scale}x1']['psnr']:.2f}" for scale in _SCALES)])
             if not settings:
-                forced += [supersampled(scene, str(side**2), dict.fromkeys(_SCALES, side), scores) for side in _SCALES]
-                forced.append(supersampled(scene, "as jaxnerf-render", usual, scores))
-    size = f"{800 // _FACTOR.value} px, {_STEPS.value} steps, {_NUM_VIEWS.value} test views"
-    lines = [*common.provenance(), "", f"PSNR in dB, one ray a pixel; {size}:", ""]
-    lines += common.markdown(("scene", "trained on", *_NAMES), quality)
-    lines += ["", "Supersampling of the runs trained at full size: PSNR in dB, and in brackets seconds a frame.", ""]
-    lines += common.markdown(("scene", "rays a pixel", *_NAMES), forced)
-    common.publish(lines, "scales" if _CONFIG.value == "lego_fast" else f"scales of {_CONFIG.value}")
+                forced += [supersampled(str(side**2), dict.fromkeys(_SCALES, side), scores) for side in _SCALES]
+                forced.append(supersampled("as jaxnerf-render", usual, scores))
+        lines = [*common.provenance(), "", f"{scene}, PSNR in dB, one ray a pixel; {size}:", ""]
+        lines += common.markdown(("trained on", *_NAMES), quality)
+        lines += ["", "Supersampling of the run trained at full size: PSNR in dB, and in brackets seconds a frame.", ""]
+        lines += common.markdown(("rays a pixel", *_NAMES), forced)
+        common.publish(lines, f"scales of {_CONFIG.value} on {scene}")
 
 
-def supersampled(scene: str, name: str, sides: dict[int, int], scores: dict[str, Any]) -> list[str]:
+def supersampled(name: str, sides: dict[int, int], scores: dict[str, Any]) -> list[str]:
     """Returns the row of a table with so many rays along a pixel's side, by scale; "-" where none were rendered."""
     cells = [scores.get(f"{scale}x{side}") for scale, side in sides.items()]
     shown = [f"{cell['psnr']:.2f} ({cell['seconds']:.3f})" if cell else "-" for cell in cells]
-    return [scene, name, *shown]
+    return [name, *shown]
 
 
 def measure(scene: str, settings: dict[str, Any], folder: pathlib.Path) -> dict[str, Any]:
