@@ -66,7 +66,7 @@ def config_of(scene: str, indices: list[int], seed: int):
     if scene == "lego":
         config = common.configuration("lego_fast", _LEGO, seed=seed)
     else:
-        config = common.changed(_resolved_room(), {"cameras.num_images": "auto", "seed": seed})
+        config = common.changed(_resolved_capture(), {"cameras.num_images": "auto", "seed": seed})
     steps = _STEPS.value
     common_fields = {"train.max_steps": steps, "train.lr_steps": steps, "train.save_every": steps}
     more = {"data.view_indices": tuple(indices), "train.max_seconds": 0.0, "train.preview_every": 0.0}
@@ -74,7 +74,7 @@ def config_of(scene: str, indices: list[int], seed: int):
 
 
 @functools.cache
-def _resolved_room():
+def _resolved_capture():
     """Returns the config of a run with all images of the room: its box, and what depends on it."""
     config = common.configuration("capture", {"data.dir": _CAPTURE.value})
     return auto_config.resolve(config, common.load_split(config, "train"))[0]
