@@ -14,6 +14,7 @@ a time, and a run is trained from scratch on all that it has:
 No method sees the images before it adds them. Finished runs in --out are not repeated.
 """
 
+import functools
 import pathlib
 import statistics
 import sys
@@ -33,6 +34,7 @@ from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.next_images.coverage import ViewCoverage, choose_views
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.runtime import cli
+from jaxnerf.training import auto_config
 
 _SCENES = flags.DEFINE_list("scenes", ["lego"], "lego, room.")
 _CAPTURE = flags.DEFINE_string("room", "runs/room", "Folder that experiments/room/make_room.py wrote.")
@@ -46,7 +48,7 @@ _OUT = flags.DEFINE_string("out", "runs/next_images", "Folder of the runs.")
 METHODS = ("coverage", "random", "farthest")
 BASE = ("random", "farthest")
 _MOST_TEST_VIEWS = 25
-# Of runs with all images, so that no program depends on which images there are.
+# Of runs with all images, as those of the room below, so that no program depends on which images there are.
 _LEGO = {
     "occupancy.lower": (-0.771, -1.2698, -0.6803),
     "occupancy.upper": (0.771, 1.2698, 1.1338),
@@ -64,11 +66,18 @@ def config_of(scene: str, indices: list[int], seed: int):
     if scene == "lego":
         config = common.configuration("lego_fast", _LEGO, seed=seed)
     else:
-        config = common.configuration("capture", {"data.dir": _CAPTURE.value}, seed=seed)
+        config = common.changed(_resolved_capture(), {"cameras.num_images": "auto", "seed": seed})
     steps = _STEPS.value
     common_fields = {"train.max_steps": steps, "train.lr_steps": steps, "train.save_every": steps}
     more = {"data.view_indices": tuple(indices), "train.max_seconds": 0.0, "train.preview_every": 0.0}
     return common.changed(config, {**common_fields, **more, "eval.at_end": False, "eval.summary_seconds": 0.0})
+
+
+@functools.cache
+def _resolved_capture():
+    """Returns the config of a run with all images of the room: its box, and what depends on it."""
+    config = common.configuration("capture", {"data.dir": _CAPTURE.value})
+    return auto_config.resolve(config, common.load_split(config, "train"))[0]
 
 
 def psnr_of(run, variables, views: Views) -> float:

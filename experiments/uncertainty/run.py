@@ -52,14 +52,17 @@ def main(argv: list[str]) -> None:
     folder, rows, levels, times = pathlib.Path(_FOLDER.value), [], [], []
     scenes = common.chosen("--scenes", _SCENES.value, SCENES)
     for scene in scenes:
-        workdir, members = runs.trained(scene, folder), runs.members_of(scene, folder)
+        workdir, members, every = runs.trained(scene, folder), runs.members_of(scene, folder), {}
         for place, name, found, psnr in measure(workdir, members, SCENES[scene]):
             covered = ["-", "-"]
             if "coverage" in found:
                 covered = [f"{100 * found['coverage']:.1f}", f"{found['interval']:.4f}"]
-                levels.append([place, str(len(psnr)), name, *_compared(np.array(psnr))])
+                levels.append([place, str(len(psnr)), name, *_compared(psnr)])
+                every.setdefault(name, []).extend(psnr)
             keys = ("ause_rmse", "ause_mae", "ause_rmse_object", "ause_mae_object")
             rows.append([place, name, *covered, *(f"{found[key]:.3f}" if key in found else "-" for key in keys)])
+        if len(SCENES[scene]) > 1:
+            levels += [[f"{scene}, all", str(len(psnr)), name, *_compared(psnr)] for name, psnr in every.items()]
         training, seconds = runs.training_seconds(workdir), laplace_seconds(workdir)
         times.append([scene, f"{training:.0f}", f"{seconds:.1f}", f"{100 * seconds / training:.0f} %"])
     tables = (common.markdown(heads, lines) for heads, lines in ((HEADS, rows), (PSNR, levels), (TIMES, times)))
@@ -70,7 +73,7 @@ def main(argv: list[str]) -> None:
 
 
 def _compared(psnr):
-    true, predicted = psnr.T
+    true, predicted = np.array(psnr).T
     return [f"{true.mean():.2f}", f"{predicted.mean():.2f}", f"{np.median(np.abs(predicted - true)):.2f}"]
 
 

@@ -55,10 +55,24 @@ def test_predicted_errors_are_the_rms_error_and_keep_the_order_of_scores():
     np.testing.assert_allclose(predicted[20:], 0.3 * scores[20:], rtol=0.15)
 
 
+def test_the_level_of_predicted_errors_is_that_of_all_views(monkeypatch):
+    """Every second view has half the errors; intervals are those of the same map without its level."""
+    scores, errors = zip(*(draws(seed) for seed in range(6)), strict=True)
+    errors, names = [found / (1 + index % 2) for index, found in enumerate(errors)], list("abcdef")
+    found = calibration.calibrate(scores, errors, names)
+    squares = np.square(np.concatenate(errors)).mean()
+    assert np.square(found.predicted(np.concatenate(scores)), dtype=float).mean() == pytest.approx(squares, rel=1e-3)
+    monkeypatch.setattr(calibration, "_scaled", lambda known, predicted, errors: known)
+    other = calibration.calibrate(scores, errors, names)
+    assert other.factor < 0.9 * found.factor
+    np.testing.assert_allclose(found.interval(scores[0]), other.interval(scores[0]), rtol=1e-5)
+
+
 def test_the_factor_has_the_finite_sample_correction():
     errors = [np.full(4, 0.1), np.array([0.1, 0.2, 0.3, 0.4])]
     found = calibration.calibrate([np.ones(4), np.ones(4)], errors, ["a", "b"], 0.8)
-    assert found.factor == pytest.approx(4.0, rel=1e-5)  # the 4th of 4, as ceil(5 * 0.8) = 4; the 80 % quantile is less
+    # The 4th of 4, as ceil(5 * 0.8) = 4; the 80 % quantile is less.
+    assert found.interval(1.0) == pytest.approx(0.4, rel=1e-5)
     with pytest.raises(ValueError, match="too few"):
         calibration.calibrate([np.ones(4), np.ones(4)], errors, ["a", "b"], 0.9)
 

@@ -62,10 +62,12 @@ def calibrate(
     """Calibrates by split conformal prediction: every second view gives the map, the others the factor.
 
     The map is the RMS error by score, made monotone (isotonic regression of the means of bins with equally many
-    pixels), so that it keeps the order of the scores. With n pixels of the other views the factor is the
-    ceil((n + 1) coverage)-th smallest ratio of error and predicted error. A new pixel from the same distribution is
-    then within the interval with at least that probability (arXiv:1604.04173). Pixels of one view are alike, so that
-    the coverage of a single view differs from it by more than its number of pixels suggests.
+    pixels), so that it keeps the order of the scores, times the constant with which the mean square of the predicted
+    errors is that of the true ones over all views: half of the views know the level of the errors worse, and the
+    intervals do not depend on it. With n pixels of the other views the factor is the ceil((n + 1) coverage)-th smallest
+    ratio of error and predicted error. A new pixel from the same distribution is then within the interval with at
+    least that probability (arXiv:1604.04173). Pixels of one view are alike, so that the coverage of a single view
+    differs from it by more than its number of pixels suggests.
 
     Args:
         scores, errors: of each view, [N] each.
@@ -85,14 +87,21 @@ def calibrate(
     for name, found in zip(views, scores, strict=True):
         if not np.isfinite(found).all():
             raise ValueError(f"{name}: has scores that are not finite, so nothing can be calibrated; check the run")
-    known = _monotone(np.concatenate(scores[::2]), np.concatenate(errors[::2]))
+    bins, known = _monotone(np.concatenate(scores[::2]), np.concatenate(errors[::2]))
     count = sum(found.size for found in scores[1::2])
     rank = math.ceil((count + 1) * coverage)
     if rank > count:
         raise ValueError(f"calibration has {count} pixels, too few for a coverage of {coverage}; lower --coverage")
-    draft = Calibration(*known, 1.0, coverage, count, tuple(views))
+    draft = Calibration(bins, known, 1.0, coverage, count, tuple(views))
+    draft = draft._replace(errors=_scaled(known, draft.predicted(np.concatenate(scores)), np.concatenate(errors)))
     ratio = np.concatenate(errors[1::2]) / draft.predicted(np.concatenate(scores[1::2]))
     return draft._replace(factor=float(np.partition(ratio, rank - 1)[rank - 1]))
+
+
+def _scaled(known, predicted, errors):
+    """Returns the errors of a map times the constant with which predicted errors have the mean square of errors."""
+    scale = np.sqrt((errors**2).mean() / (predicted.astype(np.float64) ** 2).mean())
+    return tuple(np.maximum(scale * np.array(known), _LEAST_ERROR).tolist())
 
 
 def _monotone(scores, errors):
