@@ -66,6 +66,7 @@ def config_of(scene: str, indices: list[int], seed: int):
     if scene == "lego":
         config = common.configuration("lego_fast", _LEGO, seed=seed)
     else:
+        # Everything else is that of a run with all images, but there are parameters of as many cameras as images.
         config = common.changed(_resolved_capture(), {"cameras.num_images": "auto", "seed": seed})
     steps = _STEPS.value
     common_fields = {"train.max_steps": steps, "train.lr_steps": steps, "train.save_every": steps}

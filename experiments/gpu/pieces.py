@@ -253,6 +253,23 @@ def blender(context: Context, *, name: str = "lego", seconds: float) -> dict[str
     return _trained(config, context.folder / f"{name}-{seconds:g}")
 
 
+def four_scales(context: Context) -> dict[str, Any]:
+    """Trains lego on four scales for a minute and scores its test views at each, one ray a pixel."""
+    limit = 1.0 if context.tiny else 60.0
+    overrides = {"data.dir": "lego", "data.num_scales": 4, "train.max_seconds": limit}
+    config = context.config("lego_fast", profiles.FULL_SIZE | profiles.TIMED | overrides)
+    folder = context.folder / "four_scales"
+    results = _trained(config, folder)
+    run = restore.restore_run(folder)
+    variables, rows = run.variables(restore.newest_step(run, folder)), []
+    for scale in (1, 2, 4, 8):
+        smaller = {"data.factor": scale, "data.size": config.data.size // scale}  # of files; of the embedded scene
+        views = common.load_split(common.changed(config, smaller), config.eval.split)
+        psnr = _mean_psnr(run, variables, views, range(len(views.names)))
+        rows.append({"scale": f"1/{scale}" if scale > 1 else "1", "psnr": psnr})
+    return {**results, "mean psnr": float(np.mean([row["psnr"] for row in rows])), "rows": rows}
+
+
 _SMALL = {"hash_grid.width": 64, "hash_grid.view_width": 64, "hash_grid.table_size": 2**20}
 _SIZES = {
     "5 samples per ray, networks 64 wide, 2^20 rows": _SMALL | {"occupancy.pool_samples_per_ray": 5.0},
@@ -352,17 +369,21 @@ def _scored(config, folder):
     logged = {row["step"]: row for row in metric_log.read_rows(folder)}
     rows = []
     for step in run.steps():
-        variables = run.variables(step)
-        errors = []
-        for index in (0, len(views.names) // 2):
-            pixels = pixel_grid(*views.size[index].tolist(), offset=run.experiment.config.data.pixel_offset)
-            rgb = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
-            errors.append(float(np.mean((np.asarray(rgb) - views.image(index)) ** 2)))
-        psnr = float(np.mean([-10 * math.log10(error) for error in errors]))
+        psnr = _mean_psnr(run, run.variables(step), views, (0, len(views.names) // 2))
         row = logged[step]
         rows.append({"step": step, "seconds": row["seconds"], "rays": row["rays"], "PSNR of 2 views": psnr})
     rate = rows[-1]["rays"] / max(rows[-1]["seconds"], 1e-9)
     return [row | {"rays/s": rate} for row in rows]
+
+
+def _mean_psnr(run, variables, views, indices):
+    """Returns the mean PSNR, dB, of the views of these indices."""
+    found = []
+    for index in indices:
+        pixels = pixel_grid(*views.size[index].tolist(), offset=run.experiment.config.data.pixel_offset)
+        rgb = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
+        found.append(-10 * math.log10(float(np.mean((np.asarray(rgb) - views.image(index)) ** 2))))
+    return float(np.mean(found))
 
 
 def memory_use(context: Context) -> dict[str, Any]:

@@ -62,12 +62,12 @@ def calibrate(
     """Calibrates by split conformal prediction: every second view gives the map, the others the factor.
 
     The map is the RMS error by score, made monotone (isotonic regression of the means of bins with equally many
-    pixels), so that it keeps the order of the scores, times the constant with which the mean square of the predicted
-    errors is that of the true ones over all views: half of the views know the level of the errors worse, and the
-    intervals do not depend on it. With n pixels of the other views the factor is the ceil((n + 1) coverage)-th smallest
-    ratio of error and predicted error. A new pixel from the same distribution is then within the interval with at
-    least that probability (arXiv:1604.04173). Pixels of one view are alike, so that the coverage of a single view
-    differs from it by more than its number of pixels suggests.
+    pixels), so that it keeps the order of the scores. A constant factor then gives the predicted errors of all views
+    the mean square of the true ones: all views together tell the level of the errors better than half of them, and
+    the intervals do not depend on it. With n pixels of the other views the factor is the ceil((n + 1) coverage)-th
+    smallest ratio of error and predicted error. A new pixel from the same distribution is then within the interval
+    with at least that probability (arXiv:1604.04173). Pixels of one view are alike, so that the coverage of a single
+    view differs from it by more than its number of pixels suggests.
 
     Args:
         scores, errors: of each view, [N] each.
@@ -99,7 +99,7 @@ def calibrate(
 
 
 def _scaled(known, predicted, errors):
-    """Returns the errors of a map times the constant with which predicted errors have the mean square of errors."""
+    """Returns the errors of a map, scaled so that the predicted errors have the mean square of the true ones."""
     scale = np.sqrt((errors**2).mean() / (predicted.astype(np.float64) ** 2).mean())
     return tuple(np.maximum(scale * np.array(known), _LEAST_ERROR).tolist())
 
