@@ -318,7 +318,8 @@ def watch(
     suffix = "" if split == run.experiment.config.eval.split else f"-{split}"
     views = run.experiment.load_split(split)
     while True:
-        new = [step for step in run.steps() if not (workdir / "eval" / f"{step}{suffix}").exists()]
+        steps = run.steps()
+        new = [step for step in steps if not (workdir / "eval" / f"{step}{suffix}").exists()]
         if new:
             try:
                 results = score_run(run, workdir, split=split, step=new[0], views=views)
@@ -326,17 +327,17 @@ def watch(
             except ValueError:
                 if new[0] in run.steps():  # otherwise training has deleted it as too old, which is no error
                     raise
-        elif _has_ended(run, workdir):
+        elif _has_ended(run.experiment.config.train, steps, workdir):
             return
         else:
             said = _wait(f"{workdir}: no new checkpoint", said, poll_seconds)
 
 
-def _has_ended(run, workdir):
-    """Returns whether the training has written its last checkpoint, by its steps or by its clock."""
-    options, steps, rows = run.experiment.config.train, run.steps(), metric_log.read_rows(workdir)
+def _has_ended(options, steps, workdir):
+    """Returns whether the last of these checkpoints is the training's last, by its steps or by its clock."""
     if not steps:
         return False
+    rows = metric_log.read_rows(workdir)
     late = rows and rows[-1]["step"] == steps[-1] and 0 < options.max_seconds <= rows[-1]["seconds"]
     return steps[-1] >= options.max_steps or bool(late)
 

@@ -18,6 +18,7 @@ from jaxnerf.evaluation.evaluate import evaluate, score_run, summary, watch
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import build
+from jaxnerf.training.checkpoint import Checkpoints
 from runs import smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
@@ -224,6 +225,30 @@ def test_watching_waits_scores_each_checkpoint_and_ends(trained, tmp_path):
     assert [line.split(":")[0] for line in out.splitlines()] == ["step 15", "step 20"]
     assert 1 <= err.count("no new checkpoint") <= 2  # once for each wait, not for each search
     assert json.loads((folder / "eval" / "20" / "results.json").read_text())["step"] == 20
+
+
+def test_watching_scores_a_last_checkpoint_that_comes_during_its_search(trained, tmp_path, monkeypatch):
+    folder, scored = shutil.copytree(trained, tmp_path / "run"), []
+    for step in (10, 15):
+        (folder / "eval" / str(step)).mkdir(parents=True, exist_ok=True)
+    os.replace(folder / "checkpoints" / "20", tmp_path / "20")
+    steps = Checkpoints.steps
+
+    def steps_and_then_the_last(run):
+        found = steps(run)
+        if (tmp_path / "20").exists():
+            os.replace(tmp_path / "20", folder / "checkpoints" / "20")
+        return found
+
+    def score(run, workdir, *, step, **_):
+        scored.append(step)
+        (folder / "eval" / str(step)).mkdir()
+
+    monkeypatch.setattr(Checkpoints, "steps", steps_and_then_the_last)
+    monkeypatch.setattr("jaxnerf.evaluation.evaluate.score_run", score)
+    monkeypatch.setattr("jaxnerf.evaluation.evaluate.summary", str)
+    watch(folder, poll_seconds=0.01)
+    assert scored == [20]
 
 
 def test_watching_ends_where_training_ended_by_max_seconds(trained, tmp_path):
