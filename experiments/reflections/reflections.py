@@ -1,13 +1,14 @@
-"""Trains the embedded scene with and without reflections at equal seconds, and measures PSNR and errors of normals.
+"""Trains the embedded scene with and without reflections, and measures PSNR, times and errors of normals.
 
     python experiments/reflections/reflections.py --out=runs/reflections [--finishes=shiny,matt] [--steps=2000]
         [--page=docs/results/reflections.md --table=reflections]
 
-A step with reflections takes longer, so that the run without them takes as many steps more: both steps are timed in
-turn, before training, and so are the images of both runs, after it. The truth of normals is the closed form at its own
-median depth. What is compared with it: the density's normals by automatic differentiation, those by differences over a
-step of the ray marching, those through the depths of neighbouring pixels, and what the field predicts. The views that
-are held out of training are farther from the others than the test views are.
+A step with reflections takes longer, so that a run without them takes as many steps more: both steps are timed in
+turn, before training, and so are the images of all runs, after it. Another run without them has the same number of
+steps. The truth of normals is the closed form at its own median depth. What is compared with it: the density's normals
+by automatic differentiation, those by differences over a step of the ray marching, those through the depths of
+neighbouring pixels, and what the field predicts. The views that are held out of training are farther from the others
+than the test views are.
 """
 
 import functools
@@ -53,13 +54,14 @@ def main(argv: list[str]) -> None:
         configs = {reflects: configuration(finish, reflects) for reflects in (False, True)}
         folder = pathlib.Path(_OUT.value) / f"{finish}_{_STEPS.value}"
         times = step_times(configs, folder / "times.json")
-        steps = {True: _STEPS.value, False: round(_STEPS.value * times["on"] / times["off"])}
+        equal = round(_STEPS.value * times["on"] / times["off"])
+        steps = {"off": equal, "off, equal steps": _STEPS.value, "on": _STEPS.value}
         runs, scores = {}, {}
-        for reflects, config in configs.items():
-            config = common.changed(config, {f"train.{name}": steps[reflects] for name in ("max_steps", "lr_steps")})
-            name = "on" if reflects else "off"
-            results = common.run(config, folder / name, split="test")
-            runs[name] = restore.restore_run(folder / name)
+        for name, count in steps.items():
+            config = common.changed(configs[name == "on"], {"train.max_steps": count, "train.lr_steps": count})
+            workdir = folder / name.replace(", ", "_").replace(" ", "_")
+            results = common.run(config, workdir, split="test")
+            runs[name] = restore.restore_run(workdir)
             scores[name] = results["psnr"], mean_psnr(runs[name], common.load_split(config, "held_out"))
         test = common.load_split(config, "test")
         frames = frame_times(runs, test)
@@ -70,8 +72,8 @@ def main(argv: list[str]) -> None:
                 [
                     finish,
                     name,
-                    str(steps[name == "on"]),
-                    f"{1000 * times[name]:.1f}",
+                    str(steps[name]),
+                    f"{1000 * times[name.split(',')[0]]:.1f}",
                     f"{1000 * frames[name]:.1f}",
                     *(f"{score:.2f}" for score in scores[name]),
                     *cells,
