@@ -16,10 +16,11 @@ from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask
-from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_run
+from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, memory, processes, stages
 from jaxnerf.training import metric_log
+from jaxnerf.training.optimizer import image_params
 from jaxnerf.training.state import TrainState
 from jaxnerf.training.workdir import load_config
 
