@@ -20,7 +20,7 @@ from jaxnerf.registry import Part
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
 _MAX_OCTAVES = 64  # of encoding.positional_encoding
 _PIXELS_PER_WAVE = 4  # length of the shortest wave of the encoding
-_LEAST_LENGTH = math.sqrt(12)  # of a sample, over the radius of the cone
+_PIXEL_SIDE = math.sqrt(3)  # at a sample, over the radius of the cone, see `pixel_radius`
 
 DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
 
@@ -41,7 +41,7 @@ class MlpOptions(Options):
     prefilter: bool = option(
         False,
         "Whether the position's encoding is its mean over the part of the pixel's cone that a sample stands for "
-        "(integrated positional encoding, arXiv:2103.13415), at least sqrt(12) times as long as the cone's radius. The "
+        "(integrated positional encoding, arXiv:2103.13415), and which is no shorter than the pixel is wide there. The "
         "network also reads what the mean leaves of each octave. auto: as for `hash_grid.prefilter`.",
         auto=True,
     )
@@ -286,17 +286,16 @@ def cone_variance(
     radius: Float[ArrayLike, "*batch samples"],
     length: Float[ArrayLike, "*batch samples"],
 ) -> Float[Array, "*batch samples 3"]:
-    """Computes the `frustum_variance` [..., S, 3] of samples whose length is at least sqrt(12) times the radius.
+    """Computes the `frustum_variance` [..., S, 3] of samples that are no shorter than the pixel is wide.
 
-    A sample that is much shorter than the cone is wide is a disk. Its Gaussian depends on the direction of the ray, so
-    that the network would have to learn the same surface for each direction and each ratio of length and radius. With
-    the floor, the standard deviation along the ray is at least the radius, twice that across, and the shape is the
-    same for all such samples. Neighbouring samples then overlap, as neighbouring pixels do.
+    The side of the pixel at the sample is sqrt(3) times the radius. The Gaussian of a shorter sample would be flat, and
+    another one for each direction of the ray, so that the network would have to learn a surface for all of them. As
+    long as the pixel is wide, it is a ball with the variance of the pixel, the same for all directions.
 
     Args:
         viewdirs: see `frustum_variance`, as the others.
     """
-    return frustum_variance(viewdirs, radius, jnp.maximum(length, _LEAST_LENGTH * radius))
+    return frustum_variance(viewdirs, radius, jnp.maximum(length, _PIXEL_SIDE * radius))
 
 
 def damping_of_octaves(variance: Float[ArrayLike, " N"], num_freqs: int) -> Float[Array, "F N"]:

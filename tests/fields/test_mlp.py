@@ -197,12 +197,15 @@ def test_points_instead_of_cones_are_what_the_plain_network_sees(small):
     assert_same(point, jax.jit(plain.apply)(without_damping(params, 6), x, viewdirs), rtol=1e-5, atol=1e-5)
 
 
-def test_a_sample_is_no_shorter_than_its_cone_is_wide(small):
-    """Of shorter ones, the length does not matter; of longer ones, it does."""
+def test_a_sample_is_no_shorter_than_the_pixel_is_wide(small):
+    """Of shorter ones, the length does not matter, and the variance is that of the pixel; of longer ones, it does."""
     _, cones, params = small
     x, viewdirs = inputs()
+    np.testing.assert_allclose(
+        cone_variance(viewdirs, *extents((6, 4), 0.1 / 3**0.5, 0.05).values()), 0.1**2 / 12, rtol=1e-6
+    )
     none, short, long = (
-        jax.jit(cones.apply)(params, x, viewdirs, **extents((6, 4), 0.1, length)) for length in (0.0, 0.34, 0.5)
+        jax.jit(cones.apply)(params, x, viewdirs, **extents((6, 4), 0.1, length)) for length in (0.0, 0.17, 0.5)
     )
     assert_same(none, short, rtol=0, atol=0)
     assert min(np.abs(part - want).max() for part, want in zip(long, short, strict=True)) > 1e-3
@@ -226,13 +229,13 @@ def test_what_cones_leave_of_octaves_and_its_derivatives_are_those_of_float64(dt
         given = [jnp.asarray(each, dtype) for each in (radius, length)]
         got, by = jax.jit(lambda *at: (jax.vmap(damping)(*at), slopes(*at)))(*given)
         assert got.dtype == by[0].dtype == dtype
-    wide = np.sqrt(12) * radius > length
-    along, across = (np.minimum(each, 1e18) for each in (np.where(wide, np.sqrt(12) * radius, length), radius))
+    wide = np.sqrt(3) * radius > length
+    along, across = (np.minimum(each, 1e18) for each in (np.where(wide, np.sqrt(3) * radius, length), radius))
     want = np.exp(-(octaves**2) / 2 * (along**2 / 12 + across**2 / 2)[:, None] / 3)
     np.testing.assert_allclose(got, want, atol=1e-6)
     steep = -(octaves**2) / 3 * want
     by_length = np.where(wide, 0, along / 12)[:, None] * steep
-    by_radius = (np.where(wide, across, 0) + across / 2)[:, None] * steep
+    by_radius = (np.where(wide, across / 4, 0) + across / 2)[:, None] * steep
     np.testing.assert_allclose(by[0], by_radius, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(by[1], by_length, rtol=1e-4, atol=1e-3)
 
