@@ -15,7 +15,7 @@ from jaxnerf.training.optimizer import OptimizerOptions
 UNLIMITED_STEPS = 10**7  # max_steps of a run that max_seconds ends
 _STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 _FACTOR_OF_SEVERAL_RAYS = 8  # at which a pixel of an image averages so much that one ray blurs the field
-_SHORT_SECONDS, _SHORT_RAYS = 30.0, 2_000_000  # a shorter run is better with more pixels than with sharper ones
+_SHORT_SECONDS, _SHORT_STEPS = 30.0, 2000  # a shorter run is better with more pixels than with sharper ones
 _MAX_STEPS_PER_DISPATCH = 16  # on an accelerator, where a dispatch costs as much as a small step
 
 
@@ -49,7 +49,7 @@ class TrainOptions(OptimizerOptions):
         1,
         "Rays along each side of a pixel in the last part of training and in images: their mean is the pixel's colour. "
         "A step then takes as many rays, and fewer pixels. auto: 2 where alpha bounds the scene and `data.factor` is 8 "
-        "or more, as one ray blurs the field then, in runs of at least 30 s or 2,000,000 rays; otherwise 1.",
+        "or more, as one ray blurs the field then, in runs of at least 30 s or 2,000 steps; otherwise 1.",
         range=at_least(1),
         auto=True,
         changes=Changes.MODEL,
@@ -145,7 +145,7 @@ class TrainOptions(OptimizerOptions):
             f"data.factor is {facts.factor}": facts.factor < _FACTOR_OF_SEVERAL_RAYS,
             "cameras are trained": facts.trains_cameras,
             f"train.max_seconds is {self.max_seconds:g}": 0 < self.max_seconds < _SHORT_SECONDS,
-            f"train.max_steps is {self.max_steps}": self.max_steps * self.batch_size < _SHORT_RAYS,
+            f"train.max_steps is {self.max_steps}": self.max_steps < _SHORT_STEPS,
             f"train.batch_size is {self.batch_size}": self.batch_size % 4,
             f"train.microbatch_size is {self.microbatch_size}": not is_auto(size := self.microbatch_size) and size % 4,
         }
