@@ -59,7 +59,7 @@ def test_a_small_frame_is_the_mean_of_a_large_one(trained, tmp_path, capsys):
         folder, *_ = render_path(trained, path=str(file), name=name, kind="none", **options)
         images[name] = iio.imread(folder / "color" / "0000.png") / 255
         text = capsys.readouterr().err
-        assert ("rays: 16 per pixel, as a pixel covers more than in training" in text) == (name == "small")
+        assert ("rays: 16 per pixel, as dense as those of training" in text) == (name == "small")
     expected = images["whole"].reshape(height // 4, 4, width // 4, 4, 3).mean((1, 3))
     np.testing.assert_allclose(images["small"], expected, atol=1.1 / 255)
     assert np.abs(images["point"] - expected).max() > 5 / 255
