@@ -1,13 +1,17 @@
 """Four CPU devices, checks of type annotations, and the real scenes, for every test."""
 
 import gc
+import importlib.metadata
 import os
 import pathlib
 import signal
 
 # Both are read once, when JAX starts, so they are set before anything imports it.
 os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
+flags = [os.environ.get("XLA_FLAGS", ""), "--xla_force_host_platform_device_count=4"]
+if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") and importlib.metadata.version("jaxlib").startswith("0.10."):
+    flags.append("--xla_cpu_use_fusion_emitters=false")  # compiles faster; a jaxlib without this flag would crash
+os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
 # A shell that starts pytest in the background makes it ignore SIGINT, and nohup makes it ignore SIGHUP. So would the
 # programs that tests start.
