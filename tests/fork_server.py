@@ -32,26 +32,29 @@ def _become(request):
         with open(path, mode) as file:
             os.dup2(file.fileno(), number)
     places = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
-    sys.path[:1] = [request["folder"], *places]
+    program = request["program"]
+    sys.path[:1] = [os.path.dirname(program) if program.endswith(".py") else request["folder"], *places]
     sys.argv[1:] = request["flags"]
     gc.unfreeze()
     signal.alarm(_SECONDS)
 
 
 def _serve():
-    """Answers each request, a line of JSON, with the exit code of its program; returns the module to run in a fork."""
+    """Answers each request, a line of JSON, with the exit code of its program; returns the program to run in a fork."""
     for line in sys.stdin:
         request = json.loads(line)
         child = os.fork()
         if not child:
             _become(request)
-            return request["module"]
+            return request["program"]
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 
 
 if __name__ == "__main__":
     gc.collect()
     gc.freeze()  # or the first collection of each program would copy all of it
-    module = _serve()
-    if module:
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    program = _serve()
+    if program and program.endswith(".py"):
+        runpy.run_path(program, run_name="__main__")
+    elif program:
+        runpy.run_module(f"jaxnerf.{program}", run_name="__main__", alter_sys=True)

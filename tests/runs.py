@@ -82,15 +82,15 @@ def _fork_server():
 
 
 def run_forked(program, *flags, folder=ROOT):
-    """Returns (exit code, stdout, stderr) of python -m jaxnerf.<program>, run in a folder without a new interpreter.
+    """Returns (exit code, stdout, stderr) of python -m jaxnerf.<program>, or of a script, without a new interpreter.
 
-    It is a fork of a process that has imported JAX: imports take longer than most of these programs. Tests of starting,
-    of signals, of several processes and of variables that Python reads use `start`.
+    It runs in a folder, as a fork of a process that has imported JAX: imports take longer than most of these programs.
+    Tests of starting, of signals, of several processes and of variables that Python reads use `start`.
     """
     server = _fork_server()
     with tempfile.TemporaryDirectory() as streams:
         out, err = pathlib.Path(streams, "out"), pathlib.Path(streams, "err")
-        request = {"module": f"jaxnerf.{program}", "flags": list(map(str, flags)), "folder": str(folder)}
+        request = {"program": str(program), "flags": list(map(str, flags)), "folder": str(folder)}
         request |= {"environment": dict(os.environ), "out": str(out), "err": str(err)}
         print(json.dumps(request), file=server.stdin, flush=True)
         code = int(server.stdout.readline())

@@ -57,8 +57,7 @@ def call(folder, *flags):
     """Returns (exit code, stdout, stderr) of _PROGRAM with flags."""
     program = folder / "program.py"
     program.write_text(_PROGRAM)
-    done = subprocess.run([sys.executable, program, *flags], cwd=folder, capture_output=True, text=True)
-    return done.returncode, done.stdout, done.stderr
+    return run_forked(program, *flags, folder=folder)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc returns large blocks at once")
@@ -242,9 +241,9 @@ def test_a_name_from_a_workdir_is_not_imported():
 def test_too_little_memory_is_one_line(tmp_path):
     program = tmp_path / "program.py"
     program.write_text("import numpy\nfrom jaxnerf.runtime import cli\ncli.run(lambda argv: numpy.zeros(2**58))\n")
-    done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: out of memory (Unable to allocate") and len(done.stderr.splitlines()) == 1
+    code, _, err = run_forked(program, folder=tmp_path)
+    assert code == 1
+    assert err.startswith("error: out of memory (Unable to allocate") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("flag", ["--help", "--config=help"])
