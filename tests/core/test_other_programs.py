@@ -21,7 +21,7 @@ def camera(**options):
 
 @functools.cache
 def rays():
-    return jaxnerf.rays_from_pixels(camera(), jaxnerf.pixel_grid(6, 6), near=1.0, far=6.0)
+    return make_rays(camera(), jaxnerf.pixel_grid(6, 6), near=1.0, far=6.0)
 
 
 def features(x, viewdirs, channels=8):
@@ -89,7 +89,7 @@ def test_what_takes_one_camera_says_how_several_are_computed():
     poses = jnp.stack([jaxnerf.look_at((x, -4.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for x in range(3)])
     pixels, one = jaxnerf.pixel_grid(6, 6), camera(height=6, width=6)
     cameras = dataclasses.replace(one, to_world=poses, focal=jnp.full((3, 2), 6.0), center=jnp.full((3, 2), 3.0))
-    rays = jaxnerf.rays_from_pixels(cameras, pixels, near=1.0, far=6.0)
+    rays = make_rays(cameras, pixels, near=1.0, far=6.0)
     for function, values in {
         jaxnerf.project: jnp.zeros((5, 3)),
         jaxnerf.undistort: pixels,
@@ -103,7 +103,7 @@ def test_what_takes_one_camera_says_how_several_are_computed():
             function(*arguments)
         advice = str(raised.value).partition("; for several, each array of which has a leading axis, call ")[2]
         names = {"jax": jax, function.__name__: function, "cameras": cameras, "rays": rays, "values": values}
-        found = eval(advice.replace("...", "values"), names)
+        found = jax.jit(lambda advice=advice, names=names: eval(advice.replace("...", "values"), names))()
         assert all(len(leaf) == 3 for leaf in jax.tree.leaves(found))
     with pytest.raises(ValueError, match=r"to_world has shape \(4, 4\), expected \(3, 4\)"):
         jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=jnp.eye(4)), pixels, near=1.0, far=6.0)
@@ -151,7 +151,7 @@ def test_scenes_of_any_number_of_channels(channels):
             more = {"max_samples": 864} if render is jaxnerf.render_packed else {}
             arguments = (None,) if more else ()
             with pytest.raises(ValueError, match="background has shape"):
-                render(scene, *arguments, rays(), samples, background=wrong, **more)
+                jax.eval_shape(functools.partial(render, scene, *arguments, background=wrong, **more), rays(), samples)
 
 
 def test_wrong_outputs_and_errors_of_a_scene_name_the_shapes():
@@ -162,9 +162,9 @@ def test_wrong_outputs_and_errors_of_a_scene_name_the_shapes():
         return x[..., 0], jnp.concatenate([x, viewdirs], axis=-1)[..., :3]
 
     with pytest.raises(ValueError, match=r"returned density \(6, 6, 8\) and rgb \(6, 6, 8\)"):
-        jaxnerf.render_rays(None, flat, rays(), num_samples=8)
+        jax.eval_shape(lambda: jaxnerf.render_rays(None, flat, rays(), num_samples=8))
     with pytest.raises(TypeError) as caught:
-        jaxnerf.render_rays(None, glued, rays(), num_samples=8)
+        jax.eval_shape(lambda: jaxnerf.render_rays(None, glued, rays(), num_samples=8))
     assert "x (6, 6, 8, 3) and viewdirs (6, 6, 1, 3), which broadcast" in " ".join(caught.value.__notes__)
 
 
