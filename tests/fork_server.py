@@ -35,7 +35,6 @@ def _become(request):
     program = request["program"]
     sys.path[:1] = [os.path.dirname(program) if program.endswith(".py") else request["folder"], *places]
     sys.argv[1:] = request["flags"]
-    gc.unfreeze()
     signal.alarm(_SECONDS)
 
 
