@@ -83,7 +83,7 @@ def test_muon_of_all_matrices_together_is_that_of_each(monkeypatch):
         params, state = start, update.init(start)
         for seed in range(3):
             grads = {"fine": network(jax.random.key(seed))}
-            updates, state = update.update(grads, state, params)
+            updates, state = jax.jit(update.update)(grads, state, params)
             params = optax.apply_updates(params, updates)
         ends.append((params, state))
     assert jax.tree.structure(ends[0]) == jax.tree.structure(ends[1])  # so a run goes on, on another device
