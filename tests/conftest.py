@@ -9,9 +9,10 @@ import signal
 # Both are read once, when JAX starts, so they are set before anything imports it.
 os.environ["JAX_PLATFORMS"] = "cpu"
 flags = [os.environ.get("XLA_FLAGS", ""), "--xla_force_host_platform_device_count=4"]
-if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") and importlib.metadata.version("jaxlib").startswith("0.10."):
-    # These compile faster; a jaxlib without such a flag would crash.
-    flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+if importlib.metadata.version("jaxlib").startswith("0.10."):  # one without these flags would crash
+    flags.append("--xla_cpu_parallel_codegen_split_count=1")  # compiles faster
+    if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS"):
+        flags.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
 # A shell that starts pytest in the background makes it ignore SIGINT, and nohup makes it ignore SIGHUP. So would the

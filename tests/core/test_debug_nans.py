@@ -13,6 +13,8 @@ import pytest
 
 import jaxnerf
 
+pytest_plugins = ["run_fixtures"]
+
 KEY = jax.random.key(0)
 LENS = {"opencv": jnp.array([0.1, -0.02, 0.001, 0.002]), "fisheye": jnp.array([0.01, 0.002, 0.0, 0.0])}
 
@@ -455,7 +457,9 @@ def raised(functions, arguments):
 
 
 @pytest.mark.parametrize("short", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_no_branch_makes_a_nan(found, short):
+def test_no_branch_makes_a_nan(found, short, request):
+    if not short:
+        request.getfixturevalue("unoptimized")
     left = ("render_", "distort")
     names = [name for name in found if name in RENDERED or not ("drawn" in name or name.startswith(left))]
     assert set(names) >= RENDERED
