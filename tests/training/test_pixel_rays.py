@@ -55,6 +55,11 @@ def step_of(experiment):
     )
 
 
+@functools.cache
+def compiled_step(sampler="occupancy", **changes):
+    return jax.jit(step_of(experiment_of(sampler, **changes)[0]))
+
+
 def positions_of(size=RAYS):
     return np.arange(RAYS, dtype=np.int32).reshape(-1, size)
 
@@ -107,15 +112,15 @@ def test_a_pixel_shows_the_mean_of_its_rays():
         PixelRays(3, 0.5).averaged(rendering, 3)
 
 
-@pytest.mark.parametrize("sampler", ["occupancy", "hierarchical"])
+@pytest.mark.parametrize("sampler", ["occupancy", pytest.param("hierarchical", marks=pytest.mark.slow)])
 def test_the_loss_compares_the_mean_colour_in_the_last_part_only(sampler):
     experiment, _, cells, data = experiment_of(sampler)
     state = create_state(experiment.model, experiment.optimizer, 0, cells)
-    step, positions = jax.jit(step_of(experiment)), positions_of()
+    step, positions, render = compiled_step(sampler), positions_of(), jax.jit(experiment.model.render)
     for when, side in ((5, 1), (6, 2)):
         state = dataclasses.replace(state, step=jnp.int32(when))
         keys, batch = experiment.draw(when, positions[0], data)
-        renderings = experiment.model.render(keys, state.params, state.grid, batch.rays, state.step)
+        renderings = render(keys, state.params, state.grid, batch.rays, state.step)
         expected = 0
         for name in experiment.model.image_networks:
             rgb = np.asarray(renderings[name].rgb).reshape(-1, side**2, 3).mean(axis=1)
@@ -126,16 +131,14 @@ def test_the_loss_compares_the_mean_colour_in_the_last_part_only(sampler):
 
 
 def test_before_the_last_part_the_step_is_that_of_one_ray_a_pixel():
-    experiment, _, cells, data = experiment_of()
+    _, _, cells, data = experiment_of()
     plain, _, _, plain_data = experiment_of(**{"train.rays_per_side": 1})
     state = create_state(plain.model, plain.optimizer, 0, cells)
-    one, several = (
-        jax.jit(step_of(each))(state, each_data, positions_of())[0]
-        for each, each_data in ((plain, plain_data), (experiment, data))
-    )
+    one = compiled_step(**{"train.rays_per_side": 1})(state, plain_data, positions_of())[0]
+    several = compiled_step()(state, data, positions_of())[0]
     assert_same(several.params, one.params, rtol=1e-6, atol=1e-7)
     late = data._replace(progress=ProgressData(np.float32(STEPS), np.float32(0.6)))  # by time
-    after = jax.jit(step_of(experiment))(state, late, positions_of())[0]
+    after = compiled_step()(state, late, positions_of())[0]
     with pytest.raises(AssertionError):
         assert_same(after.params, one.params, rtol=1e-6, atol=1e-7)
 
@@ -154,11 +157,16 @@ def test_one_ray_a_pixel_leaves_the_program_as_it_is():
     assert len(set(texts)) == 1
 
 
-@pytest.mark.parametrize(("mode", "size"), [("jit", 16), ("sharded", 16), ("sharded", 4), ("pmap", 16)])
+_SPLITS = [("jit", 16), ("sharded", 4), ("pmap", 16)]
+
+
+@pytest.mark.parametrize(
+    ("mode", "size"), [("sharded", 16), *(pytest.param(*x, marks=pytest.mark.slow) for x in _SPLITS)]
+)
 def test_it_does_not_depend_on_how_the_batch_is_split(mode, size):
     experiment, _, cells, data = experiment_of()
     state = dataclasses.replace(create_state(experiment.model, experiment.optimizer, 0, cells), step=jnp.int32(7))
-    _, expected = jax.jit(step_of(experiment))(state, data, positions_of())
+    _, expected = compiled_step()(state, data, positions_of())
     options = {"batch_size": RAYS, "mode": mode, "microbatch_size": size}
     run, state, data = devices.compile_step(step_of(experiment), state, data, **options)
     _, metrics = run(state, data)
@@ -173,7 +181,10 @@ def uninterrupted(compiled_once, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("resumed_at", "per_dispatch"), [(4, 1), (8, 1), (STEPS, 5)])
+@pytest.mark.parametrize(
+    ("resumed_at", "per_dispatch"),
+    [pytest.param(4, 1, marks=pytest.mark.slow), (8, 1), pytest.param(STEPS, 5, marks=pytest.mark.slow)],
+)
 def test_a_run_resumed_in_either_part_and_one_of_several_steps_a_dispatch_are_the_same(
     uninterrupted, tmp_path, resumed_at, per_dispatch
 ):
