@@ -17,6 +17,7 @@ from jaxnerf.configs import default, lego_fast, lego_mlp_fast
 from jaxnerf.data import dataset, synthetic
 from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
+from jaxnerf.data.geometry import visual_hull
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
@@ -138,6 +139,22 @@ def test_flag_of_a_wrong_type_is_an_error(monkeypatch):
     path = sys.modules[default.__name__].__file__
     with pytest.raises(flags.IllegalFlagValueError, match="expected auto, or int"):
         parsed(monkeypatch, f"--config={path}", "--config.train.microbatch_size=many")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_hull():
+    """The bounds of the visual hull, most of the time of `resolve`, are found once for the same Views."""
+    find, found = visual_hull.hull_bounds, {}
+
+    def remembered(views, *box):
+        key = id(views), *(float(each) for corner in box for each in corner)
+        if key not in found:
+            found[key] = find(views, *box), views  # as long as this keeps the Views, no others have their id
+        return found[key][0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(visual_hull, "hull_bounds", remembered)
+        yield
 
 
 @pytest.fixture(scope="module")
