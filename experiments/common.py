@@ -23,6 +23,7 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
+from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime.atomic_files import partial_file, write_text
 from jaxnerf.runtime.devices import split_positions
 from jaxnerf.training import auto_config, build
@@ -131,7 +132,7 @@ def mean_psnr(run, variables, views: Views, *, most: int = 25) -> float:
     for index in np.unique(np.linspace(0, len(views.names) - 1, most).astype(int)):
         height, width = (int(side) for side in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
-        rgb = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
+        rgb = render_pixels(run, variables, views, index, pixels)[0].rgb
         found.append(image_metrics(rgb, views.image(index), pixel_mask(views, index))["psnr"])
     return statistics.fmean(found)
 
@@ -180,7 +181,7 @@ def compile_step(config, views=None) -> Step:
     valid, data = experiment.prepare(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
     parts = experiment.model, experiment.optimizer, experiment.draw, experiment.losses
-    step = make_train_step(*parts, patches=experiment.draw_patches)
+    step = make_train_step(*parts, patches=experiment.draw_patches, pixel_rays=experiment.pixel_rays)
     positions = jnp.asarray(split_positions(config.train.batch_size, 1, config.train.microbatch_size)[0])
 
     def count_flops():

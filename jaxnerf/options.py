@@ -139,6 +139,8 @@ class Facts(NamedTuple):
         sampler: the name of the run's sampler.
         predicts_normals: whether the run's field predicts normals.
         large_field: whether an update of the field's parameters takes as long as half of a step's rays.
+        factor: by which the images were downscaled.
+        trains_cameras: whether the run trains parameters of the training images.
         busy_rays: rays per step that keep the device busy; None: no more than on a CPU.
         batch_size: rays per step; 0 while that is inferred itself.
     """
@@ -159,6 +161,8 @@ class Facts(NamedTuple):
     sampler: str = ""
     predicts_normals: bool = False
     large_field: bool = False
+    factor: int = 1
+    trains_cameras: bool = False
     busy_rays: int | None = None
     batch_size: int = 0
 

@@ -58,7 +58,7 @@ _HEIGHT = flags.DEFINE_integer(
 _MAX_RAYS = flags.DEFINE_integer(
     "max_rays_per_pixel",
     16,
-    "The most rays per pixel. A pixel that covers more of the scene than those of training, as in small images and "
+    "The most rays per pixel. A pixel that covers more of the scene than a ray of training, as in small images and "
     "from afar, is the mean of as many rays as training has there. 1 renders one ray per pixel.",
     lower_bound=1,
     upper_bound=4096,

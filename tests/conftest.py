@@ -1,13 +1,18 @@
 """Four CPU devices, checks of type annotations, and the real scenes, for every test."""
 
 import gc
+import importlib.metadata
 import os
 import pathlib
 import signal
 
 # Both are read once, when JAX starts, so they are set before anything imports it.
 os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
+flags = [os.environ.get("XLA_FLAGS", ""), "--xla_force_host_platform_device_count=4"]
+if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") and importlib.metadata.version("jaxlib").startswith("0.10."):
+    # These compile faster; a jaxlib without such a flag would crash.
+    flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
 # A shell that starts pytest in the background makes it ignore SIGINT, and nohup makes it ignore SIGHUP. So would the
 # programs that tests start.
@@ -50,3 +55,15 @@ def pytest_runtest_setup(item):
 def scenes_dir():
     """The folder of the real scenes; for tests marked `scenes`, which end before this when it is missing."""
     return pathlib.Path(os.environ["JAXNERF_SCENES"])
+
+
+_finished_files = 0
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Forgets the compiled programs of every 20 files: JAX itself forgets some of more than about 4000."""
+    global _finished_files
+    if nextitem is None or nextitem.path != item.path:
+        _finished_files += 1
+        if _finished_files % 20 == 0:
+            jax.clear_caches()

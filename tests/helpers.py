@@ -61,5 +61,14 @@ def checked_grid(half=1.5, shape=(6, 5, 8)):
     return create_grid(np.full(3, -half), np.full(3, half), valid, initial_density=1.0)
 
 
+def without_damping(params, num_freqs):
+    """Returns parameters of a plain `MLP` that sees points as the prefiltered one of these parameters does.
+
+    Of a point all octaves are left, so that their rows of the first layer are part of its bias.
+    """
+    kernel, bias = (params["trunk_0"][name] for name in ("kernel", "bias"))
+    return {**params, "trunk_0": {"kernel": kernel[:-num_freqs], "bias": bias + kernel[-num_freqs:].sum(axis=0)}}
+
+
 def all_finite(tree):
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))

@@ -25,6 +25,9 @@ def compiled_once(tmp_path_factory):
 @pytest.fixture(scope="module")
 def unoptimized(compiled_once):
     """Switches most optimizations off, here and in child processes: compiling is faster and runs are short."""
+    if jax.config.values["jax_disable_most_optimizations"]:  # as in make test
+        yield
+        return
     jax.clear_caches()  # JAX would take what it has compiled with the other option
     with _options(jax_disable_most_optimizations=True):
         yield

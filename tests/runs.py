@@ -1,10 +1,13 @@
 """A run of seconds that tests share, and programs as processes."""
 
+import functools
+import json
 import os
 import pathlib
 import socket
 import subprocess
 import sys
+import tempfile
 
 from jaxnerf.configs import smoke
 
@@ -70,8 +73,25 @@ def start_together(count, program, *flags, **environment):
     return [start(program, *flags, f"--process_id={index}", **environment) for index in range(count)]
 
 
-def run(program, *flags):
-    """Returns (exit code, stdout, stderr) of python -m jaxnerf.<program>."""
-    process = start(program, *flags)
-    out, err = process.communicate(timeout=120)
-    return process.returncode, out, err
+@functools.cache
+def _fork_server():
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment.get("PYTHONPATH", "")])
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, ROOT / "tests" / "fork_server.py"], env=environment, **pipes)
+
+
+def run_forked(program, *flags, folder=ROOT):
+    """Returns (exit code, stdout, stderr) of python -m jaxnerf.<program>, or of a script, without a new interpreter.
+
+    It runs in a folder, as a fork of a process that has imported JAX: imports take longer than most of these programs.
+    Tests of starting, of signals, of several processes and of variables that Python reads use `start`.
+    """
+    server = _fork_server()
+    with tempfile.TemporaryDirectory() as streams:
+        out, err = pathlib.Path(streams, "out"), pathlib.Path(streams, "err")
+        request = {"program": str(program), "flags": list(map(str, flags)), "folder": str(folder)}
+        request |= {"environment": dict(os.environ), "out": str(out), "err": str(err)}
+        print(json.dumps(request), file=server.stdin, flush=True)
+        code = int(server.stdout.readline())
+        return code, out.read_text(), err.read_text()

@@ -60,7 +60,7 @@ SURFACE = {
     "turntable": "num_frames | center radius elevation up=(0.0, 0.0, 1.0)",
     "load_dataset": "dir | split='train' **options",
     "draw_batch": "seed step positions views active_pixels=None | batching='all_images' pixel_offset=0.5 ndc=False "
-    "extras=() needs=()",
+    "extras=() needs=() rays_per_side=1",
     "mlp_field": "| **options",
     "hash_grid_field": "| **options",
     "still_life": "x viewdirs |",

@@ -15,7 +15,7 @@ from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.metric_log import read_rows
-from runs import SMOKE_FLAGS, run, smoke_config
+from runs import SMOKE_FLAGS, run_forked, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -50,13 +50,13 @@ def assert_one_line(result, *parts):
     ],
 )
 def test_a_wrong_command_line_makes_no_workdir(tmp_path, flags, part):
-    assert_one_line(run("train", f"--workdir={tmp_path / 'run'}", *flags), part)
+    assert_one_line(run_forked("train", f"--workdir={tmp_path / 'run'}", *flags), part)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_syntax_error_in_a_config_is_reported(tmp_path):
     (tmp_path / "wrong.py").write_text("def get_config(:\n")
-    assert_one_line(run("train", f"--workdir={tmp_path}/run", f"--config={tmp_path}/wrong.py"), "wrong.py")
+    assert_one_line(run_forked("train", f"--workdir={tmp_path}/run", f"--config={tmp_path}/wrong.py"), "wrong.py")
 
 
 def test_evaluating_an_empty_folder_leaves_it_empty(tmp_path):
@@ -172,7 +172,7 @@ def test_a_full_disk_keeps_complete_checkpoints(trained, tmp_path):
     if mounted.returncode:
         pytest.skip(f"cannot mount a disk: {mounted.stderr.decode().strip()}")
     try:
-        result = run(
+        result = run_forked(
             "train",
             f"--workdir={disk}/run",
             *SMOKE_FLAGS,

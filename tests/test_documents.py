@@ -1,8 +1,6 @@
 """The documents: links lead somewhere, every public name and every page is listed, and Python examples run."""
 
 import re
-import subprocess
-import sys
 
 import jax
 import pytest
@@ -11,7 +9,7 @@ from ml_collections import ConfigDict
 import jaxnerf
 from jaxnerf import registry
 from jaxnerf.configs import default
-from runs import ROOT
+from runs import ROOT, run_forked
 
 pytest_plugins = ["run_fixtures"]
 
@@ -169,8 +167,8 @@ def _missing_field(name):
 
 
 def test_the_page_of_options_is_what_the_program_prints():
-    command = [sys.executable, "-m", "jaxnerf.train", "--config=help:options"]
-    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    code, printed, _ = run_forked("train", "--config=help:options")
+    assert code == 0
     _, _, rest = (DOCS / "configuration.md").read_text().partition("<!-- options -->\n")
     found, _, _ = rest.partition("<!-- end of options -->")
     assert found == printed, "write what jaxnerf-train --config=help:options prints between the marks"

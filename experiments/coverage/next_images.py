@@ -33,6 +33,7 @@ from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.next_images.coverage import ViewCoverage, choose_views
 from jaxnerf.evaluation.restore import newest_step, restore_run
+from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime import cli
 from jaxnerf.training import auto_config
 
@@ -87,7 +88,7 @@ def psnr_of(run, variables, views: Views) -> float:
     for index in np.unique(np.linspace(0, count - 1, min(_MOST_TEST_VIEWS, count)).astype(int)):
         height, width = (int(side) for side in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
-        rgb = run.render_image(variables, run.experiment.view_rays(views, index, pixels)).rgb
+        rgb = render_pixels(run, variables, views, index, pixels)[0].rgb
         mask = pixel_mask(views, index)
         squares = (np.clip(np.asarray(rgb), 0, 1) - np.asarray(views.image(index))) ** 2
         found.append(-10 * np.log10((squares if mask is None else squares[np.asarray(mask, bool)]).mean()))

@@ -149,7 +149,8 @@ def step_parts(context: Context) -> dict[str, Any]:
     GPU possibly not the products that a library computes. The product is one in float32.
     """
     experiment, state, data, config = _built(context, profiles.FULL_SIZE)
-    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
+    parts = experiment.model, experiment.optimizer, experiment.draw, experiment.losses
+    step = make_train_step(*parts, pixel_rays=experiment.pixel_rays)
     positions = jnp.arange(config.train.batch_size).reshape(-1, config.train.microbatch_size)
     no_updates = data._replace(cells=data.cells[:0])
     keys, batch = jax.jit(experiment.draw)(state.step, positions.reshape(-1), data)

@@ -138,7 +138,8 @@ def parts(config, views) -> tuple[dict[str, Counts], Any, tuple]:
     state = jax.eval_shape(lambda: create_state(model, experiment.optimizer, experiment.config.seed, cells))
     positions = jax.ShapeDtypeStruct((1, resolved.train.batch_size), jnp.int32)
     without = data._replace(cells=None if data.cells is None else data.cells[:0])
-    step = make_train_step(model, experiment.optimizer, experiment.draw, experiment.losses)
+    parts = model, experiment.optimizer, experiment.draw, experiment.losses
+    step = make_train_step(*parts, pixel_rays=experiment.pixel_rays)
 
     def draw(step, positions, data):
         return experiment.draw(step, positions[0], data)[1]

@@ -1,15 +1,17 @@
-"""Trains the embedded scene with and without reflections at equal seconds, and measures PSNR and errors of normals.
+"""Trains the embedded scene with and without reflections, and measures PSNR, times and errors of normals.
 
     python experiments/reflections/reflections.py --out=runs/reflections [--finishes=shiny,matt] [--steps=2000]
         [--page=docs/results/reflections.md --table=reflections]
 
-A step with reflections takes longer, so that the run without them takes as many steps more: both steps are timed in
-turn, before training. The truth of normals is the closed form at its own median depth. What is compared with it: the
-density's normals by automatic differentiation, those by differences over a step of the ray marching, those through
-the depths of neighbouring pixels, and what the field predicts. The views that are held out of
-training are farther from the others than the test views are.
+A step with reflections takes longer, so that a run without them takes as many steps more: both steps are timed in
+turn, before training, and so are the images of all runs, after it. Another run without them has the same number of
+steps. The truth of normals is the closed form at its own median depth. What is compared with it: the density's normals
+by automatic differentiation, those by differences over a step of the ray marching, those through the depths of
+neighbouring pixels, and what the field predicts. The views that are held out of training are farther from the others
+than the test views are.
 """
 
+import functools
 import pathlib
 import statistics
 import sys
@@ -40,7 +42,7 @@ _NUM_VIEWS = 3  # whose normals are measured
 _OPAQUE = 0.9  # opacity from which a pixel shows a surface
 _NEAR = 0.05  # world units, between the surface of the run and the true one
 _SAMPLES = 384  # of the closed form, per ray
-_HEADS = ("finish", "reflections", "steps", "ms a step", "test views, dB", "held-out views, dB")
+_HEADS = ("finish", "reflections", "steps", "ms a step", "ms a frame", "test views, dB", "held-out views, dB")
 _HEADS += ("density", "differences", "depths", "predicted")
 
 
@@ -52,22 +54,28 @@ def main(argv: list[str]) -> None:
         configs = {reflects: configuration(finish, reflects) for reflects in (False, True)}
         folder = pathlib.Path(_OUT.value) / f"{finish}_{_STEPS.value}"
         times = step_times(configs, folder / "times.json")
-        steps = {True: _STEPS.value, False: round(_STEPS.value * times["on"] / times["off"])}
-        for reflects, config in configs.items():
-            config = common.changed(config, {f"train.{name}": steps[reflects] for name in ("max_steps", "lr_steps")})
-            name = "on" if reflects else "off"
-            results = common.run(config, folder / name, split="test")
-            run = restore.restore_run(folder / name)
-            scores = results["psnr"], mean_psnr(run, common.load_split(config, "held_out"))
-            errors = normal_errors(run, common.load_split(config, "test"))
+        equal = round(_STEPS.value * times["on"] / times["off"])
+        steps = {"off": equal, "off, equal steps": _STEPS.value, "on": _STEPS.value}
+        runs, scores = {}, {}
+        for name, count in steps.items():
+            config = common.changed(configs[name == "on"], {"train.max_steps": count, "train.lr_steps": count})
+            workdir = folder / name.replace(", ", "_").replace(" ", "_")
+            results = common.run(config, workdir, split="test")
+            runs[name] = restore.restore_run(workdir)
+            scores[name] = results["psnr"], mean_psnr(runs[name], common.load_split(config, "held_out"))
+        test = common.load_split(config, "test")
+        frames = frame_times(runs, test)
+        for name, run in runs.items():
+            errors = normal_errors(run, test)
             cells = [f"{np.mean(each):.1f} ({np.median(each):.1f})" if len(each) else "" for each in errors]
             rows.append(
                 [
                     finish,
                     name,
-                    str(steps[reflects]),
-                    f"{1000 * times[name]:.1f}",
-                    *(f"{score:.2f}" for score in scores),
+                    str(steps[name]),
+                    f"{1000 * times[name.split(',')[0]]:.1f}",
+                    f"{1000 * frames[name]:.1f}",
+                    *(f"{score:.2f}" for score in scores[name]),
                     *cells,
                 ]
             )
@@ -102,6 +110,17 @@ def step_times(configs, path: pathlib.Path) -> dict[str, float]:
     times = {name: statistics.median(values[_TIMED.value // 4 :]) for name, values in found.items()}
     common.write_json(path, times)
     return times
+
+
+def frame_times(runs, views) -> dict[str, float]:
+    """Returns the median seconds of an image of each run, over all views, which the runs render in turn."""
+    variables = {name: run.variables(run.steps()[-1]) for name, run in runs.items()}
+    found = {name: [] for name in runs}
+    for index, size in enumerate(views.size):
+        for name, run in runs.items():
+            rays = run.experiment.view_rays(views, index, pixel_grid(*(int(side) for side in size)))
+            found[name].append(common.seconds(functools.partial(run.render_image, variables[name], rays)))
+    return {name: statistics.median(values) for name, values in found.items()}
 
 
 def mean_psnr(run, views) -> float:

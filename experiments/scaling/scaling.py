@@ -145,7 +145,8 @@ def _row(steps):
     experiment = build.build(config)
     valid, data = experiment.prepare(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
-    step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, experiment.losses)
+    parts = experiment.model, experiment.optimizer, experiment.draw, experiment.losses
+    step = make_train_step(*parts, pixel_rays=experiment.pixel_rays)
     parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
     rays, started = experiment.config.train.batch_size, time.perf_counter()
     size = experiment.config.train.microbatch_size

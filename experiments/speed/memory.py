@@ -1,6 +1,6 @@
 """Measures where the memory and the time of a training program go, stage by stage.
 
-    JAXNERF_SCENES=... taskset -c 0 python experiments/speed/memory.py --data_dir=can_undistorted \
+    JAXNERF_SCENES=... taskset -c 0 python experiments/speed/memory.py --data_dir=can \
         [--config=capture] [--seconds=60] [--at_end] [--page=FILE.md]
 
 The program is started twice: with empty caches, and with those that the first start leaves. The resident memory and the
@@ -29,7 +29,7 @@ from jaxnerf.runtime import cli
 HEADS = ("stage", "s", "CPU s", "MB at its end", "peak MB")
 COLUMNS = (*(f"first start: {head}" if head != "stage" else head for head in HEADS), *HEADS[1:])
 _CONFIG = flags.DEFINE_string("config", "capture", "Name of a config.")
-_DATA_DIR = flags.DEFINE_string("data_dir", "can_undistorted", "Dataset, of a config that has none.")
+_DATA_DIR = flags.DEFINE_string("data_dir", "can", "Dataset, of a config that has none.")
 _SECONDS = flags.DEFINE_float("seconds", 60.0, "Seconds of training.", lower_bound=0.1)
 _AT_END = flags.DEFINE_bool("at_end", True, "Whether the program scores the test views when it has trained.")
 _TRAINING, _LAST, _SAVING = "training", "reading the checkpoint", "saving the checkpoint"

@@ -24,6 +24,7 @@ import uncertainty_runs as runs
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.evaluation.metrics import object_mask, pixel_mask
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
+from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.evaluation.uncertainty import laplace
 from jaxnerf.evaluation.uncertainty.base import UncertaintySource
 from jaxnerf.evaluation.uncertainty.calibration import figures, pixel_error, score_order
@@ -105,7 +106,7 @@ def _scored(run, variables, views, predictors):
         height, width = (int(side) for side in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
         rays = run.experiment.view_rays(views, index, pixels)
-        image, truth = run.render_image(variables, rays), views.image(index)
+        image, truth = render_pixels(run, variables, views, index, pixels)[0], views.image(index)
         mask, on_object = pixel_mask(views, index), object_mask(views, index)
         kept = np.ones((height, width), bool) if mask is None else np.asarray(mask, bool)
         error = pixel_error(image.rgb, truth)

@@ -13,7 +13,7 @@ def get_config():
     config.occupancy.threshold, config.occupancy.cpu_pool_samples_per_ray = 0.03, 9.0
     train = config.train
     # lego_fast.py has other values here, chosen on lego alone.
-    train.averaging_power = 0.0
+    train.averaging_power, train.rays_per_side = 0.0, 1
     train.cpu_batch_size, train.max_seconds = 768, 600.0
     config.hash_grid.table_size = 2**19  # with 2**17, fox has 0.8 dB less, and fern at 400 px 0.5 dB
     config.losses.distortion = 0.001  # more accurate depths, but more weight in free space

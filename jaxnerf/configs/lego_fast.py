@@ -19,6 +19,7 @@ def get_config():
     train.muon = 0.6
     train.beta2, train.epsilon = 0.99, 1e-15  # entries that few samples reach get updates of full size, too
     train.averaging_power = 10.0
+    train.rays_per_side = "auto"
     train.log_every, train.save_every = 200, 4000
     # More rays with fewer samples, most of them near surfaces, learn faster than fewer rays with all samples.
     occupancy = config.occupancy

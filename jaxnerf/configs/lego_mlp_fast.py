@@ -17,4 +17,5 @@ def get_config():
     train.cpu_batch_size, train.max_steps, train.lr_steps = 320, 30_000, 30_000
     train.lr_init, train.lr_final, train.muon, train.epsilon = 16e-3, 6e-4, 0.2, 1e-8
     train.lr_decay_power = 1.0
+    train.rays_per_side = 1  # more are not measured
     return config

@@ -154,6 +154,7 @@ def draw_batch(
     ndc: bool = False,
     extras: Iterable[str] = (),
     needs: Iterable[str] = (),
+    rays_per_side: Int[ArrayLike, ""] = 1,
 ) -> tuple[Key[Array, " B"], Batch]:
     """Draws random rays with their colours: a part of one step's batch.
 
@@ -174,6 +175,8 @@ def draw_batch(
             random observation of `views.sparse` instead, and has the colour of the pixel around it. The depth of the
             others is interpolated, if `views.sparse.interpolated` is known.
         needs: the optional fields of Rays to fill, see `view_rays`.
+        rays_per_side: n; each n^2 positions, from a multiple of n^2 on, are rays of one pixel on a regular grid, and
+            their cones are as wide as its cells.
 
     Returns:
         One key per ray, for sampling along the rays; and the Batch [B].
@@ -182,7 +185,7 @@ def draw_batch(
         ValueError: on an unknown batching, or if a depth is wanted and the views have no observations.
     """
     observed = not set(DEPTH_FIELDS).isdisjoint(extras)
-    keys, index, chosen = _draw(seed, step, positions, views, active_pixels, batching, observed)
+    keys, index, chosen = _draw(seed, step, positions, views, active_pixels, batching, observed, rays_per_side)
     view = jnp.searchsorted(views.offset, index, side="right", method="compare_all") - 1
     place = index - views.offset[view]
     width = views.size[view, 1]
@@ -190,7 +193,13 @@ def draw_batch(
     if observed:  # an observation is measured as the pixels are where their rays go through their centres
         at = jnp.asarray(views.sparse.pixel)[chosen] + (pixel_offset - 0.5)
         pixels = jnp.where((chosen >= 0)[:, None], at, pixels)
+    several = not _is_one(rays_per_side)
+    if several:
+        place_in_pixel = jnp.stack([positions % rays_per_side, positions // rays_per_side % rays_per_side], axis=-1)
+        pixels += (place_in_pixel + 0.5) / rays_per_side - 0.5
     rays = jax.vmap(lambda view, pixel: view_rays(views, view, pixel, ndc=ndc, needs=needs))(view, pixels)
+    if several and rays.radius is not None:
+        rays = dataclasses.replace(rays, radius=rays.radius / rays_per_side)
     stored = views.pixels
     colors = stored.rows[positions] if isinstance(stored, BatchPixels) else stored[index]
     weight = None if views.loss_weight is None else jnp.asarray(views.loss_weight)[view]
@@ -245,13 +254,18 @@ def draw_pixels(
     *,
     batching: str = "all_images",
     extras: Iterable[str] = (),
+    rays_per_side: Int[ArrayLike, ""] = 1,
 ) -> tuple[Key[Array, " B"], Int[Array, " B"]]:
     """Returns the keys of `draw_batch` and the ids of the pixels that its rays pass through."""
     observed = not set(DEPTH_FIELDS).isdisjoint(extras)
-    return _draw(seed, step, positions, views, active_pixels, batching, observed)[:2]
+    return _draw(seed, step, positions, views, active_pixels, batching, observed, rays_per_side)[:2]
 
 
-def _draw(seed, step, positions, views, active_pixels, batching, observed):
+def _is_one(rays_per_side):
+    return isinstance(rays_per_side, int) and rays_per_side == 1
+
+
+def _draw(seed, step, positions, views, active_pixels, batching, observed, rays_per_side):
     """Returns keys and ids, see `draw_pixels`; and the index [B] of each ray's observation, -1 for none.
 
     The last value is None unless observed.
@@ -261,6 +275,9 @@ def _draw(seed, step, positions, views, active_pixels, batching, observed):
     key = step_key(seed, step)
     ray_keys = jax.vmap(lambda position: jax.random.fold_in(key, position))(positions)
     pixel_keys, keys = jax.vmap(lambda key: tuple(jax.random.split(key)))(ray_keys)
+    if not _is_one(rays_per_side):  # the pixel of the first of its rays
+        first_rays = positions - positions % rays_per_side**2
+        pixel_keys = jax.vmap(lambda position: jax.random.split(jax.random.fold_in(key, position))[0])(first_rays)
     first, count = 0, views.pixels.shape[0] if active_pixels is None else active_pixels.size
     if batching == "single_image":
         # No ray has this position, so no ray has this key.

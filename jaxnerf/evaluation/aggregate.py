@@ -138,11 +138,12 @@ def _results(run, workdir, views, variables, finished, provenance):
     seconds = sum(row["seconds"] for row in timed) / len(timed)
     trained = [row for row in metric_log.read_rows(workdir) if row["step"] <= provenance["step"]]
     conventions = {**dataset.conventions(run.experiment.config.data), "chunk": run.experiment.config.eval.chunk}
+    rays_per_pixel = run.experiment.config.train.rays_per_side**2
     return {
         **means(rows),
         "views": len(rows),
         # The rate of one process, averaged over all processes that rendered.
-        "rays_per_second": sum(view["rays"] for view in finished) / len(rows) / seconds,
+        "rays_per_second": rays_per_pixel * sum(view["rays"] for view in finished) / len(rows) / seconds,
         "seconds_per_frame": seconds,
         "step": provenance["step"],
         "rays_seen": trained[-1].get("rays") if trained else None,

@@ -23,6 +23,7 @@ from jaxnerf.evaluation import aggregate, output_images
 from jaxnerf.evaluation.metrics import image_metrics, object_mask, pixel_mask
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
+from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime import atomic_files, memory, processes, shards, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
@@ -189,7 +190,7 @@ def score_run(
         with atomic_files.naming(partial):
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
-            _score_views(run, functools.partial(run.render_image, variables), views, partial, shard, predictor)
+            _score_views(run, functools.partial(render_pixels, run, variables, views), views, partial, shard, predictor)
             options = {"run": run, "workdir": workdir, "views": views, "variables": variables, "provenance": provenance}
             options |= {"predictor": predictor}
             return aggregate.merge(partial, target, overwrite=overwrite, **options)
@@ -273,14 +274,13 @@ def _score_views(run, render, views, folder, shard, predictor):
         name, (height, width) = views.names[index], (int(value) for value in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
         started = time.perf_counter()
-        rays = run.experiment.view_rays(views, index, pixels)
-        image = jax.block_until_ready(render(rays))
+        image, depth = jax.block_until_ready(render(index, pixels))
         seconds = time.perf_counter() - started
         truth = views.image(index)
         row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
-        depth = run.experiment.world_depth(views, index, pixels, image.depth)
         if predictor is not None:
             masks = pixel_mask(views, index), object_mask(views, index)
+            rays = run.experiment.view_rays(views, index, pixels)
             error, figures = predictor.scored(rays, image.rgb, truth, *masks)
             output_images.write_error(folder, f"{index:03d}", error)
             row |= figures

@@ -16,10 +16,12 @@ from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.metrics import pixel_mask
-from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_run
+from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
+from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, memory, processes, stages
 from jaxnerf.training import metric_log
+from jaxnerf.training.optimizer import image_params
 from jaxnerf.training.state import TrainState
 from jaxnerf.training.workdir import load_config
 
@@ -170,7 +172,7 @@ class Previews:
         height, width = (int(value) for value in views.size[index])
         every = math.ceil(math.sqrt(height * width / _MAX_RAYS))
         pixels = pixel_grid(height, width, offset=experiment.config.data.pixel_offset)[::every, ::every]
-        rgb = self._run.render_image(variables, experiment.view_rays(views, index, pixels)).rgb
+        rgb = render_pixels(self._run, variables, views, index, pixels)[0].rgb
         truth, mask = views.image(index)[::every, ::every], pixel_mask(views, index)
         mask = None if mask is None else mask[::every, ::every]
         score = float(psnr(round_to_8_bits(rgb), round_to_8_bits(truth), mask=mask))

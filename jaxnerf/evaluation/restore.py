@@ -18,8 +18,7 @@ from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
-from jaxnerf.training.optimizer import averaged_params
-from jaxnerf.training.state import PROGRESS, TrainState, create_state
+from jaxnerf.training.state import create_state
 from jaxnerf.training.workdir import load_config
 
 
@@ -92,8 +91,7 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         return params, bake(params) if bake else grid
 
     def variables(step):
-        state = checkpoints.load(step, template())
-        return variables_of(image_params(state), state.grid)
+        return variables_of(*checkpoints.load_rendered(step, template()))
 
     def model_with(settings, wrap=None):
         other = _with_settings(config, settings)
@@ -134,15 +132,6 @@ def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:
 
 def _with_settings(config, settings):
     return changed(config, {f"eval.{name}": value for name, value in settings.items()}) if settings else config
-
-
-def image_params(state: TrainState) -> dict[str, Any]:
-    """Returns the parameters with which images of a state are rendered.
-
-    They are averaged, see `averaged_params`. Where the model asks for it, "progress" is that of the state.
-    """
-    progress = {PROGRESS: state.counters[PROGRESS]} if PROGRESS in state.counters else {}
-    return {**averaged_params(state), **progress}
 
 
 def render_settings(run: TrainedRun) -> dict[str, Any]:

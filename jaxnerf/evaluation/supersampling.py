@@ -1,4 +1,4 @@
-"""Several rays a pixel where a pixel covers more of the scene than in training: in small images, and from afar.
+"""Several rays a pixel where a pixel covers more of the scene than a ray of training: in small images, and from afar.
 
 A field that is trained on pixels of one size knows the colours along their rays. One ray through the centre of a
 larger pixel shows a point of what the pixel should average; rays as dense as those of training show all of it.
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from jaxnerf.core.types import Rendering
 from jaxnerf.core.views import Views
@@ -29,7 +29,7 @@ class Footprint(NamedTuple):
         focal: px, of the images; the median.
         center: [3] world units, what the cameras look at.
         distance: world units, of the farthest camera from it; infinite in normalised device coordinates.
-        covered: sides of a pixel that the field is trained for, over those of the largest images.
+        covered: sides of what a ray of training stands for, over those of the pixels of the largest images.
     """
 
     focal: float
@@ -61,11 +61,12 @@ def trained_footprint(run: Any, views: Views) -> Footprint:
     """Returns the Footprint of the training images of a TrainedRun; no pixels of the Views are read."""
     config, look_at = run.experiment.config, LookAt(views)
     sized = "radius" in run.experiment.model.needs  # the field knows the size of its sample
+    per_ray = 1 / config.train.rays_per_side  # of a pixel's side
     return Footprint(
         focal=float(np.median(_mean_focal(views.cameras.focal))),
         center=look_at.center,
         distance=math.inf if config.data.ndc else float(look_at.distance.max()),
-        covered=2.0 ** (config.data.num_scales - 1) if sized else 1.0,
+        covered=2.0 ** (config.data.num_scales - 1) * per_ray if sized else per_ray,
     )
 
 
@@ -74,9 +75,9 @@ def render_pixels(
     variables: Any,
     views: Views,
     index: int,
-    pixels: Num[np.ndarray, "H W 2"],
+    pixels: Num[ArrayLike, "H W 2"],
     *,
-    side: int = 1,
+    side: int | None = None,
     size: float = 1.0,
 ) -> tuple[Rendering, Float[Array, "H W"]]:
     """Renders pixels of a view, each as the mean over side x side rays on a regular grid.
@@ -87,13 +88,14 @@ def render_pixels(
         views: with the camera.
         index: of the view.
         pixels: [H, W, 2] px of the view's camera, the middle of each pixel.
-        side: rays along a side of a pixel.
+        side: rays along a side of a pixel; None: as many as in training.
         size: px of the view's camera, the side of a pixel.
 
     Returns:
         Rendering [H, W], and the mean distance [H, W] in the units of the dataset's files, see `world_depth`.
     """
-    experiment = run.experiment
+    experiment, pixels = run.experiment, np.asarray(pixels)
+    side = side or experiment.config.train.rays_per_side
     places = (np.arange(side) + 0.5) / side - 0.5
     offsets = np.float32(size * np.stack(np.meshgrid(places, places, indexing="xy"), axis=-1).reshape(-1, 1, 1, 2))
     fitting = [each for each in (side**2, side) if each * pixels[..., 0].size <= _RAYS_PER_CALL]

@@ -15,6 +15,7 @@ from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import refined_views
+from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.exporters.base import ExportSource
 from jaxnerf.exporters.gaussians import Gaussians, rasterize, read_spz, write_gaussians, write_spz
 from jaxnerf.exporters.points import surface_points, thinned
@@ -129,7 +130,7 @@ def score(source: ExportSource, gaussians: Gaussians | None) -> tuple[float, int
     for index in map(int, np.arange(count) * len(views.size) // count):
         if gaussians is None:
             pixels = pixel_grid(*(int(side) for side in views.size[index]))
-            image = run.render_image(source.variables, run.experiment.view_rays(views, index, pixels)).rgb
+            image = render_pixels(run, source.variables, views, index, pixels)[0].rgb
         else:
             image = _image_of(source, gaussians, views, index)
         image = np.clip(image, 0, 1).astype(np.float32)

@@ -20,6 +20,7 @@ from jaxnerf.registry import Part
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
 _MAX_OCTAVES = 64  # of encoding.positional_encoding
 _PIXELS_PER_WAVE = 4  # length of the shortest wave of the encoding
+_PIXEL_SIDE = math.sqrt(3)  # at a sample, over the radius of the cone, see `pixel_radius`
 
 DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
 
@@ -40,7 +41,8 @@ class MlpOptions(Options):
     prefilter: bool = option(
         False,
         "Whether the position's encoding is its mean over the part of the pixel's cone that a sample stands for "
-        "(integrated positional encoding, arXiv:2103.13415). auto: as for `hash_grid.prefilter`.",
+        "(integrated positional encoding, arXiv:2103.13415), and which is no shorter than the pixel is wide there. The "
+        "network also reads what the mean leaves of each octave. auto: as for `hash_grid.prefilter`.",
         auto=True,
     )
     use_viewdirs: bool = option(True, "whether colour depends on the direction")
@@ -89,7 +91,7 @@ def mlp_field(**options: Any) -> Field:
         returns density [..., S] in 1 / world unit and rgb [..., S, 3] in [0, 1], both float32.
         With a key (one, or one per ray) normal noise of that standard deviation is added to the density
         before its activation, the paper's regulariser for real scenes. With prefilter, apply asks for the radius and
-        the length [..., 1 or S] at each sample, too, see `frustum_variance`. With reflections the field has normals.
+        the length [..., 1 or S] at each sample, too, see `cone_variance`. With reflections the field has normals.
 
     Raises:
         ValueError: if density_activation is unknown.
@@ -156,8 +158,8 @@ class MLP(linen.Module):
         num_freqs: octaves of the position's encoding.
         num_view_freqs: octaves of the direction's encoding.
         encode: False: position and direction enter without positional encoding.
-        prefilter: whether the position's encoding is the `integrated_encoding` over the cone at each sample, whose
-            radius and length are inputs, too.
+        prefilter: whether the position's encoding is the `integrated_encoding` over the cone at each sample, of the
+            variance `cone_variance`, followed by the `damping_of_octaves`; radius and length are inputs, too.
         use_viewdirs: False: colour depends on position alone; there is no bottleneck and no view layer.
         reflections: whether colour depends on the reflected direction, too, see `reflection_features`.
         density_activation: "relu" or "softplus".
@@ -195,8 +197,11 @@ class MLP(linen.Module):
         backward pass read memory contiguously. A small network on a CPU gains most from this.
         """
         shape = x.shape[:-1]
-        variance = planes(frustum_variance(viewdirs, radius, length)) if self.prefilter else None
-        encoded = encode_planes(planes(x), num_freqs=self.num_freqs * self.encode, variance=variance)
+        num_freqs = self.num_freqs * self.encode
+        variance = planes(cone_variance(viewdirs, radius, length)) if self.prefilter else None
+        encoded = encode_planes(planes(x), num_freqs=num_freqs, variance=variance)
+        if self.prefilter:
+            encoded = jnp.concatenate([encoded, damping_of_octaves(variance.mean(axis=0), num_freqs)])
         encoded = encoded.astype(self.compute_dtype)
         hidden = ()
         for layer in range(self.depth):
@@ -274,6 +279,36 @@ class Dense(Affine):
                 rows.astype(value.dtype), value, axes=(0, 0), preferred_element_type=self.dtype
             )
         return total
+
+
+def cone_variance(
+    viewdirs: Float[ArrayLike, "*batch #samples 3"],
+    radius: Float[ArrayLike, "*batch samples"],
+    length: Float[ArrayLike, "*batch samples"],
+) -> Float[Array, "*batch samples 3"]:
+    """Computes the `frustum_variance` [..., S, 3] of samples that are no shorter than the pixel is wide.
+
+    The side of the pixel at the sample is sqrt(3) times the radius. The Gaussian of a shorter sample would be flat, and
+    another one for each direction of the ray, so that the network would have to learn a surface for all of them. As
+    long as the pixel is wide, it is a ball with the variance of the pixel, the same for all directions.
+
+    Args:
+        viewdirs: see `frustum_variance`, as the others.
+    """
+    return frustum_variance(viewdirs, radius, jnp.maximum(length, _PIXEL_SIDE * radius))
+
+
+def damping_of_octaves(variance: Float[ArrayLike, " N"], num_freqs: int) -> Float[Array, "F N"]:
+    """Computes what the mean over a Gaussian leaves of the waves of each octave, exp(-4^k variance / 2).
+
+    A wave that is small in the encoding may be averaged away or near its zero; with this the network can tell.
+
+    Args:
+        variance: [N] at least 0.
+        num_freqs: F octaves.
+    """
+    octaves = np.float32(2.0 ** np.arange(num_freqs))[:, None]
+    return jnp.exp(-0.5 * octaves**2 * variance[None])
 
 
 def planes(vectors: Float[ArrayLike, "*batch 3"]) -> Float[Array, "3 N"]:

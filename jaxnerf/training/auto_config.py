@@ -69,6 +69,8 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     facts = facts._replace(
         predicts_normals=getattr(field, "reflections", False),
         large_field=getattr(field, "is_large", False),
+        factor=config.data.factor,
+        trains_cameras=config.cameras.any,
         busy_rays=sampler.busy_rays(device) if hasattr(sampler, "busy_rays") else None,
     )
     config = _resolve_sections(config, ["train"], facts, device, lines)

@@ -26,6 +26,7 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.training.camera_parameters import CameraParameters
 from jaxnerf.training.config import Config, RunConfig, read_config
 from jaxnerf.training.optimizer import make_optimizer
+from jaxnerf.training.pixel_rays import PixelRays
 from jaxnerf.training.step import ProgressData, StepLoss, TrainData
 
 # The optional fields that datasets provide.
@@ -50,6 +51,7 @@ class Experiment(NamedTuple):
         world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
         prepare: Views -> (InitialCells, or None without a grid; TrainData).
         background: [3] the colour behind the scene; None: black.
+        pixel_rays: the several rays of a pixel that draw takes; None: each ray is a pixel.
     """
 
     config: RunConfig
@@ -66,6 +68,7 @@ class Experiment(NamedTuple):
     world_depth: Callable[..., Any]
     prepare: Callable[..., tuple]
     background: tuple[float, ...] | None
+    pixel_rays: PixelRays | None
 
 
 def build(config: Config) -> Experiment:
@@ -88,6 +91,10 @@ def build(config: Config) -> Experiment:
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
     options = {"batching": train.batching, "extras": extras}
+    pixel_rays = _pixel_rays(train, cameras, extras)
+
+    def rays_per_side(step, data):
+        return {} if pixel_rays is None else {"rays_per_side": pixel_rays.side_at(data.progress.at(step))}
 
     def draw(step, positions, data):
         return ray_batches.draw_batch(
@@ -100,6 +107,7 @@ def build(config: Config) -> Experiment:
             ndc=given.ndc,
             needs=model.needs,
             **options,
+            **rays_per_side(step, data),
         )
 
     def draw_patches(step, count, data):
@@ -107,7 +115,8 @@ def build(config: Config) -> Experiment:
         return patch_rays.draw_patches(data.seed, step, data.views, count=count, **common)
 
     def pixel_ids(step, positions, data):
-        return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **options)[1]
+        common = {**options, **rays_per_side(step, data)}
+        return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **common)[1]
 
     return Experiment(
         config=config,
@@ -124,7 +133,22 @@ def build(config: Config) -> Experiment:
         world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=given.ndc)),
         prepare=functools.partial(_prepare, config, model, extras),
         background=dataset.color_behind(given),
+        pixel_rays=pixel_rays,
     )
+
+
+def _pixel_rays(train, cameras, extras):
+    """Returns the PixelRays that the options of training describe; None where each ray is a pixel."""
+    if train.rays_per_side == 1:
+        return None
+    reasons = {
+        "the section cameras has parameters of each training image, which are trained by rays through pixels": cameras,
+        "losses.depth needs rays through sparse points": not set(ray_batches.DEPTH_FIELDS).isdisjoint(extras),
+    }
+    for reason, holds in reasons.items():
+        if holds:
+            raise ValueError(f"train.rays_per_side is {train.rays_per_side}, expected 1, as {reason}")
+    return PixelRays(train.rays_per_side, train.one_ray_fraction)
 
 
 def _in_fixed_order(model, losses, cameras):
@@ -378,12 +402,13 @@ def _prepare(config, model, extras, views):
                 depths = np.pad(depths, [(0, len(drawn.size) - len(views.size)), *[(0, 0)] * 3])
             sparse = dataclasses.replace(sparse, interpolated=depths)
     progress = None
-    if "progress" in model.needs:
+    if "progress" in model.needs or config.train.rays_per_side > 1:
         # Like the learning rate: a longer run that goes on with the same lr_steps does not go back.
         progress = ProgressData(np.float32(config.train.lr_steps), np.float32(0))
     radii = None
     if model.grid_schedule is not None and "radius" in model.needs:
-        radii = np.float32(footprint_radii(views, config.data.num_scales))
+        smallest, largest = footprint_radii(views, config.data.num_scales)
+        radii = np.float32([smallest / config.train.rays_per_side, largest])
     # The mask is part of the active pixels.
     drawn = dataclasses.replace(drawn, mask=None, sparse=sparse)
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)

@@ -5,7 +5,8 @@ import functools
 import os
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,9 +14,10 @@ from orbax.checkpoint import v1 as ocp
 
 from jaxnerf.runtime import atomic_files, processes
 from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.training.optimizer import image_params
 from jaxnerf.training.state import TrainState
 
-_FINGERPRINT = "fingerprint"
+_WHOLE, _RENDERED = "fingerprint", "fingerprint_of_rendered"  # in the metadata of a checkpoint
 _SMALL = 2**25  # bytes of a state that is copied at once
 
 
@@ -48,7 +50,8 @@ class Checkpoints:
             try:
                 _silence_orbax()
                 with _one_array_at_a_time(state):
-                    self._open().save(step, state, force=True, custom_metadata={_FINGERPRINT: _fingerprint(state)})
+                    fingerprints = {_WHOLE: _fingerprint(state), _RENDERED: _fingerprint(_rendered(state))}
+                    self._open().save(step, state, force=True, custom_metadata=fingerprints)
             except Exception as error:  # orbax raises many kinds
                 raise ValueError(
                     f"{self._folder / str(step)}: cannot be written ({_reason(error)}); free disk space and "
@@ -61,13 +64,34 @@ class Checkpoints:
         Raises:
             ValueError: if the checkpoint does not fit, or is not what was saved; names it.
         """
-        abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
+        with self._reading(step) as saved:
+            state = self._open().load(step, _abstract(like))
+            _check(step, state, state, saved[_WHOLE])
+            return state
+
+    def load_rendered(self, step: int, like: TrainState) -> tuple[dict[str, Any], Any]:
+        """Returns what renders images at a step, `image_params` and the grid, and does not read the rest of the state.
+
+        Args and errors are those of `load`. A checkpoint of an earlier version is read as a whole.
+        """
+        with self._reading(step) as saved:
+            if _RENDERED not in saved:
+                return _rendered(self.load(step, like))
+            abstract = _abstract(like)
+            numbers = jax.tree.unflatten(jax.tree.structure(abstract), range(len(jax.tree.leaves(abstract))))
+            read = {numbers.step, *jax.tree.leaves(_rendered(numbers))}
+            state = self._open().load(step, jax.tree.map(lambda n, x: x if n in read else ..., numbers, abstract))
+            _check(step, state, _rendered(state), saved[_RENDERED])
+            return _rendered(state)
+
+    @contextlib.contextmanager
+    def _reading(self, step) -> Iterator[dict[str, str]]:
+        """Yields the fingerprints of a checkpoint; an error while it is read becomes a ValueError."""
         _silence_orbax()
         try:
             self._open().reload()  # another process may have written it since
-            state = self._open().load(step, abstract)
-            self._verify(step, state)
-            return state
+            metadata = atomic_files.read_json(self._folder / str(step) / "_CHECKPOINT_METADATA", "it was changed")
+            yield metadata["custom_metadata"]
         except Exception as error:  # orbax raises many kinds
             raise ValueError(
                 f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
@@ -120,14 +144,6 @@ class Checkpoints:
             )
         return self._writer
 
-    def _verify(self, step, state):
-        """Raises a ValueError if a state is not the one that was saved; orbax does not detect changed numbers."""
-        metadata = atomic_files.read_json(self._folder / str(step) / "_CHECKPOINT_METADATA", "it was changed")
-        if metadata["custom_metadata"][_FINGERPRINT] != _fingerprint(state):
-            raise ValueError("its numbers are not those that were saved")
-        if int(state.step) != step:
-            raise ValueError(f"it holds step {int(state.step)}")
-
     def _set_aside(self, step, error):
         path, number = self._folder / f"{step}.unreadable", 1
         while path.exists():
@@ -141,8 +157,24 @@ class Checkpoints:
         return f"{why}; kept as {path.name}, continuing from the previous checkpoint"
 
 
-def _fingerprint(state):
-    return fingerprint(jax.tree.map(np.asarray, state))
+def _abstract(like):
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
+
+
+def _rendered(state):
+    return image_params(state), state.grid
+
+
+def _fingerprint(tree):
+    return fingerprint(jax.tree.map(np.asarray, tree))
+
+
+def _check(step, state, read, saved):
+    """Raises a ValueError if what was read is not what was saved; orbax does not detect changed numbers."""
+    if _fingerprint(read) != saved:
+        raise ValueError("its numbers are not those that were saved")
+    if int(state.step) != step:
+        raise ValueError(f"it holds step {int(state.step)}")
 
 
 def _one_array_at_a_time(state):

@@ -382,6 +382,7 @@ def _compile(experiment, views, together=()):
         experiment.losses,
         experiment.cameras,
         experiment.draw_patches,
+        experiment.pixel_rays,
     )
     turns = many and many_runs.runs_in_turn()
     if many and not turns:
@@ -467,19 +468,20 @@ def _gather_ahead(run, ids, pixels):
         ids: (step, data) -> [batch] int32, the pixels that a step draws; jitted.
         pixels: [P, C] of all views, on the host.
     """
-    step, drawn = None, None
+    step, drawn, progress = None, None, None
 
     def run_with_pixels(state, data):
-        nonlocal step, drawn
+        nonlocal step, drawn, progress
         if step is None:
-            step = int(state.step)
+            step, progress = int(state.step), data.progress
             drawn = ids(step, data)
+        drawn_with, progress = progress, data.progress
         template = data.views.pixels
         rows = devices.place(pixels[np.asarray(drawn)], template.rows.sharding)
         step += 1
         drawn = ids(step, data)  # before the step starts, as the device would compute this after it
         views = dataclasses.replace(data.views, pixels=dataclasses.replace(template, rows=rows))
-        return run(state, data._replace(views=views))
+        return run(state, data._replace(views=views, progress=drawn_with))  # on which the pixels depend
 
     return run_with_pixels
 

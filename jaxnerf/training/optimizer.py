@@ -12,7 +12,7 @@ import optax
 from jaxnerf.core.loops import is_cpu
 from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Options, at_least, option
 from jaxnerf.training.camera_parameters import CAMERAS, CameraOptions
-from jaxnerf.training.state import TrainState
+from jaxnerf.training.state import PROGRESS, TrainState
 
 _MIN_SIDE = 8  # least inputs and outputs of a layer that Muon updates; smaller layers gain nothing
 # Root mean square of a matrix's entries at which weight decay is as large as an update by Muon. The size of such an
@@ -273,3 +273,12 @@ def with_averaging(optimizer: optax.GradientTransformation, power: float) -> opt
 def averaged_params(state: TrainState) -> Any:
     """Returns the parameters that evaluation uses: the averaged ones, or the last ones without averaging."""
     return state.opt_state.average if isinstance(state.opt_state, Averaging) else state.params
+
+
+def image_params(state: TrainState) -> dict[str, Any]:
+    """Returns the parameters with which images of a state are rendered.
+
+    They are averaged, see `averaged_params`. Where the model asks for it, "progress" is that of the state.
+    """
+    progress = {PROGRESS: state.counters[PROGRESS]} if PROGRESS in state.counters else {}
+    return {**averaged_params(state), **progress}

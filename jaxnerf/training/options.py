@@ -7,13 +7,15 @@ import jax
 
 from jaxnerf.data.ray_batches import BATCHINGS
 from jaxnerf.models.base import ViewOptions
-from jaxnerf.options import Changes, Device, Facts, at_least, infer, is_auto, option
+from jaxnerf.options import Changes, Device, Facts, at_least, between, infer, is_auto, option
 from jaxnerf.runtime import devices, processes
 from jaxnerf.training.dead_networks import CHECK_EVERY
 from jaxnerf.training.optimizer import OptimizerOptions
 
 UNLIMITED_STEPS = 10**7  # max_steps of a run that max_seconds ends
 _STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
+_FACTOR_OF_SEVERAL_RAYS = 8  # at which a pixel of an image averages so much that one ray blurs the field
+_SHORT_SECONDS, _SHORT_STEPS = 30.0, 2000  # a shorter run is better with more pixels than with sharper ones
 _MAX_STEPS_PER_DISPATCH = 16  # on an accelerator, where a dispatch costs as much as a small step
 
 
@@ -42,6 +44,18 @@ class TrainOptions(OptimizerOptions):
     )
     batching: str = option(
         "all_images", "where a step draws its rays; `single_image`: from one view", choices=BATCHINGS
+    )
+    rays_per_side: int = option(
+        1,
+        "Rays along each side of a pixel in the last part of training and in images: their mean is the pixel's colour. "
+        "A step then takes as many rays, and fewer pixels. auto: 2 where alpha bounds the scene and `data.factor` is 8 "
+        "or more, as one ray blurs the field then, in runs of at least 30 s or 2,000 steps; otherwise 1.",
+        range=at_least(1),
+        auto=True,
+        changes=Changes.MODEL,
+    )
+    one_ray_fraction: float = option(
+        0.6, "fraction of training before which a pixel has one ray, see `rays_per_side`", range=between(0, 1)
     )
     parallel: str = option(
         "auto",
@@ -121,7 +135,25 @@ class TrainOptions(OptimizerOptions):
         elif decay >= UNLIMITED_STEPS:  # several processes have no common clock
             decay, end = planned, f"step {planned:,}"
         options, last = infer(options, lr_steps=(decay, f"training      learning rate decays until {end}"))
-        return options, lines + more + last
+        options, rays_of_pixel = infer(options, rays_per_side=options._rays_per_side(facts))
+        return options, lines + more + last + rays_of_pixel
+
+    def _rays_per_side(self, facts):
+        """Returns the rays along a pixel's side, and the line that reports them."""
+        reasons = {
+            "alpha does not bound the scene": not facts.has_alpha,
+            f"data.factor is {facts.factor}": facts.factor < _FACTOR_OF_SEVERAL_RAYS,
+            "cameras are trained": facts.trains_cameras,
+            f"train.max_seconds is {self.max_seconds:g}": 0 < self.max_seconds < _SHORT_SECONDS,
+            f"train.max_steps is {self.max_steps}": self.max_steps < _SHORT_STEPS,
+            f"train.batch_size is {self.batch_size}": self.batch_size % 4,
+            f"train.microbatch_size is {self.microbatch_size}": not is_auto(size := self.microbatch_size) and size % 4,
+        }
+        for reason, holds in reasons.items():
+            if holds:
+                return 1, f"pixels        1 ray each, as {reason}"
+        start = 100 * self.one_ray_fraction
+        return 2, f"pixels        4 rays each after {start:g} % of training, as data.factor is {facts.factor}"
 
     def resolve_for_device(self, device: Device) -> tuple["TrainOptions", list[str]]:
         """Infers how the rays of a step, and the steps, are grouped."""
@@ -130,7 +162,10 @@ class TrainOptions(OptimizerOptions):
         if is_auto(self.microbatch_size):
             if is_auto(self.batch_size):
                 raise ValueError("train.batch_size is 'auto'; resolve the config against a dataset, or set a number")
-            size = devices.default_microbatch(self.batch_size // len(used), device.samples_per_ray, device.platform)
+            together = self._rays_per_pixel
+            size = together * devices.default_microbatch(
+                self.batch_size // len(used) // together, together * device.samples_per_ray, device.platform
+            )
         most = 1 if device.is_cpu else _MAX_STEPS_PER_DISPATCH
         whole = math.gcd(*host_intervals(self))
         steps = max(count for count in range(1, most + 1) if whole % count == 0)
@@ -140,7 +175,18 @@ class TrainOptions(OptimizerOptions):
             steps_per_dispatch=(steps, f"dispatch      {steps} training steps at a time, for this device"),
         )
 
+    @property
+    def _rays_per_pixel(self):
+        return 1 if is_auto(self.rays_per_side) else self.rays_per_side**2
+
     def check(self) -> None:
+        for name in ("batch_size", "microbatch_size"):
+            value = getattr(self, name)
+            if not is_auto(value) and value % self._rays_per_pixel:
+                raise ValueError(
+                    f"{name} is {value} and rays_per_side {self.rays_per_side}, expected a multiple of "
+                    f"{self._rays_per_pixel}, the rays of a pixel; change one of them"
+                )
         for name in ("max_steps", "lr_steps"):
             value = getattr(self, name)
             if not is_auto(value) and value >= UNLIMITED_STEPS and not self.max_seconds:

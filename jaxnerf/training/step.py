@@ -19,6 +19,7 @@ from jaxnerf.fields.base import field_normals, field_scene
 from jaxnerf.models.base import Model
 from jaxnerf.training.camera_parameters import CameraParameters, networks
 from jaxnerf.training.dead_networks import count_dead_steps
+from jaxnerf.training.pixel_rays import PixelRays
 from jaxnerf.training.state import PROGRESS, TrainState
 
 _RAYS_PER_SURFACE = 4  # of a batch: a loss of surfaces evaluates the field at one sample of every fourth ray
@@ -53,7 +54,7 @@ class TrainData(NamedTuple):
         radii: [2] float32 world units, smallest and largest radius of a pixel's cone, see `update_grid`; None where
             the model does not ask for the radius, or has no grid.
         decay: DecayData of the learning rate; None: as the optimizer's options say.
-        progress: ProgressData; None where the model does not ask for the progress.
+        progress: ProgressData; None where neither the model nor the number of rays of a pixel depends on the progress.
     """
 
     seed: Any
@@ -88,6 +89,7 @@ def make_train_step(
     losses: Sequence[StepLoss],
     cameras: CameraParameters | None = None,
     patches: Callable[..., tuple] | None = None,
+    pixel_rays: PixelRays | None = None,
 ) -> Callable[..., tuple]:
     """Makes the pure training step.
 
@@ -98,6 +100,7 @@ def make_train_step(
         losses: at least one must be a loss of the renderings.
         cameras: the parameters of the training images; None: none.
         patches: (step, count, data) -> (keys [B], Rays [B]), see `draw_patches`; for losses of patches.
+        pixel_rays: the several rays of a pixel that `draw` then draws; None: each ray is a pixel.
 
     Returns:
         train_step(state, data, positions, *, axis_name=None) -> (state, metrics).
@@ -129,13 +132,15 @@ def make_train_step(
     def progress_at(step, data):
         return {PROGRESS: data.progress.at(step)} if PROGRESS in model.needs else {}
 
-    def loss_fn(params, grid, step, keys, batch, views, progress):
+    def loss_fn(params, grid, step, keys, batch, views, progress, rays_per_side):
         if cameras is not None:
             batch = cameras.refined_batch(params, batch, views)
         renderings = model.render(keys, {**params, **progress}, grid, batch.rays, step)
         rendered = renderings
         if cameras is not None:
             renderings = cameras.exposed(params, renderings, batch)
+        if pixel_rays is not None:
+            renderings = {name: pixel_rays.averaged(each, rays_per_side) for name, each in renderings.items()}
         renderings = Renderings(renderings, model.image_networks)
         complete = renderings[-1].num_dropped == 0
 
@@ -168,8 +173,9 @@ def make_train_step(
     def microbatch(state, data, positions):
         keys, batch = draw(state.step, positions, data)
         views, progress = None if cameras is None else data.views, progress_at(state.step, data)
+        rays_per_side = None if pixel_rays is None else pixel_rays.side_at(data.progress.at(state.step))
         (loss, sums), grads = jax.value_and_grad(loss_fn, has_aux=True)(
-            state.params, state.grid, state.step, keys, batch, views, progress
+            state.params, state.grid, state.step, keys, batch, views, progress, rays_per_side
         )
         return {"loss": loss, **sums}, grads
 

@@ -39,6 +39,8 @@ _ADDED = {
     "occupancy.min_views": 0,
     "occupancy.uniform_fraction": 1.0,
     "train.lr_decay_power": 1.0,
+    "train.one_ray_fraction": 0.6,
+    "train.rays_per_side": 1,
 }
 # Options that no longer exist, and the value with which training was as it is now.
 _REMOVED = {"occupancy.near_gradient_distance": 0.0}

@@ -10,10 +10,11 @@ import jax
 import numpy as np
 
 from jaxnerf.core.views import Views
-from jaxnerf.evaluation.restore import image_params, newest_step, refined_views, restore_with_grid
+from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
 from jaxnerf.evaluation.uncertainty.laplace import stored_uncertainty
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training import metric_log
+from jaxnerf.training.optimizer import image_params
 from jaxnerf.training.state import TrainState
 from jaxnerf.viewer.server import HOST, PORT, Viewer, check_port, import_viser
 

@@ -88,7 +88,7 @@ def test_the_hash_grid_of_an_accelerator_is_that_of_a_cpu(monkeypatch, wrap):
         density, rgb = field.apply(params, x, viewdirs)
         return density.mean() + (rgb**2).mean()
 
-    expected = jax.value_and_grad(loss, argnums=(0, 1))(params, x)
+    expected = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(params, x)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    found = jax.value_and_grad(wrap(loss), argnums=(0, 1))(params, x)
+    found = jax.jit(jax.value_and_grad(wrap(loss), argnums=(0, 1)))(params, x)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), found, expected)

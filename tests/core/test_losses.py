@@ -216,13 +216,14 @@ def test_nan_in_a_packed_ray_stays_in_its_ray(name):
     }
     batch = make_batch(np.full(3, 1.0), 7.0)
 
+    @jax.jit
     def losses(**arrays):
         samples = jaxnerf.PackedSamples(**arrays, **others)
         rendering = make_rendering(np.zeros((3, 1), np.float32), np.zeros((3, 1)), np.zeros((3, 1)))
         return jaxnerf.distortion_loss([dataclasses.replace(rendering, weights=None, samples=samples)], batch)
 
-    slopes = jax.grad(lambda arrays: losses(**arrays)[jnp.array([0, 2])].sum())
-    clean, clean_slopes = np.asarray(losses(**arrays)), slopes(arrays)
+    slopes = jax.jit(jax.grad(lambda arrays: losses(**arrays)[jnp.array([0, 2])].sum()))
+    clean, clean_slopes = jax.device_get((losses(**arrays), slopes(arrays)))
     arrays[name][2:4] = np.nan
     got = np.asarray(losses(**arrays))
     np.testing.assert_array_equal(np.isnan(got), [False, True, False])
@@ -260,8 +261,9 @@ def test_dense_and_packed_distortion_have_the_same_gradients(far):
         )
         return jaxnerf.distortion_loss([rendering], make_batch(np.full(5, 1.0), far))
 
-    np.testing.assert_allclose(packed(weights, t), dense(weights, t), rtol=1e-5, atol=1e-7)
-    want, got = (jax.grad(lambda *a, f=f: (scale * f(*a)).sum(), argnums=(0, 1))(weights, t) for f in (dense, packed))
+    np.testing.assert_allclose(jax.jit(packed)(weights, t), jax.jit(dense)(weights, t), rtol=1e-5, atol=1e-7)
+    slopes = (jax.grad(lambda *a, f=f: (scale * f(*a)).sum(), argnums=(0, 1)) for f in (dense, packed))
+    want, got = (jax.jit(slope)(weights, t) for slope in slopes)
     for slope, expected in zip(got, want, strict=True):
         np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-6)
 

@@ -1,6 +1,7 @@
 """What other programs pass to the public functions: rays in place of images, stacks of cameras, features, old keys."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +11,17 @@ import pytest
 import jaxnerf
 from jaxnerf.core.rendering import render_samples
 
+make_rays = jax.jit(jaxnerf.rays_from_pixels)
+
 
 def camera(**options):
     pose = jaxnerf.look_at((0.2, -4.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     return jaxnerf.Camera(to_world=pose, focal=jnp.full(2, 6.0), center=jnp.full(2, 3.0), **options)
 
 
+@functools.cache
 def rays():
-    return jaxnerf.rays_from_pixels(camera(), jaxnerf.pixel_grid(6, 6), near=1.0, far=6.0)
+    return make_rays(camera(), jaxnerf.pixel_grid(6, 6), near=1.0, far=6.0)
 
 
 def features(x, viewdirs, channels=8):
@@ -57,11 +61,11 @@ def test_a_stack_of_cameras_has_the_rays_of_each(lens):
     options = {"lens": lens, "distortion": jnp.array([0.1, 0.02, 0.001, 0.002])} if lens else {}
     one, pixels = camera(**options), jaxnerf.pixel_grid(6, 5)
     near = jnp.linspace(1, 2, 30).reshape(6, 5)
-    stack = jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=poses), pixels, near=near, far=6.0)
+    stack = make_rays(dataclasses.replace(one, to_world=poses), pixels, near=near, far=6.0)
     focal = jnp.stack([one.focal] * 3)
-    whole = jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=poses, focal=focal), pixels, near=near, far=6.0)
+    whole = make_rays(dataclasses.replace(one, to_world=poses, focal=focal), pixels, near=near, far=6.0)
     for index, pose in enumerate(poses):
-        alone = jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=pose), pixels, near=near, far=6.0)
+        alone = make_rays(dataclasses.replace(one, to_world=pose), pixels, near=near, far=6.0)
         for several in (stack, whole):
             jax.tree.map(lambda a, b, i=index: np.testing.assert_allclose(a[i], b, atol=1e-6), several, alone)
 
@@ -70,10 +74,10 @@ def test_a_stack_of_cameras_has_any_leading_axes_and_a_near_of_each():
     poses = jnp.stack([jaxnerf.look_at((x, -4.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for x in range(6)])
     one, pixels = camera(), jaxnerf.pixel_grid(5, 6)  # as many columns as cameras
     near = jnp.linspace(1, 2, 6)
-    flat = jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=poses), pixels, near=near, far=9.0)
+    flat = make_rays(dataclasses.replace(one, to_world=poses), pixels, near=near, far=9.0)
     np.testing.assert_array_equal(flat.near, jnp.broadcast_to(near[:, None, None], (6, 5, 6)))
     nested = dataclasses.replace(one, to_world=poses.reshape(2, 3, 3, 4), center=jnp.full((2, 3, 2), 3.0))
-    nested = jaxnerf.rays_from_pixels(nested, pixels, near=near.reshape(2, 3), far=9.0)
+    nested = make_rays(nested, pixels, near=near.reshape(2, 3), far=9.0)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a.reshape(b.shape), b, atol=1e-6), nested, flat)
     with pytest.raises(ValueError, match=r"focal has shape \(2, 2\), expected \(2,\) or \(6, 2\) beside to_world"):
         wrong = dataclasses.replace(one, to_world=poses, focal=jnp.ones((2, 2)))
@@ -85,7 +89,7 @@ def test_what_takes_one_camera_says_how_several_are_computed():
     poses = jnp.stack([jaxnerf.look_at((x, -4.0, 0.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for x in range(3)])
     pixels, one = jaxnerf.pixel_grid(6, 6), camera(height=6, width=6)
     cameras = dataclasses.replace(one, to_world=poses, focal=jnp.full((3, 2), 6.0), center=jnp.full((3, 2), 3.0))
-    rays = jaxnerf.rays_from_pixels(cameras, pixels, near=1.0, far=6.0)
+    rays = make_rays(cameras, pixels, near=1.0, far=6.0)
     for function, values in {
         jaxnerf.project: jnp.zeros((5, 3)),
         jaxnerf.undistort: pixels,
@@ -99,7 +103,7 @@ def test_what_takes_one_camera_says_how_several_are_computed():
             function(*arguments)
         advice = str(raised.value).partition("; for several, each array of which has a leading axis, call ")[2]
         names = {"jax": jax, function.__name__: function, "cameras": cameras, "rays": rays, "values": values}
-        found = eval(advice.replace("...", "values"), names)
+        found = jax.jit(lambda advice=advice, names=names: eval(advice.replace("...", "values"), names))()
         assert all(len(leaf) == 3 for leaf in jax.tree.leaves(found))
     with pytest.raises(ValueError, match=r"to_world has shape \(4, 4\), expected \(3, 4\)"):
         jaxnerf.rays_from_pixels(dataclasses.replace(one, to_world=jnp.eye(4)), pixels, near=1.0, far=6.0)
@@ -113,9 +117,9 @@ def test_scenes_of_any_number_of_channels(channels):
         return features(x, viewdirs, channels)
 
     behind = jnp.linspace(0, 1, channels)
-    edges = jaxnerf.uniform_edges(rays().near, rays().far, num_segments=24)
-    samples = jaxnerf.samples_from_edges(None, edges)
-    whole = render_samples(scene, rays(), samples, background=behind, median_depth=True)
+    edges = np.linspace(rays().near, rays().far, 25, axis=-1)
+    samples = jax.jit(functools.partial(jaxnerf.samples_from_edges, None))(edges)
+    whole = jax.jit(lambda: render_samples(scene, rays(), samples, background=behind, median_depth=True))()
     assert whole.rgb.shape == (6, 6, channels)
     for index in {0, channels - 1}:
 
@@ -123,19 +127,22 @@ def test_scenes_of_any_number_of_channels(channels):
             density, values = scene(x, viewdirs)
             return density, values[..., index, None] * jnp.ones((1,) * (x.ndim - 1) + (3,))
 
-        alone = render_samples(grey, rays(), samples, background=jnp.full(3, behind[index]))
+        alone = jax.jit(
+            lambda grey=grey, color=behind[index]: render_samples(grey, rays(), samples, background=jnp.full(3, color))
+        )()
         np.testing.assert_allclose(whole.rgb[..., index], alone.rgb[..., 0], atol=1e-6)
     bounds = jnp.full(3, -2.0), jnp.full(3, 2.0)
     grid = jaxnerf.create_grid(*bounds, jnp.ones((4, 4, 4), bool), initial_density=1.0)
     options = {"max_samples": 36 * 24, "background": behind}
-    packed = jaxnerf.render_packed(scene, grid, rays(), samples, **options)
+    packed = jax.jit(lambda: jaxnerf.render_packed(scene, grid, rays(), samples, **options))()
     np.testing.assert_allclose(packed.rgb, whole.rgb, atol=1e-3)
-    early = jaxnerf.render_packed(scene, None, rays(), samples, early_stop_eps=1e-6, median_depth=True, **options)
+    options |= {"early_stop_eps": 1e-6, "median_depth": True}
+    early = jax.jit(lambda: jaxnerf.render_packed(scene, None, rays(), samples, **options))()
     np.testing.assert_allclose(early.rgb, whole.rgb, atol=1e-5)
     np.testing.assert_allclose(early.median_depth, whole.median_depth, rtol=1e-5)
     for render in (
-        lambda **options: render_samples(scene, rays(), samples, **options),
-        lambda **options: jaxnerf.render_packed(scene, grid, rays(), samples, max_samples=36 * 24, **options),
+        jax.jit(lambda **options: render_samples(scene, rays(), samples, **options)),
+        jax.jit(lambda **options: jaxnerf.render_packed(scene, grid, rays(), samples, max_samples=36 * 24, **options)),
     ):
         for background in (jnp.ones(1), jnp.ones((6, 6, 1)), jnp.ones((6, 6, channels))):
             np.testing.assert_array_equal(render(background=background).rgb, render(background=jnp.ones(channels)).rgb)
@@ -144,7 +151,7 @@ def test_scenes_of_any_number_of_channels(channels):
             more = {"max_samples": 864} if render is jaxnerf.render_packed else {}
             arguments = (None,) if more else ()
             with pytest.raises(ValueError, match="background has shape"):
-                render(scene, *arguments, rays(), samples, background=wrong, **more)
+                jax.eval_shape(functools.partial(render, scene, *arguments, background=wrong, **more), rays(), samples)
 
 
 def test_wrong_outputs_and_errors_of_a_scene_name_the_shapes():
@@ -155,9 +162,9 @@ def test_wrong_outputs_and_errors_of_a_scene_name_the_shapes():
         return x[..., 0], jnp.concatenate([x, viewdirs], axis=-1)[..., :3]
 
     with pytest.raises(ValueError, match=r"returned density \(6, 6, 8\) and rgb \(6, 6, 8\)"):
-        jaxnerf.render_rays(None, flat, rays(), num_samples=8)
+        jax.eval_shape(lambda: jaxnerf.render_rays(None, flat, rays(), num_samples=8))
     with pytest.raises(TypeError) as caught:
-        jaxnerf.render_rays(None, glued, rays(), num_samples=8)
+        jax.eval_shape(lambda: jaxnerf.render_rays(None, glued, rays(), num_samples=8))
     assert "x (6, 6, 8, 3) and viewdirs (6, 6, 1, 3), which broadcast" in " ".join(caught.value.__notes__)
 
 
@@ -192,9 +199,8 @@ def test_metrics_refuse_masks_of_numbers(metric, kind):
 
 def test_old_keys_are_accepted():
     scene = jaxnerf.still_life
-    new, old = (
-        jaxnerf.render_rays(key(3), scene, rays(), num_samples=4) for key in (jax.random.key, jax.random.PRNGKey)
-    )
+    render = jax.jit(lambda key: jaxnerf.render_rays(key, scene, rays(), num_samples=4))
+    new, old = (render(key(3)) for key in (jax.random.key, jax.random.PRNGKey))
     np.testing.assert_array_equal(new.rgb, old.rgb)
 
 

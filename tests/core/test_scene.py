@@ -121,14 +121,15 @@ def test_a_scene_may_need_one_thing(name, renderer, rays, samples):
     speed = np.linalg.norm(rays.directions, axis=-1, keepdims=True)
     values = {"radius": rays.radius[:, None] * samples.t, "length": samples.delta * speed}
     values |= {"time": rays.time[:, None], "image_index": rays.image_index[:, None]}
-    weights = np.asarray(jaxnerf.render_samples(plain, rays, samples).weights)
+    weights = compiled(functools.partial(jaxnerf.render_samples, plain))(rays, samples).weights
     np.testing.assert_allclose(got.rgb[:, 0], (weights * values[name]).sum(axis=-1), rtol=2e-5, atol=1e-6)
 
 
 def test_render_rays_and_render_hierarchical_pass_them_on(rays):
-    whole = jaxnerf.render_rays(None, needy, rays, num_samples=SEGMENTS)
+    whole = compiled(lambda rays: jaxnerf.render_rays(None, needy, rays, num_samples=SEGMENTS))(rays)
     np.testing.assert_allclose(whole.rgb, by_hand(rays, whole.samples), rtol=2e-5)
-    coarse, fine = jaxnerf.render_hierarchical(None, plain, needy, rays, num_coarse=8, num_fine=8)
+    hierarchical = functools.partial(jaxnerf.render_hierarchical, None, plain, needy, num_coarse=8, num_fine=8)
+    coarse, fine = compiled(hierarchical)(rays)
     np.testing.assert_allclose(fine.rgb, by_hand(rays, fine.samples), rtol=2e-5)
     assert all_finite(coarse)
 
@@ -151,7 +152,7 @@ def test_batch_is_vmap_is_jit_and_gradients_reach_the_rays(rays, samples):
         return render(needy, dataclasses.replace(rays, radius=radius, time=time), samples).rgb.sum()
 
     gradients = [
-        jax.grad(total, argnums=(0, 1))(rays.radius, rays.time, RENDERERS[name])
+        jax.jit(jax.grad(functools.partial(total, render=RENDERERS[name]), argnums=(0, 1)))(rays.radius, rays.time)
         for name in ("render_samples", "packed")
     ]
     for dense, packed in zip(*gradients, strict=True):
@@ -172,7 +173,7 @@ def test_samples_of_length_0_have_no_gradient_even_where_the_scene_has_none(rays
         return render(scene, dataclasses.replace(at_origin, radius=radius), samples)
 
     for render in (jaxnerf.render_samples, RENDERERS["packed"]):
-        gradient = jax.grad(lambda radius, render=render: total(radius, render).opacity.sum())(rays.radius)
+        gradient = jax.jit(jax.grad(lambda radius, render=render: total(radius, render).opacity.sum()))(rays.radius)
         assert np.isfinite(gradient).all() and (np.asarray(gradient) > 0).all()
 
 
@@ -249,11 +250,11 @@ def test_what_is_missing_is_named(name, samples):
     exec(f"def scene(x, viewdirs, *, {name}): return plain(x, viewdirs)", scopes)
     rays = rays_past_origin(2, RAYS)
     with pytest.raises(ValueError, match="render_samples: " + MESSAGES[name]):
-        jaxnerf.render_samples(scopes["scene"], rays, samples)
+        jax.eval_shape(functools.partial(jaxnerf.render_samples, scopes["scene"]), rays, samples)
     with pytest.raises(ValueError, match="render_packed: " + MESSAGES[name]):
-        jaxnerf.render_packed(scopes["scene"], full_grid(), rays, samples, max_samples=200)
+        jax.eval_shape(functools.partial(RENDERERS["packed"], scopes["scene"]), rays, samples)
     bound = functools.partial(scopes["scene"], **{name: 0})
-    assert jaxnerf.render_samples(bound, rays, samples).rgb.shape == (RAYS, 3)
+    assert compiled(functools.partial(jaxnerf.render_samples, bound))(rays, samples).rgb.shape == (RAYS, 3)
 
 
 def test_a_field_of_rays_has_the_shape_of_near(rays, samples):
@@ -329,7 +330,7 @@ def test_no_rays_and_no_gradient(rays, samples):
 
         return jaxnerf.render_packed(scene, full_grid(), *none, max_samples=4).rgb.sum()
 
-    assert jax.grad(total)(0.5) == 0
+    assert jax.jit(jax.grad(total))(0.5) == 0
 
 
 def test_visible_samples_pass_what_a_scene_needs(rays, samples):
@@ -338,8 +339,10 @@ def test_visible_samples_pass_what_a_scene_needs(rays, samples):
         return 1e4 * (time < 0.5) * (length > 0) + 0 * x[..., 0], 0.5 + 0 * x
 
     timed = dataclasses.replace(rays, time=np.float32(np.arange(RAYS) % 2))
-    needed = visible_samples(wall, full_grid(), timed, samples, error=1 / 512, max_samples=50)
-    np.testing.assert_array_equal(needed.any(axis=-1), np.arange(RAYS) % 2 == 0)
+    needed = jax.jit(
+        lambda rays, samples: visible_samples(wall, full_grid(), rays, samples, error=1 / 512, max_samples=50)
+    )(timed, samples)
+    np.testing.assert_array_equal(np.asarray(needed).any(axis=-1), np.arange(RAYS) % 2 == 0)
 
 
 # Cones.
@@ -358,26 +361,25 @@ def test_the_radius_is_that_of_neighbouring_rays(lens, distortion):
     )
     pixels = np.asarray(jaxnerf.pixel_grid(24, 32))
     step = 0.25
-    at = [
-        jaxnerf.rays_from_pixels(camera, pixels + np.float32(shift), near=1.0, far=2.0).directions
-        for shift in ((step, 0), (-step, 0), (0, step), (0, -step))
-    ]
+    directions = jax.jit(lambda pixels: jaxnerf.rays_from_pixels(camera, pixels, near=1.0, far=2.0).directions)
+    at = [directions(pixels + np.float32(shift)) for shift in ((step, 0), (-step, 0), (0, step), (0, -step))]
     right, down = (np.asarray(at[i] - at[i + 1]) / (2 * step) for i in (0, 2))
     area = np.linalg.norm(np.cross(right, down), axis=-1)
-    got = pixel_radius(camera, pixels)
+    radius = jax.jit(functools.partial(pixel_radius, camera))
+    got = radius(pixels)
     np.testing.assert_allclose(got, 2 / np.sqrt(12) * np.sqrt(area), rtol=2e-3)
-    one = pixel_radius(camera, jnp.array([3, 4]))  # integers, and no leading axes
-    assert one.shape == () and np.isfinite(jax.grad(lambda at: pixel_radius(camera, at))(jnp.array([3.0, 4.0]))).all()
+    one = radius(np.array([3, 4]))  # integers, and no leading axes
+    assert one.shape == () and np.isfinite(jax.jit(jax.grad(radius))(np.float32([3, 4]))).all()
 
 
 def test_contracted_lengths_have_the_scale_of_the_contraction():
     x = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32) * np.geomspace(0.3, 300, 200)[:, None]
     x = np.float32(x)
-    determinant = np.abs(np.linalg.det(np.float64(jax.vmap(jax.jacfwd(contract))(x))))
+    determinant = np.abs(np.linalg.det(np.float64(jax.jit(jax.vmap(jax.jacfwd(contract)))(x))))
     np.testing.assert_allclose(length_scale(x), np.cbrt(determinant), rtol=2e-3)
     assert (np.asarray(length_scale(x))[np.abs(x).max(axis=-1) <= 1] == 1).all()
     far = np.float32([[np.inf, 0, 0], [1e30, -1e30, 0], [1e12, 0, 0]])
-    assert np.isfinite(length_scale(far)).all() and all_finite(jax.vmap(jax.grad(length_scale))(far[1:]))
+    assert np.isfinite(length_scale(far)).all() and all_finite(jax.jit(jax.vmap(jax.grad(length_scale)))(far[1:]))
 
 
 def test_a_contracted_field_receives_contracted_lengths():
@@ -402,12 +404,13 @@ def test_a_contracted_field_receives_contracted_lengths():
 def test_cells_have_stated_values():
     grid = jaxnerf.create_grid(np.zeros(3), np.float32([8, 4, 2]), np.ones((8, 4, 2), bool), initial_density=1.0)
     x = np.random.default_rng(0).uniform(0, 2, (500, 3)).astype(np.float32)
-    at = cell_inputs("test", needy, grid, x)
+    at = jax.jit(functools.partial(cell_inputs, "test", needy))(grid, x)
     assert [each.shape for each in at.values()] == [(500,)] * 4
     np.testing.assert_allclose(at["radius"], 0.5)
     np.testing.assert_allclose(at["length"], 1.0)
     assert not at["time"].any() and not at["image_index"].any() and at["image_index"].dtype == np.int32
-    random = cell_inputs("test", needy, grid, x, length=np.full(500, 0.3), key=jax.random.key(0))
+    drawn = jax.jit(lambda grid, x, key: cell_inputs("test", needy, grid, x, length=np.full(500, 0.3), key=key))
+    random = drawn(grid, x, jax.random.key(0))
     np.testing.assert_allclose(random["length"], 0.3)
     assert 0 <= random["time"].min() < 0.1 and 0.9 < random["time"].max() < 1
 
@@ -434,9 +437,10 @@ def test_a_cell_is_occupied_if_matter_is_there_for_any_radius(contracted):
             stretched = radius * (length_scale(x) if contracted else 1)
             return jnp.where((stretched > low) & (stretched < high), 10.0, 0.0), 0 * x
 
-        key = jax.random.key(0)
-        return jaxnerf.update_grid(key, grid, scene, cells, threshold=0.1, radii=jnp.float32([0.01, 0.16])).density_max
+        key, radii = jax.random.key(0), jnp.float32([0.01, 0.16])
+        return jaxnerf.update_grid(key, grid, scene, cells, threshold=0.1, radii=radii).density_max
 
+    density_at = jax.jit(density_at)
     assert (density_at(0.0099, 0.1601) == 10).all()
     for low, high in ((0.01, 0.02), (0.02, 0.04), (0.04, 0.08), (0.08, 0.16)):
         found.append(float((density_at(low, high) > 0).mean()))

@@ -1,7 +1,9 @@
 """An image, a camera and the rays of a view."""
 
 import dataclasses
+import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -31,7 +33,8 @@ def test_the_scene_looks_like_its_image_along_a_views_rays():
     assert rays.near.shape == (48, 48) and camera.to_world.shape == (3, 4) and camera.height == 48
     expected = jaxnerf.rays_from_pixels(camera, jaxnerf.pixel_grid(48, 48), near=views.near[2], far=views.far[2])
     np.testing.assert_array_equal(rays.directions, expected.directions)
-    image = jaxnerf.render_rays(None, jaxnerf.still_life, rays, num_samples=256, background=jnp.ones(3))
+    render = functools.partial(jaxnerf.render_rays, None, jaxnerf.still_life, num_samples=256, background=jnp.ones(3))
+    image = jax.jit(render)(rays)
     assert jaxnerf.psnr(image.rgb, views.image(2)) > 30
 
 

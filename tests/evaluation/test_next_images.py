@@ -13,8 +13,7 @@ from jaxnerf.evaluation.next_images.coverage import ViewCoverage, choose_views
 from jaxnerf.evaluation.next_images.propose import propose_images, save_path
 from jaxnerf.evaluation.paths.camera_path import make_path
 from jaxnerf.evaluation.restore import restore_run
-from runs import ROOT
-from runs import run as run_program
+from runs import ROOT, run_forked
 
 pytest_plugins = ["run_fixtures"]
 
@@ -158,7 +157,7 @@ def test_the_program_reports_and_refuses(unoptimized, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT / "tests"), str(ROOT)]))
     workdir = ball_runs.make_run(tmp_path / "ball", "ndc")
     ball_module = (f"--workdir={workdir}", f"--out={tmp_path / 'cover.png'}", "--plugins=ball_runs")
-    code, out, err = run_program("check", *ball_module, "--next_images=2")
+    code, out, err = run_forked("check", *ball_module, "--next_images=2")
     assert code == 0, err
     assert "above" in out and "  2. from " in out and (tmp_path / "cover.png").is_file()
     assert (workdir / "camera_paths" / "next_images.json").is_file()
@@ -175,5 +174,5 @@ def test_the_program_reports_and_refuses(unoptimized, tmp_path, monkeypatch):
     ],
 )
 def test_wrong_calls_are_refused_in_a_line(flags, message):
-    code, out, err = run_program("check", *flags)
+    code, out, err = run_forked("check", *flags)
     assert code == 1 and not out and message in err and err.count("\n") == 1

@@ -10,7 +10,7 @@ from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation import quality_search
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.models import occupancy
-from runs import run
+from runs import run_forked
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -65,7 +65,7 @@ def test_a_baked_grid_removes_nothing_visible(trained, monkeypatch):
 
 
 def test_a_negative_error_budget_is_a_wrong_flag():
-    code, _, err = run("eval", "--workdir=nowhere", "--error_budget=-1")
+    code, _, err = run_forked("eval", "--workdir=nowhere", "--error_budget=-1")
     assert code == 2 and "error_budget" in err
 
 

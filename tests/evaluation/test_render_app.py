@@ -16,7 +16,7 @@ from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import render_path as render_path_module
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.runtime import memory
-from runs import run as run_program
+from runs import run_forked
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -210,7 +210,7 @@ def test_the_program_selects_a_path_and_reports_it(run):
         "--fps=5",
         "--chunk=100",
     )
-    code, out, err = run_program("render", *flags)
+    code, out, err = run_forked("render", *flags)
     assert code == 0, err
     target = run / "renders" / "turntable-20"
     assert out.split() == [str(target), f"{target}.gif"]

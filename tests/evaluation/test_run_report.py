@@ -11,7 +11,7 @@ import pytest
 
 from jaxnerf.evaluation import run_report
 from jaxnerf.training import auto_config, workdir
-from runs import ROOT, run, smoke_config
+from runs import ROOT, run_forked, smoke_config
 
 METRICS = ("psnr", "ssim", "psnr_float", "psnr_truncated", "psnr_aligned", "ssim_aligned")
 
@@ -46,7 +46,7 @@ def runs(tmp_path_factory):
 
 
 def test_the_table_has_scores_and_differing_options(runs):
-    code, out, err = run("report", runs)
+    code, out, err = run_forked("report", runs)
     head, first, second = out.splitlines()
     assert (code, err) == (0, "")
     assert head.split()[:5] == ["run", "steps", "seconds", "PSNR", "SSIM"]
@@ -60,7 +60,7 @@ def test_the_table_has_scores_and_differing_options(runs):
 def test_csv_and_plot_are_not_replaced_silently(runs, tmp_path):
     pytest.importorskip("matplotlib")
     files = {"csv": tmp_path / "runs.csv", "png": tmp_path / "runs.png", "svg": tmp_path / "runs.svg"}
-    code, out, err = run("report", runs, f"--csv={files['csv']}", f"--plot={files['png']}")
+    code, out, err = run_forked("report", runs, f"--csv={files['csv']}", f"--plot={files['png']}")
     assert (code, err) == (0, "") and f"csv: {files['csv']}" in out
     with files["csv"].open(newline="") as file:
         first, second = csv.DictReader(file)
@@ -70,10 +70,12 @@ def test_csv_and_plot_are_not_replaced_silently(runs, tmp_path):
     assert iio.imread(files["png"]).shape == (500, 1300, 4)
     before = files["png"].read_bytes()
     for flags in ([f"--csv={files['csv']}"], [f"--plot={files['png']}"]):
-        code, out, err = run("report", runs, *flags)
+        code, out, err = run_forked("report", runs, *flags)
         assert code == 1 and "exists already; give --overwrite" in err and err.count("\n") == 1 and not out
     assert files["png"].read_bytes() == before
-    code, _, err = run("report", runs / "run_9", f"--plot={files['svg']}", f"--csv={files['csv']}", "--overwrite")
+    code, _, err = run_forked(
+        "report", runs / "run_9", f"--plot={files['svg']}", f"--csv={files['csv']}", "--overwrite"
+    )
     assert code == 0 and "<svg" in files["svg"].read_text() and len(files["csv"].read_text().splitlines()) == 2
 
 
@@ -119,19 +121,14 @@ def test_bad_input_is_one_line(arguments, message, tmp_path):
         folder = write_run(tmp_path / name, scores=[(100, "test", 23.0)])
         if content:
             (folder / "eval" / "100" / "results.json").write_text(content)
-    command = [sys.executable, "-m", "jaxnerf.report", *arguments]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment())
-    assert done.returncode == 1 and not done.stdout
-    assert message in done.stderr and done.stderr.count("\n") == 1 and done.stderr.startswith("error: ")
+    code, out, err = run_forked("report", *arguments, folder=tmp_path)
+    assert code == 1 and not out
+    assert message in err and err.count("\n") == 1 and err.startswith("error: ")
 
 
 def test_a_plot_without_matplotlib_says_what_to_install(runs, tmp_path):
     (tmp_path / "matplotlib.py").write_text("raise ImportError('none here')")
     command = [sys.executable, "-m", "jaxnerf.report", runs, "--plot=a.png"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment(tmp_path))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, ROOT)))}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
     assert done.returncode == 1 and "pip install matplotlib" in done.stderr and not (tmp_path / "a.png").exists()
-
-
-def environment(*first):
-    """Returns the environment in which this checkout is imported, after some folders."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*first, ROOT)))}

@@ -12,7 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from runs import ROOT
+from runs import ROOT, run_forked
 from studies import common, study
 
 run = study("benchmark/run")
@@ -267,10 +267,8 @@ def test_a_job_is_trained_scored_and_not_repeated(tmp_path):
         (["--jobs=lego_100", "--report"], 1, "holds no scores of lego_100"),
     ],
 )
-def test_a_wrong_flag_is_reported_in_one_line(tmp_path, flags, code, text):
-    command = [sys.executable, "experiments/benchmark/run.py", f"--out={tmp_path}", *flags]
-    environment = {**os.environ, "JAXNERF_SCENES": str(tmp_path)}
+def test_a_wrong_flag_is_reported_in_one_line(tmp_path, monkeypatch, flags, code, text):
+    monkeypatch.setenv("JAXNERF_SCENES", str(tmp_path))
     (tmp_path / "lego").mkdir()
-    found = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert found.returncode == code and found.stderr.startswith("error: ") and text in found.stderr
-    assert found.stderr.count("\n") == 1
+    found, _, err = run_forked(ROOT / "experiments" / "benchmark" / "run.py", f"--out={tmp_path}", *flags)
+    assert found == code and err.startswith("error: ") and text in err and err.count("\n") == 1

@@ -1,8 +1,6 @@
 """The gallery shows of each run the view in the middle and the newest frames, and names runs that lack either."""
 
 import json
-import subprocess
-import sys
 
 import imageio.v3 as iio
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 from jaxnerf.configs import smoke
 from jaxnerf.training.config import read_config
 from jaxnerf.training.workdir import save_config
-from runs import ROOT
+from runs import ROOT, run_forked
 
 SIDE = 16
 
@@ -39,9 +37,8 @@ def run(tmp_path):
 
 def make_gallery(*arguments):
     """Returns (exit code, stderr) of the program."""
-    command = [sys.executable, ROOT / "experiments" / "results" / "gallery.py", *arguments]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    return ended.returncode, ended.stderr
+    code, _, errors = run_forked(ROOT / "experiments" / "results" / "gallery.py", *arguments)
+    return code, errors
 
 
 def test_the_page_shows_the_middle_view_and_some_frames(run, tmp_path):

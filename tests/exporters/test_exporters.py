@@ -18,7 +18,7 @@ from jaxnerf.exporters.points import export_points, thinned
 from jaxnerf.exporters.splats import export_splats, score
 from jaxnerf.fields.base import Field
 from jaxnerf.registry import Exporter
-from runs import run
+from runs import run_forked
 
 IN_FILE = 2 * RADIUS  # the ball's radius there
 VOXEL = 2 * IN_FILE / 32
@@ -360,6 +360,6 @@ def test_a_run_that_cannot_be_exported_is_refused_before_its_grid_is_extracted(m
     "kind, flag, kinds", [("points", "--format=obj", "mesh"), ("depth", "--num_points=5", "points or --kind=splats")]
 )
 def test_flags_of_other_kinds_are_refused(tmp_path, kind, flag, kinds):
-    code, _, err = run("export", f"--workdir={tmp_path}", f"--kind={kind}", flag)
+    code, _, err = run_forked("export", f"--workdir={tmp_path}", f"--kind={kind}", flag)
     expected = f"error: {flag.partition('=')[0]} is given and --kind={kind}, expected --kind={kinds}; drop it"
     assert code == 1 and err.startswith(expected)

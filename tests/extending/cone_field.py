@@ -2,7 +2,9 @@
 
 A pixel sees a cone, not a ray. The field asks for the cone's radius and the length of the interval around each sample,
 and replaces sin and cos of the position by their expected values there (arXiv:2103.13415): detail that is finer than
-the cone is averaged away, so an image of lower resolution than those of training is smooth instead of aliased.
+the cone is averaged away, so an image of lower resolution than those of training is smooth instead of aliased. The
+option `fine.prefilter` of the field `mlp` does this, too, but its frustum is no shorter than the pixel is wide there,
+and the network also reads what the mean leaves of each octave.
 
 Train with it by
 

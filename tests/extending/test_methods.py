@@ -44,6 +44,7 @@ def test_a_proposal_network_with_a_loss_of_its_own(compiled_once, tmp_path):
     assert set(params) == {"proposal", "fine"}
 
 
+@pytest.mark.slow
 def test_a_curriculum_follows_the_progress_of_training(compiled_once, tmp_path):
     rows, psnr = trained(tmp_path / "run", 300, field="coarse_to_fine", **{"train.lr_init": 5e-3})
     assert psnr > 17  # 19.0 dB
@@ -55,5 +56,8 @@ def test_a_curriculum_follows_the_progress_of_training(compiled_once, tmp_path):
         assert float(variables[0]["progress"]) == expected  # a checkpoint has its own
         density, _ = jax.jit(scene)(x, x[:, :1])
         assert np.isfinite(density).all()
+
+
+def test_octaves_are_added_one_after_another():
     weights = coarse_to_fine.octave_weights(0.25, 7, 0.5)
     assert weights[0] == 1 and 0 < weights[3] <= 1 and weights[-1] == 0

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import oracle
-from helpers import assert_same
+from helpers import assert_same, without_damping
 from jaxnerf.core.scene import needs_of
 from jaxnerf.fields.base import contract_field
 from jaxnerf.fields.hash_grid import hash_grid_field
-from jaxnerf.fields.mlp import mlp_field
+from jaxnerf.fields.mlp import cone_variance, damping_of_octaves, mlp_field
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -178,12 +178,11 @@ def test_an_unknown_activation_is_named():
 
 @pytest.fixture(scope="module")
 def small():
-    """A small network, its twin with prefilter, and parameters that fit both."""
+    """A small network, its twin with prefilter, and parameters of the twin."""
     options = {"depth": 2, "width": 16, "view_width": 8, "num_freqs": 6}
     plain, cones = mlp_field(**options), mlp_field(**options, prefilter=True)
     assert needs_of(plain.apply) == () and needs_of(cones.apply) == ("radius", "length")
     params = jax.jit(cones.init)(jax.random.key(0))
-    assert_same(params, jax.jit(plain.init)(jax.random.key(0)), rtol=0, atol=0)
     return plain, cones, jax.tree.map(lambda leaf: leaf + 0.1, params)
 
 
@@ -195,8 +194,50 @@ def test_points_instead_of_cones_are_what_the_plain_network_sees(small):
     plain, cones, params = small
     x, viewdirs = inputs()
     point = jax.jit(cones.apply)(params, x, viewdirs, **extents(x.shape[:-1], 0.0, 0.0))
-    for got, want in zip(point, jax.jit(plain.apply)(params, x, viewdirs), strict=True):
-        np.testing.assert_array_equal(got, want)
+    assert_same(point, jax.jit(plain.apply)(without_damping(params, 6), x, viewdirs), rtol=1e-5, atol=1e-5)
+
+
+def test_a_sample_is_no_shorter_than_the_pixel_is_wide(small):
+    """Of shorter ones, the length does not matter, and the variance is that of the pixel; of longer ones, it does."""
+    _, cones, params = small
+    x, viewdirs = inputs()
+    np.testing.assert_allclose(
+        cone_variance(viewdirs, *extents((6, 4), 0.1 / 3**0.5, 0.05).values()), 0.1**2 / 12, rtol=1e-6
+    )
+    none, short, long = (
+        jax.jit(cones.apply)(params, x, viewdirs, **extents((6, 4), 0.1, length)) for length in (0.0, 0.17, 0.5)
+    )
+    assert_same(none, short, rtol=0, atol=0)
+    assert min(np.abs(part - want).max() for part, want in zip(long, short, strict=True)) > 1e-3
+
+
+EXTENTS = np.array([0.0, 1e-30, 1e-12, 1e-3, 0.02, 0.5, 3.0, 1e6, 1e17, 1e25, np.inf])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_cones_leave_of_octaves_and_its_derivatives_are_those_of_float64(dtype):
+    """For radius and length of any size."""
+    radius, length = (each.reshape(-1) for each in np.meshgrid(EXTENTS, EXTENTS))
+    away, octaves = np.array([[2.0, -1.0, 2.0]]) / 3, 2.0 ** np.arange(12)
+
+    def damping(radius, length):
+        variance = cone_variance(jnp.asarray(away, dtype), radius[None], length[None])
+        return damping_of_octaves(variance.mean(axis=-1), 12)[:, 0]
+
+    with jax.enable_x64(dtype == np.float64):
+        slopes = jax.vmap(jax.jacrev(damping, argnums=(0, 1)))
+        given = [jnp.asarray(each, dtype) for each in (radius, length)]
+        got, by = jax.jit(lambda *at: (jax.vmap(damping)(*at), slopes(*at)))(*given)
+        assert got.dtype == by[0].dtype == dtype
+    wide = np.sqrt(3) * radius > length
+    along, across = (np.minimum(each, 1e18) for each in (np.where(wide, np.sqrt(3) * radius, length), radius))
+    want = np.exp(-(octaves**2) / 2 * (along**2 / 12 + across**2 / 2)[:, None] / 3)
+    np.testing.assert_allclose(got, want, atol=1e-6)
+    steep = -(octaves**2) / 3 * want
+    by_length = np.where(wide, 0, along / 12)[:, None] * steep
+    by_radius = (np.where(wide, across / 4, 0) + across / 2)[:, None] * steep
+    np.testing.assert_allclose(by[0], by_radius, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(by[1], by_length, rtol=1e-4, atol=1e-3)
 
 
 def test_wide_cones_show_no_waves(small):
@@ -225,7 +266,7 @@ def test_gradients_through_cones_are_finite_at_any_size(small):
             density, rgb = cones.apply(params, x, viewdirs, radius=radius, length=length)
             return density.sum() + rgb.sum()
 
-        return jax.grad(total, argnums=(0, 1, 2, 3))(params, x, *extents((6, 4), extent, extent).values())
+        return jax.grad(total, argnums=(0, 1, 2, 3))(params, x, *extents((6, 4), extent, 4 * extent).values())
 
     for extent in (0.0, 1e-30, 0.1, 1e20, np.inf):
         found = slopes(extent)

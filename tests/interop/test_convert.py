@@ -28,7 +28,7 @@ from jaxnerf.training import build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
 from published import as_flax, as_state_dict, random_layers
-from runs import run, smoke_config
+from runs import run_forked, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -149,7 +149,7 @@ def test_a_converted_run_is_scored_loaded_and_trained_further(compiled_once, tmp
     networks = [random_layers(seed, **SMALL) for seed in (1, 2)]
     files, (_, fine) = write("original", tmp_path / "theirs", networks, step=10)
     flags = (f"--weights={files[0]},{files[1]}", "--config=configs/smoke.py", f"--workdir={tmp_path / 'run'}")
-    code, out, err = run("convert", *flags)
+    code, out, err = run_forked("convert", *flags)
     assert (code, err) == (0, "") and out.startswith("the original code, step 10: coarse and fine network")
     assert evaluate(tmp_path / "run")["step"] == 10
     scene, _ = load_scene(tmp_path / "run")

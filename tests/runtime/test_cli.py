@@ -9,7 +9,7 @@ import pytest
 
 from jaxnerf.registry import FIELDS
 from jaxnerf.runtime import cli
-from runs import ROOT
+from runs import ROOT, run_forked
 
 _FAULTS = """
 import ctypes, resource, threading
@@ -57,8 +57,7 @@ def call(folder, *flags):
     """Returns (exit code, stdout, stderr) of _PROGRAM with flags."""
     program = folder / "program.py"
     program.write_text(_PROGRAM)
-    done = subprocess.run([sys.executable, program, *flags], cwd=folder, capture_output=True, text=True)
-    return done.returncode, done.stdout, done.stderr
+    return run_forked(program, *flags, folder=folder)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc returns large blocks at once")
@@ -175,11 +174,10 @@ def test_a_limit_is_a_number_or_auto(tmp_path, value, printed):
     + [("occupancy.resolutions", '\'resolutions\', did you mean "resolution" instead of "resolutions"')],
 )
 def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
-    command = [sys.executable, "-m", "jaxnerf.train", "--config=smoke", f"--workdir={tmp_path}", f"--config.{field}=3"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 2 and not done.stdout
-    assert done.stderr.startswith(f"error: the config has no such field: {message}; ")
-    assert "--config=help:options lists all fields" in done.stderr and done.stderr.count("\n") == 1
+    code, out, err = run_forked("train", "--config=smoke", f"--workdir={tmp_path}", f"--config.{field}=3")
+    assert code == 2 and not out
+    assert err.startswith(f"error: the config has no such field: {message}; ")
+    assert "--config=help:options lists all fields" in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -212,21 +210,18 @@ def test_an_option_without_its_section_is_named_in_full(tmp_path, program, flag,
         "    stretch: float = option(1.0, 'how far')\n\n\n"
         "jaxnerf.register_field('testing', lambda options, box: None, options=Stretched)\n"
     )
-    command = [sys.executable, "-m", f"jaxnerf.{program}", "--workdir=run", flag, "--plugins=mine"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
-    assert done.returncode == 2 and not done.stdout
-    assert expected in done.stderr and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    code, out, err = run_forked(program, "--workdir=run", flag, "--plugins=mine", folder=tmp_path)
+    assert code == 2 and not out
+    assert expected in err and err.startswith("error: ") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("fault", ['{}["nothing"]', "sys.nothing"])
 def test_a_fault_in_a_config_file_is_not_an_unknown_field(tmp_path, fault):
     file = tmp_path / "mine.py"
     file.write_text(f"import sys\n\n\ndef get_config():\n    return {fault}\n")
-    command = [sys.executable, "-m", "jaxnerf.train", f"--config={file}", f"--workdir={tmp_path}"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 2 and not done.stdout
-    assert done.stderr.startswith(f"error: --config: {file}, line 5: ") and done.stderr.count("\n") == 1
+    code, out, err = run_forked("train", f"--config={file}", f"--workdir={tmp_path}")
+    assert code == 2 and not out
+    assert err.startswith(f"error: --config: {file}, line 5: ") and err.count("\n") == 1
 
 
 def test_help_lists_the_flags_of_the_program(tmp_path):
@@ -246,9 +241,9 @@ def test_a_name_from_a_workdir_is_not_imported():
 def test_too_little_memory_is_one_line(tmp_path):
     program = tmp_path / "program.py"
     program.write_text("import numpy\nfrom jaxnerf.runtime import cli\ncli.run(lambda argv: numpy.zeros(2**58))\n")
-    done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: out of memory (Unable to allocate") and len(done.stderr.splitlines()) == 1
+    code, _, err = run_forked(program, folder=tmp_path)
+    assert code == 1
+    assert err.startswith("error: out of memory (Unable to allocate") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("flag", ["--help", "--config=help"])

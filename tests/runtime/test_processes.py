@@ -14,7 +14,7 @@ from jaxnerf.runtime import devices, processes
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
-from runs import ROOT, free_port, run
+from runs import ROOT, free_port, run_forked
 
 SLURM = {"SLURM_JOB_ID": "4711", "SLURM_STEP_NODELIST": "127.0.0.1", "SLURM_NTASKS": "2"}
 SLURM["SLURM_STEP_NUM_TASKS"] = "2"
@@ -122,7 +122,7 @@ def test_single_process_joins_nothing(monkeypatch, tmp_path):
 def test_missing_coordinator_prints_one_line(tmp_path):
     address = f"127.0.0.1:{free_port()}"
     by_hand = (f"--coordinator={address}", "--num_processes=2", "--process_id=1", "--join_seconds=1")
-    code, _, err = run("train", "--config=configs/smoke.py", f"--workdir={tmp_path / 'run'}", *by_hand)
+    code, _, err = run_forked("train", "--config=configs/smoke.py", f"--workdir={tmp_path / 'run'}", *by_hand)
     assert code == 1 and len(err.splitlines()) == 1, err
     assert err.startswith(f"error: waited 1 s for the other processes at {address}: nothing answers there")
     assert not (tmp_path / "run").exists()

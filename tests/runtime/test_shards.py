@@ -15,7 +15,7 @@ from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime import memory, shards
 from jaxnerf.training import workdir
-from runs import run as run_program
+from runs import run_forked
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -228,5 +228,5 @@ def test_the_flag_names_a_shard_by_index_and_count(monkeypatch):
 
 
 def test_shard_with_watch_is_an_error(run):
-    code, _, err = run_program("eval", f"--workdir={run[0]}", "--shard=0/2", "--watch")
+    code, _, err = run_forked("eval", f"--workdir={run[0]}", "--shard=0/2", "--watch")
     assert code == 1 and "not --watch; drop" in err and len(err.splitlines()) == 1

@@ -64,6 +64,7 @@ def test_who_imports_the_functions_gets_no_output(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_each_long_stage_of_a_run_says_what_it_does(shown, monkeypatch, unoptimized, tmp_path, capsys):
     """Here each stage is long; whoever waits for a large capture sees these lines."""
     monkeypatch.setattr(stages, "_FIRST", 0.0)

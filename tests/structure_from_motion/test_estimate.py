@@ -62,7 +62,7 @@ def test_wrong_settings_are_reported(images, tmp_path, pycolmap, setting, value)
 
 
 def test_a_folder_without_images_is_reported_in_one_line(tmp_path):
-    code, out, err = runs.run("cameras", f"--images={tmp_path}", f"--out={tmp_path / 'out'}")
+    code, out, err = runs.run_forked("cameras", f"--images={tmp_path}", f"--out={tmp_path / 'out'}")
     assert (code, out) == (1, "")
     assert err.startswith(f"error: {tmp_path}: holds no images, expected at least 3 ") and err.count("\n") == 1
 
@@ -233,7 +233,7 @@ def test_cameras_of_a_few_images_agree_with_the_given_ones_and_an_interrupted_ca
     assert not (out / "sparse").exists()
     extracted = colmap_process.count_rows(database, "descriptors")
 
-    code, text, err = runs.run("cameras", *flags)
+    code, text, err = runs.run_forked("cameras", *flags)
     assert code == 0, err
     assert "registered      8 of 8 images\n" in text
     assert sum(line.count("Processed file") for line in (out / "cameras" / "log.txt").open()) <= 8 + 8 - extracted + 1
@@ -247,8 +247,8 @@ def test_cameras_of_a_few_images_agree_with_the_given_ones_and_an_interrupted_ca
         assert np.degrees(np.arccos(min((np.trace(apart) - 1) / 2, 1.0))) < 1.0
 
     before = files(out / "sparse")
-    code, _, err = runs.run("cameras", *flags)
+    code, _, err = runs.run_forked("cameras", *flags)
     assert code == 1 and "add --overwrite" in err and files(out / "sparse") == before
-    code, text, err = runs.run("cameras", *flags, "--overwrite")
+    code, text, err = runs.run_forked("cameras", *flags, "--overwrite")
     assert code == 0 and files(out / "sparse") == before, err
     assert json.loads((out / "cameras" / "settings.json").read_text())["matching"] == "exhaustive"

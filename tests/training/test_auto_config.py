@@ -55,6 +55,7 @@ AUTO_FIELDS = {
     "data.background_color": (0.5, 0.4, 0.3),
     "cameras.num_images": 60,
     "train.batch_size": 512,
+    "train.rays_per_side": 2,
     "train.microbatch_size": 128,
     "train.steps_per_dispatch": 8,
     "train.max_steps": 300,

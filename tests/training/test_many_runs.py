@@ -36,7 +36,7 @@ def difference(a, b):
 @pytest.mark.parametrize(
     ("kind", "vmapped"),
     [
-        ("packed", False),
+        pytest.param("packed", False, marks=pytest.mark.slow),
         pytest.param("packed", True, marks=pytest.mark.slow),
         pytest.param("paper", True, marks=pytest.mark.extra),
     ],

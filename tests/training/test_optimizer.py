@@ -1,5 +1,7 @@
 """Muon and averaged parameters: which parameters they change, by how much, and how they are saved."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,7 +83,7 @@ def test_muon_of_all_matrices_together_is_that_of_each(monkeypatch):
         params, state = start, update.init(start)
         for seed in range(3):
             grads = {"fine": network(jax.random.key(seed))}
-            updates, state = update.update(grads, state, params)
+            updates, state = jax.jit(update.update)(grads, state, params)
             params = optax.apply_updates(params, updates)
         ends.append((params, state))
     assert jax.tree.structure(ends[0]) == jax.tree.structure(ends[1])  # so a run goes on, on another device
@@ -131,7 +133,7 @@ def test_reinitialization_resets_the_moments():
 
 
 def test_state_is_restored_from_a_checkpoint(tmp_path):
-    """This includes the masks that stand for parameters of the other optimizer."""
+    """This includes the masks that stand for parameters of the other optimizer. Rendering reads a part of it."""
     params = {"fine": network(jax.random.key(0))}
     update = optimizer(averaging_power=10.0)
     _, moved = update.update(slopes(1), update.init(params), params)
@@ -141,6 +143,17 @@ def test_state_is_restored_from_a_checkpoint(tmp_path):
     checkpoints.save(state)
     like = jax.tree.map(jnp.zeros_like, state)
     assert_same(checkpoints.load(1, like), state, rtol=0, atol=0)
+    read = {"fine": moved.average["fine"]}, None
+    assert_same(checkpoints.load_rendered(1, like), read, rtol=0, atol=0)
+    metadata = tmp_path / "checkpoints" / "1" / "_CHECKPOINT_METADATA"
+    content = json.loads(metadata.read_text())
+    del content["custom_metadata"]["fingerprint_of_rendered"]  # as earlier versions wrote it
+    metadata.write_text(json.dumps(content))
+    assert_same(checkpoints.load_rendered(1, like), read, rtol=0, atol=0)
+    content["custom_metadata"]["fingerprint_of_rendered"] = content["custom_metadata"]["fingerprint"]
+    metadata.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="checkpoints/1: .*its numbers are not those that were saved"):
+        checkpoints.load_rendered(1, like)
 
 
 def test_negative_size_is_an_error():

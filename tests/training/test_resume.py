@@ -18,7 +18,7 @@ from jaxnerf.training import metric_log, workdir
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import changed, to_config_dict
 from jaxnerf.training.options import UNLIMITED_STEPS
-from runs import SMOKE_FLAGS, run, smoke_config, start
+from runs import SMOKE_FLAGS, run_forked, smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -92,11 +92,11 @@ def test_a_run_resumes_from_its_workdir_alone(trained, tmp_path):
 @pytest.mark.slow
 def test_the_program_resumes_with_flags_and_rejects_an_empty_workdir(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
-    code, _, err = run("train", f"--workdir={folder}", "--config.train.max_steps=25")
+    code, _, err = run_forked("train", f"--workdir={folder}", "--config.train.max_steps=25")
     assert code == 0 and "20 of 25 done" in err and Checkpoints(folder).steps()[-1] == 25, err
-    code, _, err = run("train", f"--workdir={tmp_path / 'none'}")
+    code, _, err = run_forked("train", f"--workdir={tmp_path / 'none'}")
     assert code == 1 and err.count("\n") == 1 and "holds no config.json, so there is no run to resume" in err
-    code, _, err = run("train", f"--workdir={tmp_path / 'none'}", "--config.train.max_steps=25")
+    code, _, err = run_forked("train", f"--workdir={tmp_path / 'none'}", "--config.train.max_steps=25")
     assert code == 2 and err.count("\n") == 1 and "give --config=NAME" in err
 
 

@@ -1,17 +1,23 @@
-"""Where the pixels of a view may see matter, according to the dataset's sparse points."""
+"""Where the pixels of a view may see matter, according to the dataset's sparse points.
+
+SciPy is imported where it is used: it takes 50 MB, and a start that finds its results in the cache does not need it.
+"""
+
+import pathlib
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import DEPTH_STRIDE
+from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.runtime.user_cache import load_or_make
 
 _MARGIN = 0.15  # of the depth: surfaces curve between points, and points have errors
 _NEIGHBOURS = 8  # observations around one that it is compared with
 _OUTLIER = 0.3  # relative difference from the median inverse depth of the neighbours
 _FEW = 16  # observations in a view: fewer say too little
+_SLOW = 0.5  # seconds of work from which depths are cached
 
 
 def surface_range(
@@ -50,11 +56,27 @@ def interpolated_depths(views: Views) -> Float[np.ndarray, "V H W 2"]:
 
     The inverse depth is interpolated linearly in triangles of observations, so it is exact on planes if the lens does
     not distort. The confidence is the square of the least inverse depth of a triangle's corners over the largest one:
-    a triangle between an object and what is behind it tells little. It is 0 outside all triangles.
+    a triangle between an object and what is behind it tells little. It is 0 outside all triangles. A result that takes
+    a while to compute is kept in the user's cache.
 
     Args:
         views: of any sizes; the result has the largest of them, and 0 beyond the end of a view.
     """
+    code = pathlib.Path(__file__).read_bytes()
+    name = f"depths_{fingerprint(code, DEPTH_STRIDE, views.size, views.cameras.to_world, views.sparse)}"
+    found = load_or_make(
+        None,
+        name,
+        lambda: {"depths": _interpolated(views)},
+        is_valid=lambda arrays: set(arrays) == {"depths"} and arrays["depths"].dtype == np.float32,
+        min_seconds=_SLOW,
+    )
+    return found["depths"]
+
+
+def _interpolated(views):
+    from scipy.interpolate import LinearNDInterpolator
+
     height, width = -(-np.asarray(views.size).max(axis=0) // DEPTH_STRIDE)
     result = np.zeros((len(views.size), height, width, 2), np.float32)
     y, x = (places.reshape(-1) for places in np.mgrid[:height, :width])
@@ -73,6 +95,8 @@ def interpolated_depths(views: Views) -> Float[np.ndarray, "V H W 2"]:
 
 def _triangulated(views, view):
     """Returns the triangles between a view's observations, without outliers, and the inverse depths; None: too few."""
+    from scipy.spatial import Delaunay, QhullError, cKDTree
+
     if views.sparse is None:
         return None
     first, end = np.searchsorted(views.sparse.view, [view, view + 1])

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 
 from jaxnerf.core import contraction
 from jaxnerf.core.cameras import project, undistort
@@ -75,6 +74,8 @@ def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
     known = np.zeros(len(views.offset)) if views.free_depth is None else np.asarray(views.free_depth)
     nearest = np.where(known > 0, known, np.inf)
     if views.sparse is not None and len(views.sparse.positions) >= _FEW_POINTS:
+        from scipy.spatial import cKDTree  # see free_space.py
+
         centers = np.asarray(views.cameras.to_world)[:, :, 3]
         distances, _ = cKDTree(views.sparse.positions).query(centers, [_FEW_POINTS])
         nearest = np.minimum(nearest, distances[:, 0])

@@ -73,7 +73,7 @@ def render_path(
         overwrite: whether frames of that name are deleted first.
         shard: (index, count): only every count-th frame, from frame `index` on. The process that finds all
             frames finished makes the depth images and the videos.
-        max_rays_per_pixel: a pixel that covers more of the scene than those of training is the mean over as many rays
+        max_rays_per_pixel: a pixel that covers more of the scene than a ray of training is the mean over as many rays
             as training has there, and at most so many, see `Footprint.rays_per_side`.
 
     Returns:
@@ -180,7 +180,7 @@ def _print_rays(sides):
         rays = sides[sides > 1] ** 2
         count = f"{rays.min()}" if rays.min() == rays.max() else f"{rays.min()} to {rays.max()}"
         where = f" in {len(rays)} of {len(sides)} frames" if len(rays) < len(sides) else ""
-        why = "as a pixel covers more than in training; --max_rays_per_pixel=1 renders one"
+        why = "as dense as those of training; --max_rays_per_pixel=1 renders one"
         print(f"rays: {count} per pixel{where}, {why}", file=sys.stderr)
 
 
