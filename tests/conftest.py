@@ -62,9 +62,9 @@ _finished_files = 0
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Forgets the compiled programs of every 20 files: JAX itself forgets some of more than about 4000."""
+    """Forgets the compiled programs of every 40 files: JAX itself forgets some of more than about 4000."""
     global _finished_files
     if nextitem is None or nextitem.path != item.path:
         _finished_files += 1
-        if _finished_files % 20 == 0:
+        if _finished_files % 40 == 0:
             jax.clear_caches()

@@ -298,7 +298,8 @@ def test_rays_have_the_fields_that_are_needed():
 
 def test_each_drawn_ray_has_the_time_and_the_index_of_its_view():
     scene = dataclasses.replace(views(), time=np.float32([0.1, 0.2, 0.3]))
-    _, batch = ray_batches.draw_batch(7, 0, jnp.arange(64), scene, needs=("time", "image_index", "radius"))
+    needs = ("time", "image_index", "radius")
+    _, batch = jax.jit(functools.partial(ray_batches.draw_batch, 7, 0, needs=needs))(jnp.arange(64), scene)
     view, _ = pixel_ids(batch.rays)
     np.testing.assert_array_equal(batch.rays.image_index, view)
     np.testing.assert_array_equal(batch.rays.time, scene.time[view])

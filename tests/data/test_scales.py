@@ -1,6 +1,7 @@
 """Images at several sizes: means of premultiplied colour, cameras of the same cones, and losses that weigh as sides."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -100,12 +101,13 @@ def test_too_many_sizes_are_refused():
 
 def test_rays_have_the_weight_of_their_view():
     whole = jax.tree.map(jnp.asarray, with_scales(views(), 2))
-    _, batch = ray_batches.draw_batch(0, 0, jnp.arange(64), whole, needs=("radius",))
+    draw = jax.jit(functools.partial(ray_batches.draw_batch, 0, 0, needs=("radius",)))
+    _, batch = draw(jnp.arange(64), whole)
     weights = np.asarray(whole.loss_weight)
     large = np.asarray(batch.rays.radius) > 1.5 * np.asarray(batch.rays.radius).min()
     assert 0 < large.sum() < 64
     np.testing.assert_allclose(batch.loss_weight, np.where(large, weights[-1], weights[0]), rtol=1e-6)
-    assert ray_batches.draw_batch(0, 0, jnp.arange(4), views())[1].loss_weight is None
+    assert draw(jnp.arange(64), views())[1].loss_weight is None
 
 
 def test_a_loss_weight_of_two_is_a_ray_drawn_twice():
@@ -118,7 +120,7 @@ def test_a_loss_weight_of_two_is_a_ray_drawn_twice():
 
         model = toy_model()
         step = make_train_step(model, OPTIMIZER, draw, LOSSES)
-        return step(create_state(model, OPTIMIZER, 0), None, jnp.asarray([index]))
+        return jax.jit(step)(create_state(model, OPTIMIZER, 0), None, jnp.asarray([index]))
 
     (_, twice), (_, heavy) = gradient_step([0, 1, 1], None), gradient_step([0, 1], np.float32([2, 4]) / 3)
     for name in ("loss", "grad_norm", "mse_fine"):

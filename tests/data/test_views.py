@@ -41,7 +41,8 @@ def test_the_scene_looks_like_its_image_along_a_views_rays():
 def test_the_cameras_of_all_views_have_the_rays_of_each():
     views = jaxnerf.load_dataset("", split="test", format="synthetic", size=8)  # as many views as pixels in a row
     views = dataclasses.replace(views, near=views.near + np.arange(8, dtype=np.float32) / 8, time=np.linspace(0, 1, 8))
-    rays = jaxnerf.rays_from_pixels(views.cameras, jaxnerf.pixel_grid(8, 8), near=views.near, far=views.far)
+    rays_of = jax.jit(jaxnerf.rays_from_pixels)
+    rays = rays_of(views.cameras, jaxnerf.pixel_grid(8, 8), near=views.near, far=views.far)
     for index in (0, 5, -1):
         alone = views.rays(index)
         assert (alone.time == np.float32(views.time[index])).all() and rays.time is None

@@ -34,7 +34,7 @@ FIELDS = {
 def packed(options, precision="16 bits", contracted=False, as_scene=False):
     """Returns the function that evaluates a field with random parameters, and its WebScene; as_scene: it is a scene."""
     network, field = HashGrid(**options), hash_grid_field(**options)
-    params = field.init(jax.random.key(1))
+    params = jax.jit(field.init)(jax.random.key(1))
     leaves, tree = jax.tree.flatten(params)
     rng = np.random.default_rng(2)
     leaves = [np.float32(leaf + 0.3 * rng.standard_normal(leaf.shape)) for leaf in leaves]
@@ -52,7 +52,7 @@ def packed(options, precision="16 bits", contracted=False, as_scene=False):
         return lambda x, viewdirs: field.apply(decoded, x, viewdirs), scene
 
     def evaluate(x, viewdirs):
-        density, rgb = field.apply(decoded, jnp.float32(x)[None], jnp.float32(viewdirs)[None])
+        density, rgb = jax.jit(field.apply)(decoded, np.float32(x)[None], np.float32(viewdirs)[None])
         return np.asarray(density[0]), np.asarray(rgb[0])
 
     return evaluate, scene

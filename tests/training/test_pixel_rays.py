@@ -181,9 +181,10 @@ def uninterrupted(compiled_once, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("resumed_at", "per_dispatch"),
-    [pytest.param(4, 1, marks=pytest.mark.slow), (8, 1), pytest.param(STEPS, 5, marks=pytest.mark.slow)],
+    [(4, 1), (8, 1), (STEPS, 5)],
 )
 def test_a_run_resumed_in_either_part_and_one_of_several_steps_a_dispatch_are_the_same(
     uninterrupted, tmp_path, resumed_at, per_dispatch
