@@ -20,6 +20,7 @@ from PIL import Image
 from jaxnerf.core import cameras, rendering
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.types import Camera, Rays
+from jaxnerf.core.views import Views
 from jaxnerf.data import synthetic
 from jaxnerf.fields import still_life
 
@@ -32,6 +33,22 @@ _LENSES = {
     "fisheye": (0.8, (0.06, -0.02, 0.004, -0.001)),
 }
 _ORIENTATION = 0x0112
+
+
+def black_views(cameras: Camera, **fields) -> Views:
+    """Returns Views of black images of stacked cameras of one size, between t = 1 and 9; fields: others of Views."""
+    count = len(cameras.to_world)
+    size = np.tile(np.int32([[cameras.height, cameras.width]]), (count, 1))
+    counts = size.prod(axis=1)
+    return Views(
+        pixels=np.zeros((counts.sum(), 3), np.uint8),
+        offset=np.int32(np.cumsum(counts) - counts),
+        size=size,
+        cameras=cameras,
+        near=np.ones(count, np.float32),
+        far=np.full(count, 9, np.float32),
+        **fields,
+    )
 
 
 class Shot(NamedTuple):

@@ -40,9 +40,9 @@ class MlpOptions(Options):
     encode: bool = option(True, "whether position and direction have a positional encoding")
     prefilter: bool = option(
         False,
-        "Whether the position's encoding is its mean over the part of the pixel's cone that a sample stands for "
-        "(integrated positional encoding, arXiv:2103.13415), and which is no shorter than the pixel is wide there. The "
-        "network also reads what the mean leaves of each octave. auto: as for `hash_grid.prefilter`.",
+        "Whether the position's encoding is its mean over the part of the pixel's cone around a sample (integrated "
+        "positional encoding, arXiv:2103.13415), taken to be no shorter than the pixel is wide there. The network also "
+        "reads what the mean leaves of each octave. auto: as for `hash_grid.prefilter`.",
         auto=True,
     )
     use_viewdirs: bool = option(True, "whether colour depends on the direction")

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from captures import orbit
-from jaxnerf import SparsePoints, Views
+from captures import black_views, orbit
+from jaxnerf import SparsePoints
 from jaxnerf.core.cameras import project
 from jaxnerf.data.observations import confident_observations
 
@@ -25,17 +25,7 @@ def views():
     kept = (point > 0) | (view == 0)
     pixel = np.float32(np.asarray(pixels).reshape(-1, 2) + rng.normal(scale=0.2, size=(view.size, 2)))
     sparse = SparsePoints(positions=positions, view=view[kept], point=point[kept], pixel=pixel[kept])
-    size = np.tile(np.int32([[cameras.height, cameras.width]]), (VIEWS, 1))
-    counts = size.prod(axis=1)
-    return Views(
-        pixels=np.zeros((counts.sum(), 3), np.uint8),
-        offset=np.int32(np.cumsum(counts) - counts),
-        size=size,
-        cameras=cameras,
-        near=np.ones(VIEWS, np.float32),
-        far=np.full(VIEWS, 9, np.float32),
-        sparse=sparse,
-    )
+    return black_views(cameras, sparse=sparse)
 
 
 def changed(views, **fields):

@@ -1,5 +1,6 @@
 """Muon and averaged parameters: which parameters they change, by how much, and how they are saved."""
 
+import dataclasses
 import json
 
 import jax
@@ -145,6 +146,10 @@ def test_state_is_restored_from_a_checkpoint(tmp_path):
     assert_same(checkpoints.load(1, like), state, rtol=0, atol=0)
     read = {"fine": moved.average["fine"]}, None
     assert_same(checkpoints.load_rendered(1, like), read, rtol=0, atol=0)
+    others = dataclasses.replace(like, params=jax.tree.map(lambda leaf: jnp.zeros(7), like.params))
+    assert_same(checkpoints.load_rendered(1, others), read, rtol=0, atol=0)  # does not read the last parameters
+    with pytest.raises(ValueError, match="checkpoints/1: cannot be read"):
+        checkpoints.load(1, others)
     metadata = tmp_path / "checkpoints" / "1" / "_CHECKPOINT_METADATA"
     content = json.loads(metadata.read_text())
     del content["custom_metadata"]["fingerprint_of_rendered"]  # as earlier versions wrote it

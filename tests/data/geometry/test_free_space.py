@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from captures import orbit
-from jaxnerf import SparsePoints, Views
+from captures import black_views, orbit
+from jaxnerf import SparsePoints
 from jaxnerf.core.cameras import project, rays_from_pixels
 from jaxnerf.data.geometry import free_space
 from jaxnerf.data.ray_batches import DEPTH_STRIDE
@@ -24,19 +24,9 @@ def views():
     positions += np.outer((HEIGHT - positions @ NORMAL) / (NORMAL @ NORMAL), NORMAL)
     camera = jax.tree.map(lambda leaf: leaf[0], cameras)
     pixel = np.float32(project(camera, np.float32(positions))[0])
-    size = np.tile(np.int32([[cameras.height, cameras.width]]), (2, 1))
     index = np.arange(len(positions), dtype=np.int32)
     sparse = SparsePoints(positions=np.float32(positions), view=0 * index, point=index, pixel=pixel)
-    counts = size.prod(axis=1)
-    return Views(
-        pixels=np.zeros((counts.sum(), 3), np.uint8),
-        offset=np.int32(np.cumsum(counts) - counts),
-        size=size,
-        cameras=cameras,
-        near=np.ones(2, np.float32),
-        far=np.full(2, 9, np.float32),
-        sparse=sparse,
-    )
+    return black_views(cameras, sparse=sparse)
 
 
 def test_depths_are_exact_on_a_plane(views):
