@@ -9,5 +9,5 @@ def get_config():
     config.hash_grid.table_size = 2**17  # so few pixels do not fill larger ones, which train longer
     config.losses.total_variation, config.losses.depth_smoothness, config.losses.near_opacity = 1.0, 0.1, 0.1
     config.losses.distortion = "auto"
-    config.train.max_seconds = 300.0
+    config.train.max_seconds, config.train.table_momentum = 300.0, True
     return config

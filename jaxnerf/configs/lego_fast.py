@@ -16,7 +16,7 @@ def get_config():
     train = config.train
     train.batch_size, train.cpu_batch_size, train.max_steps, train.lr_steps = "auto", 1024, "auto", "auto"
     train.lr_init, train.lr_final, train.lr_decay_power, train.warmup_steps = 5e-3, 1.5e-4, 8.0, 50
-    train.muon = 0.6
+    train.muon, train.table_momentum = 0.6, False
     train.beta2, train.epsilon = 0.99, 1e-15  # entries that few samples reach get updates of full size, too
     train.averaging_power = 10.0
     train.rays_per_side = "auto"

@@ -8,5 +8,5 @@ def get_config():
     config = lego_fast.get_config()
     data, train = config.data, config.train
     data.format, data.dir, data.factor, data.size = "synthetic", "", 1, 200
-    train.max_seconds, train.lr_decay_power = 60.0, 4.0
+    train.max_seconds, train.lr_decay_power, train.table_momentum = 60.0, 4.0, True
     return config

@@ -55,6 +55,11 @@ class OptimizerOptions(Options):
         "root mean square times the learning rate; those of Adam have about 0.2.",
         range=at_least(0),
     )
+    table_momentum: bool = option(
+        True,
+        "whether Adam keeps a first moment of the gradient of a hash grid's table, too. Without it, a step takes less "
+        "time and memory, as most rows have no gradient in most steps.",
+    )
     averaging_power: float = option(
         0.0,
         "Above 0: evaluation uses parameters averaged over about the last 1 / power of all steps (arXiv:1212.1824).",
@@ -78,10 +83,13 @@ def make_optimizer(
     moments = {"b1": train.beta1, "b2": train.beta2, "eps": train.epsilon}
 
     def optimizer_with(schedule):
+        decay = _DECAY if train.muon else 0.0
+        optimizer = optax.adamw(schedule, **moments, weight_decay=decay) if decay else optax.adam(schedule, **moments)
+        if not train.table_momentum:
+            table = _without_momentum(schedule, train.beta2, train.epsilon, decay)
+            optimizer = optax.partition({"table": table, "other": optimizer}, _tables)
         if train.muon:
-            optimizer = with_muon(optax.adamw(schedule, **moments, weight_decay=_DECAY), schedule, train.muon)
-        else:
-            optimizer = optax.adam(schedule, **moments)
+            optimizer = with_muon(optimizer, schedule, train.muon)
         return optimizer if cameras is None else _with_cameras(optimizer, train, schedule, cameras)
 
     def update(grads, state, params=None, *, decay=None):
@@ -117,6 +125,16 @@ def _with_cameras(optimizer, train, schedule, cameras):
         return "log_gains" if path[1].key == "log_gains" else "poses"
 
     return optax.partition(updates, lambda params: jax.tree_util.tree_map_with_path(label, params))
+
+
+def _without_momentum(schedule, beta2, epsilon, decay):
+    """Returns AdamW without a first moment; what corrects the bias of the second one is a factor of the update."""
+    return optax.chain(
+        optax.scale_by_rms(beta2, epsilon, eps_in_sqrt=False),
+        optax.scale_by_schedule(lambda step: jnp.sqrt(1 - beta2 ** (step + 1.0))),
+        optax.add_decayed_weights(decay),
+        optax.scale_by_learning_rate(schedule),
+    )
 
 
 def with_muon(
@@ -184,6 +202,13 @@ def _labels(params):
     def label(path, leaf):
         matrix = getattr(path[-1], "key", None) == "kernel" and leaf.ndim == 2
         return "muon" if matrix and min(leaf.shape) >= _MIN_SIDE else "other"
+
+    return jax.tree_util.tree_map_with_path(label, params)
+
+
+def _tables(params):
+    def label(path, _):
+        return "table" if getattr(path[-1], "key", None) == "table" else "other"
 
     return jax.tree_util.tree_map_with_path(label, params)
 

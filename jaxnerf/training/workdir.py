@@ -41,6 +41,7 @@ _ADDED = {
     "train.lr_decay_power": 1.0,
     "train.one_ray_fraction": 0.6,
     "train.rays_per_side": 1,
+    "train.table_momentum": True,
 }
 # Options that no longer exist, and the value with which training was as it is now.
 _REMOVED = {"occupancy.near_gradient_distance": 0.0}

@@ -76,6 +76,26 @@ def test_adamw_updates_all_other_parameters(power):
     assert np.abs(ends[0]["kernel"] - ends[1]["kernel"]).max() > RATE / 10
 
 
+@pytest.mark.parametrize("muon, decay", [(SIZE, 0.05), (0.0, 0.0)])
+def test_the_table_may_have_no_first_moment(muon, decay):
+    """It is then updated by AdamW with beta1 = 0, and all other parameters as before."""
+    start, ends = {"fine": network(jax.random.key(0))}, []
+    without = optax.adamw(RATE, 0.0, 0.9, 1e-12, weight_decay=decay)
+    updates = optimizer(muon=muon), optimizer(muon=muon, table_momentum=False), without
+    for update in updates:
+        params, state, move = start, update.init(start), jax.jit(update.update)
+        for seed in range(3):
+            changes, state = move(slopes(seed), state, params)
+            params = optax.apply_updates(params, changes)
+        ends.append((params["fine"], state))
+    (usual, full), (found, state), (expected, _) = ends
+    assert_same(found["table"], expected["table"], rtol=1e-5, atol=1e-6)
+    assert np.abs(found["table"] - usual["table"]).max() > RATE / 10
+    assert_same({**found, "table": 0}, {**usual, "table": 0}, rtol=0, atol=0)
+    tables = [[leaf for leaf in jax.tree.leaves(each) if leaf.shape == (64, 8)] for each in (full, state)]
+    assert [len(each) for each in tables] == [2, 1]
+
+
 def test_muon_of_all_matrices_together_is_that_of_each(monkeypatch):
     start, ends = {"fine": network(jax.random.key(0))}, []
     for backend in ("cpu", "gpu"):
