@@ -80,7 +80,18 @@ def stepped_edges(
     shift = 0.0 if key is None else uniform(key, (*near.shape, 1))
     count = jnp.arange(num_segments + 1, dtype=near.dtype).reshape((1,) * near.ndim + (-1,))
     step = jnp.broadcast_to(jnp.asarray(step_size, near.dtype), near.shape)
-    near, far, step = near[..., None], far[..., None], step[..., None]
+    return edges_after_steps(count, near[..., None], far[..., None], step[..., None], num_segments, shift)
+
+
+def edges_after_steps(
+    count: Num[ArrayLike, "*#batch #edges"],
+    near: Float[ArrayLike, "*#batch 1"],
+    far: Float[ArrayLike, "*#batch 1"],
+    step: Float[ArrayLike, "*#batch 1"],
+    num_segments: int,
+    shift: Float[ArrayLike, "*#batch 1"] | float = 0.0,
+) -> Float[Array, "*batch edges"]:
+    """Computes those edges of stepped_edges that follow a number of steps."""
     inner = jnp.minimum(near + (count - shift) * step, far)
     return jnp.where(count == 0, near, jnp.where(count == num_segments, far, inner))
 

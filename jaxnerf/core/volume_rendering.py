@@ -414,7 +414,7 @@ def running_sum(x: Float[ArrayLike, "*batch samples"], part_size: int = 16) -> F
     return total.reshape(*x.shape[:-1], -1)[..., :size]
 
 
-def running_sum_since(starts: Bool[ArrayLike, " K"], x: Float[Array, " K"], longest: int) -> Float[Array, " K"]:
+def running_sum_since(starts: Bool[ArrayLike, " K"], x: Num[Array, " K"], longest: int) -> Num[Array, " K"]:
     """Computes the cumulative sum since the last start, for runs of at most longest (Hillis and Steele 1986)."""
     rounds = max(min(longest, x.size) - 1, 0).bit_length()
 

@@ -344,6 +344,43 @@ def is_occupied(
     return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t) | has_nan(rays)[..., None]
 
 
+def near_occupied(
+    grid: OccupancyGrid, rays: Rays, t: Float[ArrayLike, "*batch samples"], radius: int
+) -> Bool[Array, "*batch samples"]:
+    """Returns whether a cell within a radius of x(t) is occupied, or one that is somewhat farther away.
+
+    It is looked up in coarse cells whose side is the radius: true if that around x(t) holds an occupied cell, or one
+    beside it. Places outside the box count as those at its border.
+
+    Args:
+        grid: OccupancyGrid, not contracted.
+        rays: Rays [...].
+        t: [..., S] in t.
+        radius: cells along each axis, >= 1.
+    """
+    coarse = grid.occupied
+    for axis in range(3):
+        # One pass for each axis: the first, over all cells, is then vectorised.
+        coarse = jax.lax.optimization_barrier(_pooled(coarse, radius, axis))
+    for axis in range(3):
+        around = jnp.pad(coarse, [(1, 1) if i == axis else (0, 0) for i in range(3)])
+        before, after = (jax.lax.slice_in_dim(around, i, i + coarse.shape[axis], axis=axis) for i in (0, 2))
+        coarse |= before | after
+    places = [place / radius for place in _along_rays(grid, rays, t)]
+    along = [jnp.clip(x, 0, size - 1).astype(jnp.int32) for x, size in zip(places, coarse.shape, strict=True)]
+    return coarse.reshape(-1)[flat_index(along, coarse.shape)]
+
+
+def _pooled(cells, side, axis):
+    """Returns whether any of `side` cells along an axis is true; the last ones may be fewer."""
+    whole = cells.shape[axis] // side * side
+    parts = [jax.lax.slice_in_dim(cells, i, whole, side, axis) for i in range(side if whole else 0)]
+    parts = [functools.reduce(jnp.logical_or, parts)] if whole else []
+    if whole < cells.shape[axis]:
+        parts.append(jax.lax.slice_in_dim(cells, whole, None, axis=axis).any(axis=axis, keepdims=True))
+    return jnp.concatenate(parts, axis=axis)
+
+
 def _check_bool(function, **cells):
     """Raises a ValueError unless arrays of cells are bool; numbers would be masks by accident."""
     for name, array in cells.items():

@@ -9,10 +9,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from jaxnerf.core.loops import short_loop
 from jaxnerf.core.occupancy.grid import OccupancyGrid, estimate_optical_depth
 from jaxnerf.core.occupancy.packed import PlacedSamples
+from jaxnerf.core.occupancy.sample_runs import RaysInRuns, SampleRuns, WholeRays
 from jaxnerf.core.sampling import uniform
 from jaxnerf.core.types import Keys, Rays, Samples, check_shapes
 from jaxnerf.core.varying import vary_like
-from jaxnerf.core.volume_rendering import exclusive_sum, running_sum
 
 _PARTS = 2.0**16  # probabilities are multiples of its inverse: float32 then sums them exactly, in any order
 
@@ -21,7 +21,7 @@ def importance_samples(
     key: Keys,
     grid: OccupancyGrid,
     rays: Rays,
-    candidates: Samples,
+    candidates: Samples | SampleRuns,
     *,
     max_samples: int,
     uniform_fraction: float,
@@ -40,7 +40,8 @@ def importance_samples(
         key: one key, or one per ray [B]; it moves all samples of a ray together.
         grid: OccupancyGrid. Its cells are the resolution of the weights.
         rays: Rays [B].
-        candidates: Samples [B, S] of rule "segments", S <= 2^16; usually of `march_rays`.
+        candidates: Samples [B, S] of rule "segments", S <= 2^16, usually of `march_rays`; or the SampleRuns of
+            `march_near_matter`, which are fewer.
         max_samples: K >= 1, the size of the buffer.
         uniform_fraction: in (0, 1]. The weights are estimates: without evenly placed samples, matter would not be
             found where the grid has none yet. At 1 the weights do not matter.
@@ -54,8 +55,11 @@ def importance_samples(
     Raises:
         ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
     """
-    shapes = {"near": (rays.near, "B"), "t": (candidates.t, "B S"), "delta": (candidates.delta, "B S")}
-    check_shapes("importance_samples", **shapes)
+    along: WholeRays | RaysInRuns = WholeRays()
+    if isinstance(candidates, SampleRuns):
+        candidates, along = candidates.samples, RaysInRuns(candidates)
+    rows = "U W" if isinstance(along, RaysInRuns) else "B S"
+    check_shapes("importance_samples", near=(rays.near, "B"), t=(candidates.t, rows), delta=(candidates.delta, rows))
     if candidates.rule != "segments" or max_samples < 1 or not 0 < uniform_fraction <= 1:
         raise ValueError(
             f"importance_samples: rule is {candidates.rule!r}, max_samples {max_samples} and uniform_fraction "
@@ -66,23 +70,24 @@ def importance_samples(
         index = jnp.zeros(max_samples, jnp.int32)
         return PlacedSamples(t=zeros, delta=zeros, ray_index=index, used=index > 0, num_dropped=none), none > 0
     # Candidates that the grid expects to be hidden are skipped; the others share out the slots of the buffer.
-    occupied, optical_depth = estimate_optical_depth(grid, rays, candidates)
-    in_front = exclusive_sum(optical_depth)
+    occupied, optical_depth = estimate_optical_depth(grid, along.of_rows(rays), candidates)
+    in_front = along.before(optical_depth)
     kept = occupied & ~(in_front > max_optical_depth)
-    count = kept.sum(axis=-1, dtype=jnp.int32)
+    count = along.total(kept.sum(axis=-1, dtype=jnp.int32))
     number = divide_slots(count, max_samples)
     # The probability of each candidate: a part in proportion to its estimated weight, only where the ray gets fewer
     # samples than candidates, and the rest evenly, so that the sum is 1.
     transmittance = jnp.exp(-in_front)
     weights = jnp.where(kept, transmittance - transmittance * jnp.exp(-optical_depth), 0)
-    weights = jnp.where((number < count)[:, None], (1 - uniform_fraction) * weights, 0)
-    even = (1 - weights.sum(axis=-1)) / jnp.maximum(count, 1)
-    probability = weights + even[:, None]
+    weights = jnp.where(along.of_rows(number < count)[:, None], (1 - uniform_fraction) * weights, 0)
+    even = (1 - along.total(weights.sum(axis=-1))) / jnp.maximum(count, 1)
+    probability = weights + along.of_rows(even)[:, None]
     # As whole numbers of parts, whose sums are exact in float32 whatever the order; each candidate has at least one.
     parts = jnp.where(kept, 1 + jnp.where(probability > 0, jnp.floor(_PARTS * probability), 0), 0)
-    cumulative = running_sum(parts)
+    cumulative = along.through(parts)
     delta = jnp.where(kept, candidates.delta, 0)
-    length = running_sum(delta)
+    length = along.through(delta)
+    all_parts, whole_length = along.last(cumulative), along.last(length)
 
     # The ray of each slot: a cumulative sum of where rays end in the buffer takes the place of a search.
     first = jnp.cumsum(number, dtype=jnp.int32) - number
@@ -91,32 +96,34 @@ def importance_samples(
     ray = jnp.minimum(jnp.cumsum(ended, dtype=jnp.int32), count.size - 1)
     used = slot < number.sum()
     # The parts of a ray are divided evenly among its slots; a random shift moves all inner bounds together.
-    row, total = slot - first[ray], cumulative[ray, -1]
+    row, total = slot - first[ray], all_parts[ray]
     spacing = total / jnp.maximum(number[ray], 1)
     shift = uniform(key, (*count.shape, 1))[ray, 0] - 0.5
     lower = jnp.where(row == 0, 0, (row + shift) * spacing)
     last = row == number[ray] - 1
     upper = jnp.where(last, total, (row + 1 + shift) * spacing)
+    begin, size = along.places_of(ray, candidates.t.shape[-1])
 
     def locate(at):
         """Returns the candidate that contains a place [K] on the scale of `cumulative`, and the fraction before it."""
-        index = _count_up_to(cumulative, ray, jnp.minimum(jnp.floor(at), total - 1))
-        size = parts[ray, index]
-        return index, jnp.clip((at - (cumulative[ray, index] - size)) / jnp.maximum(size, 1), 0, 1)
+        found = _count_up_to(cumulative, begin, size, jnp.minimum(jnp.floor(at), total - 1), along.most_runs)
+        index = jnp.divmod(begin + found, cumulative.shape[-1])
+        size_of = parts[index]
+        return index, jnp.clip((at - (cumulative[index] - size_of)) / jnp.maximum(size_of, 1), 0, 1)
 
     # A sample lies in the middle of its parts, and stands for the length between their bounds.
     index, fraction = locate(lower)
-    before = length[ray, index] - (1 - fraction) * delta[ray, index]
-    after = jnp.where(last, length[ray, -1], jnp.roll(before, -1))
+    before = length[index] - (1 - fraction) * delta[index]
+    after = jnp.where(last, whole_length[ray], jnp.roll(before, -1))
     index, fraction = locate((lower + upper) / 2)
     placed = PlacedSamples(
-        t=jnp.where(used, candidates.t[ray, index] + (fraction - 0.5) * candidates.delta[ray, index], 0),
+        t=jnp.where(used, candidates.t[index] + (fraction - 0.5) * candidates.delta[index], 0),
         delta=jnp.where(used, jnp.maximum(after - before, 0), 0),
         ray_index=ray,
         used=used,
         num_dropped=jnp.where(number == 0, count, 0),
     )
-    return placed, (occupied & (in_front > max_optical_depth)).any(axis=-1)
+    return placed, along.any((occupied & (in_front > max_optical_depth)).any(axis=-1))
 
 
 def divide_slots(count: Int[ArrayLike, " B"], num_slots: int) -> Int[Array, " B"]:
@@ -135,15 +142,21 @@ def divide_slots(count: Int[ArrayLike, " B"], num_slots: int) -> Int[Array, " B"
     return number + (more & (jnp.cumsum(more) <= num_slots - number.sum())).astype(number.dtype)
 
 
-def _count_up_to(ascending, row, value):
-    """Returns [K], how many of ascending[row] [K, S] are at most value [K]; at most S - 1."""
-    size = ascending.shape[-1]
-    largest = 1 << (size.bit_length() - 1)
+def _count_up_to(ascending, begin, size, value, most_runs):
+    """Returns [K], how many of the `size` values after the first `begin` are at most value [K]; at most size - 1.
+
+    Args:
+        ascending: [U, W], row after row.
+        most_runs: rows that `size` values can fill.
+    """
+    most = most_runs * ascending.shape[-1]
+    largest = 1 << (most.bit_length() - 1)
 
     def search(level, found):
         place = found + (largest >> level)
         inside = place < size
-        return jnp.where(inside & (ascending[row, jnp.minimum(place, size) - 1] <= value), place, found)
+        at = jnp.divmod(begin + jnp.minimum(place, size) - 1, ascending.shape[-1])
+        return jnp.where(inside & (ascending[at] <= value), place, found)
 
-    none = vary_like(jnp.zeros(row.shape, jnp.int32), ascending, row, value)
-    return short_loop(size.bit_length(), search, none)
+    none = vary_like(jnp.zeros(value.shape, jnp.int32), ascending, begin, value)
+    return short_loop(most.bit_length(), search, none)

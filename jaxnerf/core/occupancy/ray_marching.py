@@ -35,15 +35,26 @@ def march_rays(
     Returns:
         Samples [..., S].
     """
-    x, y, z = (at_least_float32(rays.directions[..., axis])[0] for axis in range(3))
-    speed = jnp.sqrt(x * x + y * y + z * z)
+    t_step, count = stretch * steps_in_t(rays, step_size), num_steps(grid, step_size, cell)
+    if grid.contracted:
+        return samples_in_contracted_space(key, grid, rays, t_step, count)
+    inside = clip_rays_to_box(grid, rays)
+    edges = stepped_edges(key, inside.near, inside.far, step_size=t_step, num_segments=count)
+    return samples_from_edges(None, edges)
+
+
+def num_steps(grid: OccupancyGrid, step_size: float, cell: Sequence[float]) -> int:
+    """Returns the number of samples of each ray of march_rays."""
     sides = [size * count for size, count in zip(cell, grid.valid.shape, strict=True)]
     if grid.contracted:
-        return samples_in_contracted_space(key, grid, rays, stretch * step_size / speed, max(sides) / 4 / step_size)
-    inside = clip_rays_to_box(grid, rays)
-    count = _whole_words(math.hypot(*sides) / step_size + 1)
-    edges = stepped_edges(key, inside.near, inside.far, step_size=stretch * step_size / speed, num_segments=count)
-    return samples_from_edges(None, edges)
+        return _whole_words(max(sides) / step_size + 1)
+    return _whole_words(math.hypot(*sides) / step_size + 1)
+
+
+def steps_in_t(rays: Rays, step_size: float) -> Float[Array, "*batch"]:
+    """Returns a step of world units in t, [...] for Rays [...]."""
+    x, y, z = (at_least_float32(rays.directions[..., axis])[0] for axis in range(3))
+    return step_size / jnp.sqrt(x * x + y * y + z * z)
 
 
 def samples_in_contracted_space(
@@ -51,7 +62,7 @@ def samples_in_contracted_space(
     grid: OccupancyGrid,
     rays: Rays,
     t_step: Float[Array, "*batch"],
-    steps_in_half_side: float,
+    count: int,
 ) -> Samples:
     """Returns samples from near to far, at steps that grow with the contracted cells; far may be arbitrarily large.
 
@@ -65,7 +76,7 @@ def samples_in_contracted_space(
         grid: OccupancyGrid, contracted.
         rays: Rays [...].
         t_step: [...] in t, the step where space is not contracted.
-        steps_in_half_side: a number, half the side of the inner half over the step.
+        count: S, of samples.
 
     Returns:
         Samples [..., S].
@@ -81,7 +92,6 @@ def samples_in_contracted_space(
     t_step = t_step * scale / smallest
     last = scale - t_step / 2  # a whole step more would end at infinity
     near, far = (jnp.minimum(_compress(t - nearest, scale), last) for t in (rays.near, rays.far))
-    count = _whole_words(4 * steps_in_half_side + 1)
     edges = stepped_edges(key, near, far, step_size=t_step, num_segments=count)
     edges = nearest[..., None] + edges / (1 - (edges / scale[..., None]) ** 2)
     return samples_from_edges(None, jnp.clip(edges, rays.near[..., None], rays.far[..., None]))

@@ -1,0 +1,164 @@
+"""Ray marching near matter: runs of steps that may cross occupied cells, in one buffer for all rays.
+
+On a CPU the samples of a batch are computed one after the other, whether a cell is occupied or not. With fine cells
+most are not, so that it is faster to look first which parts of a ray matter at all.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, has_nan, near_occupied
+from jaxnerf.core.occupancy.ray_marching import num_steps, steps_in_t
+from jaxnerf.core.sampling import edges_after_steps, samples_from_edges
+from jaxnerf.core.types import Rays, Samples, pytree
+from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
+
+WIDTH = 8  # steps of a run; march_rays has a multiple of 32 of them
+
+
+@pytree(static=("most",))
+class SampleRuns:
+    """Samples along B rays in U runs of W that follow each other, ray after ray.
+
+    Attributes:
+        samples: Samples [U, W].
+        ray_index: [U] int32, the ray of each run, ascending. Runs that no ray has are empty and come last.
+        first: [B] int32, the first run of each ray.
+        count: [B] int32, its runs; may be 0.
+        most: an upper bound of `count`.
+    """
+
+    samples: Samples
+    ray_index: Int[Array, " U"]
+    first: Int[Array, " B"]
+    count: Int[Array, " B"]
+    most: int
+
+
+def march_near_matter(
+    grid: OccupancyGrid, rays: Rays, *, step_size: float, cell: Sequence[float], max_runs: int
+) -> tuple[SampleRuns, Bool[Array, ""]]:
+    """Returns the samples of `march_rays` in those runs of steps that may cross occupied cells.
+
+    A run is looked up once, by its middle, see `near_occupied`.
+
+    Args:
+        grid: OccupancyGrid, not contracted.
+        rays: Rays [B], B >= 1. One that is NaN has all runs.
+        step_size, cell: see `march_rays`.
+        max_runs: U, how many runs there is room for.
+
+    Returns:
+        SampleRuns, and whether there is room for all. If not, the last ones are missing.
+    """
+    steps, t_step, inside = num_steps(grid, step_size, cell), steps_in_t(rays, step_size), clip_rays_to_box(grid, rays)
+    near, far, t_run = (leaf[:, None] for leaf in (inside.near, inside.far, WIDTH * t_step))
+    runs = jnp.arange(steps // WIDTH, dtype=jnp.float32)[None]
+    # Half a run is at most so many cells long; the margin is for rounding.
+    radius = math.ceil(1.001 * WIDTH * step_size / (2 * min(cell)))
+    may_cross = (near + runs * t_run < far) & near_occupied(grid, rays, near + (runs + 0.5) * t_run, radius)
+    may_cross |= has_nan(rays)[:, None]
+    rank = running_sum(may_cross.astype(jnp.float32), part_size=runs.size).astype(jnp.int32)
+    count = rank[:, -1]
+    first = jnp.cumsum(count, dtype=jnp.int32) - count
+
+    # The runs of all rays in order; the others are written to no place.
+    place = jnp.where(may_cross, first[:, None] + rank - 1, max_runs).reshape(-1)
+    every = jnp.arange(place.size, dtype=jnp.int32)
+    chosen = jnp.full(max_runs, place.size, jnp.int32).at[place].set(every, mode="drop")
+    ray, run = jnp.divmod(chosen, runs.size)
+    ray = jnp.minimum(ray, rays.near.size - 1)
+    after = run[:, None] * WIDTH + jnp.arange(WIDTH + 1)[None]
+    ends = (leaf[ray][:, None] for leaf in (inside.near, inside.far, t_step))
+    edges = edges_after_steps(after.astype(jnp.float32), *ends, steps)
+    edges = jnp.where((chosen < place.size)[:, None], edges, 0)
+    samples = samples_from_edges(None, edges)
+    found = SampleRuns(samples=samples, ray_index=ray, first=first, count=count, most=runs.size)
+    return found, count.sum() <= max_runs
+
+
+class WholeRays:
+    """Sums of values [B, S] along rays."""
+
+    most_runs = 1
+
+    def of_rows(self, tree: Any) -> Any:
+        """Returns what belongs to the ray of each row: arrays [B, ...] as they are."""
+        return tree
+
+    def total(self, values: Array) -> Array:
+        """Returns the sum [B] of one value [B] of each row."""
+        return values
+
+    def any(self, values: Bool[Array, " B"]) -> Bool[Array, " B"]:
+        """Returns whether any row of a ray is true."""
+        return values
+
+    def through(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
+        """Returns the running sum along each ray."""
+        return running_sum(values)
+
+    def before(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
+        """Returns the sum of what is in front of each value."""
+        return exclusive_sum(values)
+
+    def last(self, sums: Float[Array, "B S"]) -> Float[Array, " B"]:
+        """Returns the last of running sums."""
+        return sums[:, -1]
+
+    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
+        """Returns how many values are in front of those of rays, row after row, and how many each ray has."""
+        return ray * width, width
+
+
+class RaysInRuns:
+    """Does what WholeRays does, for values [U, W] of SampleRuns."""
+
+    def __init__(self, runs: SampleRuns):
+        self._runs, self.most_runs = runs, runs.most
+        self._starts = jnp.arange(runs.ray_index.size) == runs.first[runs.ray_index]
+        self._last = jnp.maximum(runs.first + runs.count - 1, 0)
+
+    def of_rows(self, tree: Any) -> Any:
+        """Returns what belongs to the ray of each run: arrays [B, ...] -> [U, ...]."""
+        return jax.tree.map(lambda leaf: leaf[self._runs.ray_index], tree)
+
+    def total(self, values: Array) -> Array:
+        """Returns the sum [B] of one value [U] of each run."""
+        return self._of_last(self._since_start(values))
+
+    def any(self, values: Bool[Array, " U"]) -> Bool[Array, " B"]:
+        """Returns whether any run of a ray is true."""
+        return self.total(values.astype(jnp.int32)) > 0
+
+    def through(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
+        """Returns the running sum along each ray."""
+        inside = running_sum(values)
+        return inside + self._in_front(inside)
+
+    def before(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
+        """Returns the sum of what is in front of each value."""
+        inside = running_sum(values)
+        return jnp.pad(inside[:, :-1], ((0, 0), (1, 0))) + self._in_front(inside)
+
+    def last(self, sums: Float[Array, "U W"]) -> Float[Array, " B"]:
+        """Returns the last of running sums; 0 for a ray without runs."""
+        return self._of_last(sums[:, -1])
+
+    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
+        """Returns how many values are in front of those of rays, row after row, and how many each ray has."""
+        return self._runs.first[ray] * width, self._runs.count[ray] * width
+
+    def _of_last(self, values):
+        return jnp.where(self._runs.count > 0, values[self._last], 0)
+
+    def _since_start(self, values):
+        return running_sum_since(self._starts, values, self._runs.most)
+
+    def _in_front(self, inside):
+        return jnp.where(self._starts, 0, jnp.roll(self._since_start(inside[:, -1]), 1))[:, None]
