@@ -29,6 +29,7 @@ _PARTS = (
     ("interpolation in the hash grid", "fields/hash_grid.py", "_stored"),
     ("networks", "fields/", ""),
     ("ray marching", "core/occupancy/ray_marching.py", ""),
+    ("ray marching", "core/occupancy/sample_runs.py", "march_near_matter"),
     ("choice of samples", "core/occupancy/importance.py", ""),
     ("choice of samples", "core/occupancy/grid.py", ""),
     ("rays and pixels", "data/ray_batches.py", ""),

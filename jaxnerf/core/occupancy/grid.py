@@ -367,7 +367,7 @@ def near_occupied(
         before, after = (jax.lax.slice_in_dim(around, i, i + coarse.shape[axis], axis=axis) for i in (0, 2))
         coarse |= before | after
     places = [place / radius for place in _along_rays(grid, rays, t)]
-    along = [jnp.clip(x, 0, size - 1).astype(jnp.int32) for x, size in zip(places, coarse.shape, strict=True)]
+    along = [jnp.clip(x.astype(jnp.int32), 0, size - 1) for x, size in zip(places, coarse.shape, strict=True)]
     return coarse.reshape(-1)[flat_index(along, coarse.shape)]
 
 
