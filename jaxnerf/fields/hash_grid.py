@@ -152,7 +152,7 @@ class HashGridOptions(Options):
         rows = table if levels is None else sum(min(table, level**3) for level in levels)
         inputs = self.features_per_level * len(levels or [1])
         return {
-            "table_size": 16 * rows * self.features_per_level,
+            "table_size": 12 * rows * self.features_per_level,  # one moment, see `train.table_momentum`
             "width": 16 * width * (inputs + 1 + self.geometry_features),
             "view_width": 16 * view_width * view_width * max(self.view_depth - 1, 0),
         }

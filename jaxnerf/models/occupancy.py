@@ -44,9 +44,10 @@ _MAX_STEPS = 144  # along the longest side: finer images need finer features rat
 # _MAX_RESOLUTION cells it is a little shorter, which gains 0.1 dB at 400 px.
 _FINE_STEPS_PER_CELL = 1.125
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
-# Part of all steps along rays for which there is memory near matter; with alpha, lego has 0.21 there and mic 0.12.
-_MAX_NEAR_MATTER = 0.25
 _FINE_RESOLUTION = 256  # where alpha empties most of them; a cell then holds two of the smallest details
+# Fraction of all steps along rays that the buffer of those near matter holds; with alpha, 0.21 are there in lego and
+# 0.12 in mic.
+_MAX_NEAR_MATTER = 0.25
 _MAX_OPEN_RESOLUTION = 96  # where nothing empties cells before training, so that all of them are updated
 _MAX_STEPS_PER_SIDE = 2**16  # of any step size, through the box
 _ACCELERATOR_SAMPLES = 2**18  # of a step, which keep an accelerator busy; as in arXiv:2201.05989
@@ -252,9 +253,9 @@ def occupancy_model(
         longest = num_steps(grid, **steps)
         # An accelerator marches along all rays at once, and coarser cells are most often occupied.
         if is_cpu() and max(grid.valid.shape) > _MAX_RESOLUTION and not grid.contracted and rays.near.size:
-            most = math.ceil(_MAX_NEAR_MATTER * longest / WIDTH * rays.near.size)
-            runs, fit = march_near_matter(grid, fixed, max_runs=most, **steps)
-            samples, occluded = jax.lax.cond(fit, lambda: place(runs), anywhere)
+            max_runs = math.ceil(_MAX_NEAR_MATTER * longest / WIDTH * rays.near.size)
+            runs, complete = march_near_matter(grid, fixed, max_runs=max_runs, **steps)
+            samples, occluded = jax.lax.cond(complete, lambda: place(runs), anywhere)
         else:
             samples, occluded = anywhere()
         rendering = render_placed(scene(params), rays, samples, longest=longest)

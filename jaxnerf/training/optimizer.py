@@ -128,11 +128,10 @@ def _with_cameras(optimizer, train, schedule, cameras):
 
 
 def _without_momentum(schedule, beta2, epsilon, decay):
-    """Returns AdamW without a first moment; what corrects the bias of the second one is a factor of the update."""
+    """Returns AdamW with beta1 = 0, which keeps no first moment."""
     return optax.chain(
-        optax.scale_by_rms(beta2, epsilon, eps_in_sqrt=False),
-        optax.scale_by_schedule(lambda step: jnp.sqrt(1 - beta2 ** (step + 1.0))),
-        optax.add_decayed_weights(decay),
+        optax.scale_by_rms(beta2, epsilon, eps_in_sqrt=False, bias_correction=True),
+        *([optax.add_decayed_weights(decay)] if decay else []),
         optax.scale_by_learning_rate(schedule),
     )
 

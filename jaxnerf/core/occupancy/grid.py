@@ -347,10 +347,10 @@ def is_occupied(
 def near_occupied(
     grid: OccupancyGrid, rays: Rays, t: Float[ArrayLike, "*batch samples"], radius: int
 ) -> Bool[Array, "*batch samples"]:
-    """Returns whether a cell within a radius of x(t) is occupied, or one that is somewhat farther away.
+    """Returns True where a cell within a radius of x(t) is occupied, and False if none within two radii is.
 
-    It is looked up in coarse cells whose side is the radius: true if that around x(t) holds an occupied cell, or one
-    beside it. Places outside the box count as those at its border.
+    It looks up coarse cells, whose side is the radius: whether that around x(t) or one beside it holds an occupied
+    cell. Places outside the box count as those at its border.
 
     Args:
         grid: OccupancyGrid, not contracted.

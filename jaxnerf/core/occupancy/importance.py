@@ -40,8 +40,8 @@ def importance_samples(
         key: one key, or one per ray [B]; it moves all samples of a ray together.
         grid: OccupancyGrid. Its cells are the resolution of the weights.
         rays: Rays [B].
-        candidates: Samples [B, S] of rule "segments", S <= 2^16, usually of `march_rays`; or the SampleRuns of
-            `march_near_matter`, which are fewer.
+        candidates: Samples [B, S] of rule "segments", S <= 2^16 and B S < 2^31, usually of `march_rays`; or the
+            SampleRuns of `march_near_matter`, which skip runs that cross no occupied cell, U W < 2^31.
         max_samples: K >= 1, the size of the buffer.
         uniform_fraction: in (0, 1]. The weights are estimates: without evenly placed samples, matter would not be
             found where the grid has none yet. At 1 the weights do not matter.
@@ -55,11 +55,11 @@ def importance_samples(
     Raises:
         ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
     """
-    along: WholeRays | RaysInRuns = WholeRays()
+    along, axes, shapes = WholeRays(), "B S", {"near": (rays.near, "B")}
     if isinstance(candidates, SampleRuns):
-        candidates, along = candidates.samples, RaysInRuns(candidates)
-    rows = "U W" if isinstance(along, RaysInRuns) else "B S"
-    check_shapes("importance_samples", near=(rays.near, "B"), t=(candidates.t, rows), delta=(candidates.delta, rows))
+        shapes |= {"first": (candidates.first, "B"), "ray_index": (candidates.ray_index, "U")}
+        candidates, along, axes = candidates.samples, RaysInRuns(candidates), "U W"
+    check_shapes("importance_samples", **shapes, t=(candidates.t, axes), delta=(candidates.delta, axes))
     if candidates.rule != "segments" or max_samples < 1 or not 0 < uniform_fraction <= 1:
         raise ValueError(
             f"importance_samples: rule is {candidates.rule!r}, max_samples {max_samples} and uniform_fraction "

@@ -15,13 +15,14 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, has_nan, near_occupied
 from jaxnerf.core.occupancy.ray_marching import num_steps, steps_in_t
 from jaxnerf.core.sampling import edges_after_steps, samples_from_edges
-from jaxnerf.core.types import Rays, Samples, pytree
+from jaxnerf.core.types import Rays, Samples, check_shapes, pytree
 from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
 
 WIDTH = 8  # steps of a run; march_rays has a multiple of 32 of them
+_PART = 64  # runs that are counted by one matrix product
 
 
-@pytree(static=("most",))
+@pytree(static=("max_count",))
 class SampleRuns:
     """Samples along B rays in U runs of W that follow each other, ray after ray.
 
@@ -30,14 +31,14 @@ class SampleRuns:
         ray_index: [U] int32, the ray of each run, ascending. Runs that no ray has are empty and come last.
         first: [B] int32, the first run of each ray.
         count: [B] int32, its runs; may be 0.
-        most: an upper bound of `count`.
+        max_count: an upper bound of `count`.
     """
 
     samples: Samples
     ray_index: Int[Array, " U"]
     first: Int[Array, " B"]
     count: Int[Array, " B"]
-    most: int
+    max_count: int
 
 
 def march_near_matter(
@@ -51,11 +52,17 @@ def march_near_matter(
         grid: OccupancyGrid, not contracted.
         rays: Rays [B], B >= 1. One that is NaN has all runs.
         step_size, cell: see `march_rays`.
-        max_runs: U, how many runs there is room for.
+        max_runs: U, the size of the buffer.
 
     Returns:
-        SampleRuns, and whether there is room for all. If not, the last ones are missing.
+        SampleRuns, and whether the buffer holds all. If not, the last ones are missing.
+
+    Raises:
+        ValueError: on other shapes, or a contracted grid.
     """
+    check_shapes("march_near_matter", near=(rays.near, "B"))
+    if grid.contracted:
+        raise ValueError("march_near_matter: the grid is contracted, expected one that is not; use march_rays")
     steps, t_step, inside = num_steps(grid, step_size, cell), steps_in_t(rays, step_size), clip_rays_to_box(grid, rays)
     near, far, t_run = (leaf[:, None] for leaf in (inside.near, inside.far, WIDTH * t_step))
     runs = jnp.arange(steps // WIDTH, dtype=jnp.float32)[None]
@@ -63,7 +70,7 @@ def march_near_matter(
     radius = math.ceil(1.001 * WIDTH * step_size / (2 * min(cell)))
     may_cross = (near + runs * t_run < far) & near_occupied(grid, rays, near + (runs + 0.5) * t_run, radius)
     may_cross |= has_nan(rays)[:, None]
-    rank = running_sum(may_cross.astype(jnp.float32), part_size=runs.size).astype(jnp.int32)
+    rank = running_sum(may_cross.astype(jnp.float32), part_size=_PART).astype(jnp.int32)
     count = rank[:, -1]
     first = jnp.cumsum(count, dtype=jnp.int32) - count
 
@@ -78,7 +85,7 @@ def march_near_matter(
     edges = edges_after_steps(after.astype(jnp.float32), *ends, steps)
     edges = jnp.where((chosen < place.size)[:, None], edges, 0)
     samples = samples_from_edges(None, edges)
-    found = SampleRuns(samples=samples, ray_index=ray, first=first, count=count, most=runs.size)
+    found = SampleRuns(samples=samples, ray_index=ray, first=first, count=count, max_count=runs.size)
     return found, count.sum() <= max_runs
 
 
@@ -112,7 +119,7 @@ class WholeRays:
         return sums[:, -1]
 
     def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
-        """Returns how many values are in front of those of rays, row after row, and how many each ray has."""
+        """Returns the flat index of the first value of each of some rays, and how many values it has."""
         return ray * width, width
 
 
@@ -120,13 +127,13 @@ class RaysInRuns:
     """Does what WholeRays does, for values [U, W] of SampleRuns."""
 
     def __init__(self, runs: SampleRuns):
-        self._runs, self.most_runs = runs, runs.most
+        self._runs, self.most_runs = runs, runs.max_count
         self._starts = jnp.arange(runs.ray_index.size) == runs.first[runs.ray_index]
         self._last = jnp.maximum(runs.first + runs.count - 1, 0)
 
     def of_rows(self, tree: Any) -> Any:
         """Returns what belongs to the ray of each run: arrays [B, ...] -> [U, ...]."""
-        return jax.tree.map(lambda leaf: leaf[self._runs.ray_index], tree)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[self._runs.ray_index], tree)
 
     def total(self, values: Array) -> Array:
         """Returns the sum [B] of one value [U] of each run."""
@@ -143,22 +150,21 @@ class RaysInRuns:
 
     def before(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
         """Returns the sum of what is in front of each value."""
-        inside = running_sum(values)
-        return jnp.pad(inside[:, :-1], ((0, 0), (1, 0))) + self._in_front(inside)
+        return exclusive_sum(values) + self._in_front(running_sum(values))
 
     def last(self, sums: Float[Array, "U W"]) -> Float[Array, " B"]:
         """Returns the last of running sums; 0 for a ray without runs."""
         return self._of_last(sums[:, -1])
 
     def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
-        """Returns how many values are in front of those of rays, row after row, and how many each ray has."""
+        """Returns the flat index of the first value of each of some rays, and how many values it has."""
         return self._runs.first[ray] * width, self._runs.count[ray] * width
 
     def _of_last(self, values):
         return jnp.where(self._runs.count > 0, values[self._last], 0)
 
     def _since_start(self, values):
-        return running_sum_since(self._starts, values, self._runs.most)
+        return running_sum_since(self._starts, values, self._runs.max_count)
 
     def _in_front(self, inside):
         return jnp.where(self._starts, 0, jnp.roll(self._since_start(inside[:, -1]), 1))[:, None]

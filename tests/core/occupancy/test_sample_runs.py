@@ -56,10 +56,10 @@ def found(grid, rays, max_runs=2000):
 
 
 def test_runs_hold_all_samples_in_occupied_cells(grid, rays):
-    runs, fit = found(grid, rays)
+    runs, complete = found(grid, rays)
     every = march_rays(None, grid, rays, step_size=STEP, cell=CELL)
     occupied = np.asarray(is_occupied(grid, rays, every.t) & (every.delta > 0))
-    assert fit and 20 < occupied.sum() and int(runs.count.sum()) * WIDTH < every.t.size / 2
+    assert complete and 20 < occupied.sum() and int(runs.count.sum()) * WIDTH < every.t.size / 2
     for ray in range(RAYS):
         mine = np.arange(runs.first[ray], runs.first[ray] + runs.count[ray])
         np.testing.assert_array_equal(runs.ray_index[mine], ray)
@@ -69,6 +69,38 @@ def test_runs_hold_all_samples_in_occupied_cells(grid, rays):
         np.testing.assert_allclose(t[place], np.asarray(every.t)[ray][occupied[ray]], atol=1e-5)
         np.testing.assert_allclose(delta[place], np.asarray(every.delta)[ray][occupied[ray]], atol=1e-5)
     np.testing.assert_array_equal(np.asarray(runs.samples.delta)[int(runs.count.sum()) :], 0)
+
+
+@pytest.mark.parametrize("step", [0.9, 3.5])
+@pytest.mark.parametrize("cell", [(0.05, 0.05, 0.05), (0.02, 0.1, 0.05)])
+def test_rays_along_the_axes_lose_no_cell_that_is_far_from_others(cell, step):
+    """A run is then as many cells long as it can be."""
+    shape, size = (35, 35, 35), np.float32(cell)
+    occupied = np.zeros(shape, bool)
+    occupied[::17, ::17, ::17] = True
+    grid = create_grid(np.zeros(3), shape * size, occupied, initial_density=1.0)
+    random, axes = np.random.default_rng(4), np.arange(600) % 3
+    directions = np.eye(3)[axes] * random.choice([-1, 1], size=(600, 1))
+    cells = random.choice([0, 17, 34], size=(600, 3))
+    at = (cells + random.random((600, 3))) * size - 5 * directions
+    at, directions = np.float32(at), np.float32(directions)
+    near, far = np.float32(random.uniform(0, 5, 600)), np.full(600, 20, np.float32)
+    rays = jaxnerf.Rays(origins=at, directions=directions, viewdirs=directions, near=near, far=far)
+    steps = {"step_size": step * min(cell), "cell": cell}
+    every = march_rays(None, grid, rays, **steps)
+    runs, complete = march(grid, rays, max_runs=9000, **steps)
+    along = jax.tree.map(lambda leaf: leaf[runs.ray_index], rays)
+    expected, kept = (
+        np.asarray(is_occupied(grid, each, samples.t) & (samples.delta > 0)).sum()
+        for each, samples in ((rays, every), (along, runs.samples))
+    )
+    assert complete and kept == expected > 50
+    assert runs.count.sum() < 600 * every.t.shape[-1] / WIDTH
+
+
+def test_a_contracted_grid_is_refused(grid, rays):
+    with pytest.raises(ValueError, match="the grid is contracted, expected one that is not"):
+        found(dataclasses.replace(grid, contracted=True), rays)
 
 
 @pytest.mark.parametrize("limit, slots", [(np.inf, 4000), (np.inf, 60), (0.5, 60), (0.5, 20)])
@@ -93,16 +125,16 @@ def test_runs_that_do_not_fit_are_reported(grid, rays):
 def test_rays_that_are_nan_have_all_runs(grid, rays):
     near = rays.near.copy()
     near[5] = np.nan
-    runs, fit = found(grid, dataclasses.replace(rays, near=near))
-    assert fit and runs.count[5] == runs.most and np.isnan(runs.samples.t[runs.first[5]]).all()
+    runs, complete = found(grid, dataclasses.replace(rays, near=near))
+    assert complete and runs.count[5] == runs.max_count and np.isnan(runs.samples.t[runs.first[5]]).all()
     samples, _ = choose(jax.random.key(0), grid, rays, runs, max_samples=4000, uniform_fraction=0.4)
     assert (np.asarray(samples.used) & (np.asarray(samples.ray_index) == 5)).any()
 
 
 def test_an_empty_grid_has_no_runs(grid, rays):
     empty = dataclasses.replace(grid, occupied=jnp.zeros(SHAPE, bool), density_mean=jnp.full(SHAPE, -1.0))
-    runs, fit = found(empty, rays)
-    assert fit and not np.asarray(runs.count).any()
+    runs, complete = found(empty, rays)
+    assert complete and not np.asarray(runs.count).any()
     assert np.isfinite(runs.samples.t).all()
     samples, hidden = choose(jax.random.key(0), empty, rays, runs, max_samples=100, uniform_fraction=0.4)
     assert not np.asarray(samples.used).any() and not np.asarray(hidden).any() and np.isfinite(samples.t).all()
@@ -127,16 +159,20 @@ def test_cells_within_the_radius_are_near(grid, radius):
     assert near[distance <= radius].all() and not near[distance >= 2 * radius].any()
 
 
-@pytest.mark.parametrize("part, fits", [(0.5, True), (0.001, False)])
-def test_a_model_with_fine_cells_places_the_same_samples(grid, rays, monkeypatch, part, fits):
-    """Those near matter, or all of march_rays where more are near matter than there is memory for."""
+@pytest.mark.parametrize("part, complete", [(0.5, True), (0.001, False), (0.5, None)])
+def test_a_model_with_fine_cells_places_the_same_samples(grid, rays, monkeypatch, part, complete):
+    """Those near matter, or all of march_rays: where the buffer does not hold the former, or space is contracted."""
+    contracted = complete is None
+    grid = dataclasses.replace(grid, contracted=contracted)
 
     def apply(params, x, viewdirs):
         return 5 + params * x[..., 0], jax.nn.sigmoid(x)
 
     field = Field(init=lambda key: jnp.ones(()), apply=apply)
     updates = {"threshold": 0.01, "update_every": 16, "cells_per_update": 64}
-    schedule = make_grid_schedule((0, 0, 0), tuple(UPPER), resolution=21, step_size=STEP, field=field, **updates)
+    schedule = make_grid_schedule(
+        (0, 0, 0), tuple(UPPER), resolution=21, step_size=STEP, field=field, contracted=contracted, **updates
+    )
     options = OccupancyOptions(pool_samples_per_ray=1.0, max_optical_depth=1.0, occlusion_start_step=0)
     view = ViewOptions(early_stop_eps=0.0, max_samples=1)
 
@@ -154,5 +190,4 @@ def test_a_model_with_fine_cells_places_the_same_samples(grid, rays, monkeypatch
 
     monkeypatch.setattr(occupancy, "march_near_matter", spy)
     assert_same(rendered(), expected, rtol=1e-4, atol=1e-4)
-    (max_runs,) = marched
-    assert bool(found(grid, rays, max_runs)[1]) == fits
+    assert [bool(found(grid, rays, max_runs)[1]) for max_runs in marched] == [complete] * (not contracted)
