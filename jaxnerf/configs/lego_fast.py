@@ -13,6 +13,7 @@ def get_config():
     config.data.format, config.data.dir, config.data.factor = "blender", "lego", 8
     config.field, config.sampler = "hash_grid", "occupancy"
     config.hash_grid.width = config.hash_grid.view_width = config.hash_grid.table_size = "auto"
+    config.hash_grid.view_depth = "auto"
     train = config.train
     train.batch_size, train.cpu_batch_size, train.max_steps, train.lr_steps = "auto", 1024, "auto", "auto"
     train.lr_init, train.lr_final, train.lr_decay_power, train.warmup_steps = 5e-3, 1.5e-4, 8.0, 50

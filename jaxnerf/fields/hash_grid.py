@@ -42,6 +42,8 @@ _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
+# With fine cells the networks take a fifth of a step: a third layer for the colour costs 7 % of its time there, and a
+# quarter at 100 px (docs/results/lego_settings.md).
 # A larger table and wider networks take little time on an accelerator: each gained 0.3 dB for lego at 800 x 800 on an
 # H200 (docs/guides/accelerators.md).
 _CPU_WIDTH, _ACCELERATOR_WIDTH, _ACCELERATOR_ROWS = 64, 128, 4
@@ -88,7 +90,12 @@ class HashGridOptions(Options):
     geometry_features: int = option(
         15, "outputs of the density network that the colour network reads", range=at_least(0)
     )
-    view_depth: int = option(2, "hidden layers of the colour network", range=between(0, _MAX_LAYERS))
+    view_depth: int = option(
+        2,
+        "hidden layers of the colour network; auto: 3 on a CPU where the occupancy grid has fine cells, else 2",
+        range=between(0, _MAX_LAYERS),
+        auto=True,
+    )
     view_width: int = option(
         128, "outputs of a hidden layer of the colour network; auto: as `width`", range=at_least(1), auto=True
     )
@@ -123,6 +130,7 @@ class HashGridOptions(Options):
         rows, width = (rows, _CPU_WIDTH) if device.is_cpu else (_ACCELERATOR_ROWS * rows, _ACCELERATOR_WIDTH)
         size = f"{facts.side:.0f} x {facts.side:.0f} px"
         prefilter, why = infer_prefilter(facts)
+        depth = 3 if device.is_cpu and facts.has_fine_cells else 2
         per_layer = f"hash grid     {width} outputs per hidden layer of the {{}} network, for this device"
         return infer(
             self,
@@ -130,6 +138,7 @@ class HashGridOptions(Options):
             table_size=(rows, f"hash grid     at most {rows:,} rows per level, for images of about {size}"),
             width=(width, per_layer.format("density")),
             view_width=(width, per_layer.format("colour")),
+            view_depth=(depth, f"hash grid     {depth} hidden layers of the colour network"),
             prefilter=(prefilter, f"prefilter     {'on' if prefilter else 'off'}: {why}"),
         )
 
@@ -145,8 +154,8 @@ class HashGridOptions(Options):
 
     def bytes_needed(self) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
-        table, width, view_width = (
-            1 if is_auto(value) else value for value in (self.table_size, self.width, self.view_width)
+        table, width, view_width, view_depth = (
+            1 if is_auto(value) else value for value in (self.table_size, self.width, self.view_width, self.view_depth)
         )
         levels = None if is_auto(self.resolutions) else self.resolutions
         rows = table if levels is None else sum(min(table, level**3) for level in levels)
@@ -154,7 +163,7 @@ class HashGridOptions(Options):
         return {
             "table_size": 12 * rows * self.features_per_level,  # one moment, see `train.table_momentum`
             "width": 16 * width * (inputs + 1 + self.geometry_features),
-            "view_width": 16 * view_width * view_width * max(self.view_depth - 1, 0),
+            "view_width": 16 * view_width * view_width * max(view_depth - 1, 0),
         }
 
     @property

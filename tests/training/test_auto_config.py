@@ -43,6 +43,7 @@ AUTO_FIELDS = {
     "hash_grid.table_size": 2**12,
     "hash_grid.width": 32,
     "hash_grid.view_width": 32,
+    "hash_grid.view_depth": 1,
     "hash_grid.prefilter": True,
     "occupancy.pool_samples_per_ray": 6.0,
     "occupancy.contracted": True,
@@ -564,7 +565,7 @@ def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
     [(8, True, 0, 128, 144), (12, True, 0, 140, 157.5), (16, True, 0, 186, 209.25), (32, True, 0, 256, 288)]
     + [(32, False, 0, 96, 144), (32, True, 1, 128, 144)],
 )
-def test_small_pixels_with_alpha_have_a_finer_occupancy_grid(views, zoom, use_alpha, alpha, cells, steps):
+def test_small_pixels_with_alpha_have_finer_cells_and_deeper_networks(views, zoom, use_alpha, alpha, cells, steps):
     opaque = np.iinfo(views.pixels.dtype).max
     larger = dataclasses.replace(
         views,
@@ -572,8 +573,12 @@ def test_small_pixels_with_alpha_have_a_finer_occupancy_grid(views, zoom, use_al
         pixels=np.concatenate([views.pixels[:, :3], np.full_like(views.pixels[:, :1], opaque * alpha)], axis=-1),
     )
     box = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3}
-    section = resolve(auto_config(use_alpha=use_alpha, contracted=False, **box), larger).config.occupancy
+    config = auto_config(use_alpha=use_alpha, contracted=False, **box)
+    config.hash_grid.view_depth = AUTO
+    on_cpu, on_gpu = (resolve(config, larger, platform=platform).config for platform in ("cpu", "gpu"))
+    section = on_cpu.occupancy
     assert section.resolution == cells and 2 / section.step_size == pytest.approx(steps)
+    assert on_cpu.hash_grid.view_depth == (3 if cells > 128 else 2) and on_gpu.hash_grid.view_depth == 2
 
 
 @pytest.mark.parametrize("cells, steps", [(16, 32), (128, 128), (512, 576)])
