@@ -42,8 +42,9 @@ _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 # Rows of a level per pixel of an image's side; finer images show what collisions of the hash cost.
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
-# With fine cells the networks take a fifth of a step: a third layer for the colour costs 7 % of its time there, and a
-# quarter at 100 px (docs/results/lego_settings.md).
+# With fine cells a third layer for the colour costs 7 % of a step's time, with others a quarter
+# (docs/results/thin_matter.md).
+_FINE_DEPTH, _DEPTH = 3, 2
 # A larger table and wider networks take little time on an accelerator: each gained 0.3 dB for lego at 800 x 800 on an
 # H200 (docs/guides/accelerators.md).
 _CPU_WIDTH, _ACCELERATOR_WIDTH, _ACCELERATOR_ROWS = 64, 128, 4
@@ -130,7 +131,7 @@ class HashGridOptions(Options):
         rows, width = (rows, _CPU_WIDTH) if device.is_cpu else (_ACCELERATOR_ROWS * rows, _ACCELERATOR_WIDTH)
         size = f"{facts.side:.0f} x {facts.side:.0f} px"
         prefilter, why = infer_prefilter(facts)
-        depth = 3 if device.is_cpu and facts.has_fine_cells else 2
+        depth = _FINE_DEPTH if device.is_cpu and facts.has_fine_cells else _DEPTH
         per_layer = f"hash grid     {width} outputs per hidden layer of the {{}} network, for this device"
         return infer(
             self,

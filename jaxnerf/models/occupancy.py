@@ -45,8 +45,7 @@ _MAX_STEPS = 144  # along the longest side: finer images need finer features rat
 _FINE_STEPS_PER_CELL = 1.125
 _MAX_RESOLUTION = 128  # cells: updating more of them costs more than the samples that they save
 _FINE_RESOLUTION = 256  # where alpha empties most of them; a cell then holds two of the smallest details
-# Fraction of all steps along rays that the buffer of those near matter holds; with alpha, 0.21 are there in lego and
-# 0.12 in mic.
+# Fraction of all steps along rays that the buffer of those near matter holds; lego at 400 px needs most of it.
 _MAX_NEAR_MATTER = 0.25
 _MAX_OPEN_RESOLUTION = 96  # where nothing empties cells before training, so that all of them are updated
 _MAX_STEPS_PER_SIDE = 2**16  # of any step size, through the box
@@ -251,7 +250,7 @@ def occupancy_model(
             return place(march_rays(None, grid, fixed, **steps))
 
         longest = num_steps(grid, **steps)
-        # An accelerator marches along all rays at once, and coarser cells are most often occupied.
+        # An accelerator marches along all rays at once, and of coarser cells too many are occupied.
         if is_cpu() and max(grid.valid.shape) > _MAX_RESOLUTION and not grid.contracted and rays.near.size:
             max_runs = math.ceil(_MAX_NEAR_MATTER * longest / WIDTH * rays.near.size)
             runs, complete = march_near_matter(grid, fixed, max_runs=max_runs, **steps)

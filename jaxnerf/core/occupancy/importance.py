@@ -55,9 +55,11 @@ def importance_samples(
     Raises:
         ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
     """
+    # All sums below are along rays, whose candidates are one row of an array or several.
     along, axes, shapes = WholeRays(), "B S", {"near": (rays.near, "B")}
     if isinstance(candidates, SampleRuns):
-        shapes |= {"first": (candidates.first, "B"), "ray_index": (candidates.ray_index, "U")}
+        shapes |= {"first": (candidates.first, "B"), "count": (candidates.count, "B")}
+        shapes["ray_index"] = (candidates.ray_index, "U")
         candidates, along, axes = candidates.samples, RaysInRuns(candidates), "U W"
     check_shapes("importance_samples", **shapes, t=(candidates.t, axes), delta=(candidates.delta, axes))
     if candidates.rule != "segments" or max_samples < 1 or not 0 < uniform_fraction <= 1:
@@ -108,8 +110,8 @@ def importance_samples(
         """Returns the candidate that contains a place [K] on the scale of `cumulative`, and the fraction before it."""
         found = _count_up_to(cumulative, begin, size, jnp.minimum(jnp.floor(at), total - 1), along.most_runs)
         index = jnp.divmod(begin + found, cumulative.shape[-1])
-        size_of = parts[index]
-        return index, jnp.clip((at - (cumulative[index] - size_of)) / jnp.maximum(size_of, 1), 0, 1)
+        inside = parts[index]
+        return index, jnp.clip((at - (cumulative[index] - inside)) / jnp.maximum(inside, 1), 0, 1)
 
     # A sample lies in the middle of its parts, and stands for the length between their bounds.
     index, fraction = locate(lower)

@@ -1,7 +1,7 @@
 """Ray marching near matter: runs of steps that may cross occupied cells, in one buffer for all rays.
 
-On a CPU the samples of a batch are computed one after the other, whether a cell is occupied or not. With fine cells
-most are not, so that it is faster to look first which parts of a ray matter at all.
+A CPU takes as long for a sample in an empty cell as for one in an occupied cell. With fine cells most are empty, so it
+is faster to find out first which parts of a ray may cross occupied ones.
 """
 
 import math
@@ -74,7 +74,7 @@ def march_near_matter(
     count = rank[:, -1]
     first = jnp.cumsum(count, dtype=jnp.int32) - count
 
-    # The runs of all rays in order; the others are written to no place.
+    # The runs of all rays, in order; the index max_runs is outside the buffer, so that all others are dropped.
     place = jnp.where(may_cross, first[:, None] + rank - 1, max_runs).reshape(-1)
     every = jnp.arange(place.size, dtype=jnp.int32)
     chosen = jnp.full(max_runs, place.size, jnp.int32).at[place].set(every, mode="drop")
