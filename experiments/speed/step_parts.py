@@ -36,7 +36,7 @@ _PARTS = (
     ("compositing and losses", "core/", ""),
 )
 _OTHER = "gradient's norm, copies, counters"
-
+_LEAST = 0.8  # of the time of a step that its parts must make up
 
 _RUNS = {
     "lego, 100 px": ("lego_fast", {"data.factor": 8}),
@@ -54,13 +54,16 @@ def measure_all(kept: dict[str, Any], save: Callable[[dict], None]) -> None:
             save(kept)
 
 
-def measure(config, *, warm_up: int = 1500, num_steps: int = 192) -> dict[str, Any]:
+def measure(config, *, warm_up: int = 1500, num_steps: int = 64) -> dict[str, Any]:
     """Returns the time of each part of a step, in ms.
 
     Args:
         config: of the run.
         warm_up: steps before the measurement, in which the grid becomes sparse.
         num_steps: steps that are timed; a multiple of the interval of updates.
+
+    Raises:
+        ValueError: if the profiler recorded less than _LEAST of the time; it drops events above about a million.
     """
     step = common.compile_step(config)
     state = step.state
@@ -83,6 +86,11 @@ def measure(config, *, warm_up: int = 1500, num_steps: int = 192) -> dict[str, A
     parts: collections.Counter = collections.Counter()
     for name, microseconds in own_times(events, part_of):
         parts[part_of[name]] += microseconds / 1e3 / num_steps
+    if sum(parts.values()) < _LEAST * 1e3 * plain / num_steps:
+        raise ValueError(
+            f"the profiler recorded {sum(parts.values()):.1f} ms of {1e3 * plain / num_steps:.1f} ms a step; give "
+            "fewer num_steps"
+        )
     samples = step.positions.size * step.config.occupancy.pool_samples_per_ray
     return {
         "rays": int(step.positions.size),
