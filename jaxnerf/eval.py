@@ -84,8 +84,8 @@ def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation import evaluate, external, quality_search
-    from jaxnerf.evaluation.uncertainty.predict import requested
     from jaxnerf.runtime import shards
+    from jaxnerf.tools.uncertainty.predict import requested
 
     shard = shards.parse(_SHARD.value)
     _check_flags(is_sharded=shard != shards.WHOLE)

@@ -7,8 +7,6 @@ from jaxnerf.core.normals import SurfaceSamples
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
 from jaxnerf.data.readers.base import Capture, Frame
-from jaxnerf.evaluation.uncertainty.base import Estimate, UncertaintySource
-from jaxnerf.exporters.base import ExportSource
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.options import (
@@ -24,6 +22,8 @@ from jaxnerf.options import (
     infer,
     option,
 )
+from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource
 
 __all__ = [
     # fields and samplers

@@ -149,19 +149,19 @@ EXPORTERS = Registry(
     "exporter",
     "jaxnerf.register_exporter",
     {
-        "mesh": "jaxnerf.exporters.mesh:EXPORTER",
-        "points": "jaxnerf.exporters.points:EXPORTER",
-        "depth": "jaxnerf.exporters.depth:EXPORTER",
-        "splats": "jaxnerf.exporters.splats:EXPORTER",
-        "web": "jaxnerf.exporters.web:EXPORTER",
+        "mesh": "jaxnerf.tools.exporters.mesh:EXPORTER",
+        "points": "jaxnerf.tools.exporters.points:EXPORTER",
+        "depth": "jaxnerf.tools.exporters.depth:EXPORTER",
+        "splats": "jaxnerf.tools.exporters.splats:EXPORTER",
+        "web": "jaxnerf.tools.exporters.web:EXPORTER",
     },
 )
 ESTIMATORS = Registry(
     "estimator of uncertainty",
     "jaxnerf.register_estimator",
     {
-        "laplace": "jaxnerf.evaluation.uncertainty.laplace:estimate_laplace",
-        "ensemble": "jaxnerf.evaluation.uncertainty.ensemble:estimate_ensemble",
+        "laplace": "jaxnerf.tools.uncertainty.laplace:estimate_laplace",
+        "ensemble": "jaxnerf.tools.uncertainty.ensemble:estimate_ensemble",
     },
 )
 

@@ -95,8 +95,8 @@ def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation.paths.render_path import render_path
-    from jaxnerf.evaluation.uncertainty.predict import requested
     from jaxnerf.runtime import shards
+    from jaxnerf.tools.uncertainty.predict import requested
 
     errors = {"step": _STEP.value, "members": _MEMBERS.value, "coverage": _COVERAGE.value}
 

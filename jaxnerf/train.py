@@ -132,7 +132,7 @@ def _viewer(is_first):
     if not (_VIEWER.value and is_first):
         yield None
         return
-    from jaxnerf.viewer.live import LiveViewer
+    from jaxnerf.tools.viewer.live import LiveViewer
 
     viewer = LiveViewer(_WORKDIR.value, host=_VIEWER_HOST.value, port=_VIEWER_PORT.value)
     try:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxnerf import Camera, Views, create_grid, look_at, mask_scene, render_rays
 from jaxnerf.data import ray_batches
 from jaxnerf.evaluation.restore import TrainedRun
-from jaxnerf.exporters.base import ExportSettings, ExportSource
 from jaxnerf.fields.base import Field
+from jaxnerf.tools.exporters.base import ExportSettings, ExportSource
 from jaxnerf.training.config import RunConfig, changed
 
 RADIUS, SIZE = 0.5, 48

@@ -56,4 +56,4 @@ if __name__ == "__main__":
     if program and program.endswith(".py"):
         runpy.run_path(program, run_name="__main__")
     elif program:
-        runpy.run_module(f"jaxnerf.{program}", run_name="__main__", alter_sys=True)
+        runpy.run_module(program, run_name="__main__", alter_sys=True)

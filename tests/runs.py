@@ -52,9 +52,24 @@ def as_flags(fields):
     return [f"--config.{name}={value}" for name, value in fields.items()]
 
 
+# The folders of the programs below jaxnerf/tools.
+TOOLS = {
+    "cameras": "structure_from_motion",
+    "check": "capture_check",
+    "convert": "interop",
+    "export": "exporters",
+    "view": "viewer",
+}
+
+
+def module_of(program):
+    """Returns the module of a program, by the name of its command without jaxnerf-."""
+    return f"jaxnerf.tools.{TOOLS[program]}.program" if program in TOOLS else f"jaxnerf.{program}"
+
+
 def start(program, *flags, **environment):
-    """Starts python -m jaxnerf.<program>, or a script in tests/ that ends in .py, with its output in pipes."""
-    what = [str(ROOT / "tests" / program)] if program.endswith(".py") else ["-m", f"jaxnerf.{program}"]
+    """Starts a program, by its command without jaxnerf-, or a script in tests/ that ends in .py; output in pipes."""
+    what = [str(ROOT / "tests" / program)] if program.endswith(".py") else ["-m", module_of(program)]
     command = [sys.executable, *what, *map(str, flags)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=ROOT, env={**os.environ, **environment}, **pipes)
@@ -82,7 +97,7 @@ def _fork_server():
 
 
 def run_forked(program, *flags, folder=ROOT):
-    """Returns (exit code, stdout, stderr) of python -m jaxnerf.<program>, or of a script, without a new interpreter.
+    """Returns (exit code, stdout, stderr) of a program, or of a script, see `start`, without a new interpreter.
 
     It runs in a folder, as a fork of a process that has imported JAX: imports take longer than most of these programs.
     Tests of starting, of signals, of several processes and of variables that Python reads use `start`.
@@ -90,7 +105,8 @@ def run_forked(program, *flags, folder=ROOT):
     server = _fork_server()
     with tempfile.TemporaryDirectory() as streams:
         out, err = pathlib.Path(streams, "out"), pathlib.Path(streams, "err")
-        request = {"program": str(program), "flags": list(map(str, flags)), "folder": str(folder)}
+        what = str(program) if str(program).endswith(".py") else module_of(program)
+        request = {"program": what, "flags": list(map(str, flags)), "folder": str(folder)}
         request |= {"environment": dict(os.environ), "out": str(out), "err": str(err)}
         print(json.dumps(request), file=server.stdin, flush=True)
         code = int(server.stdout.readline())

@@ -107,9 +107,9 @@ def defined_flags(files):
     )
 
 
-PROGRAMS = dict(re.findall(r"^    (jaxnerf-\w+) = jaxnerf\.(\w+):run$", (ROOT / "setup.cfg").read_text(), re.MULTILINE))
+PROGRAMS = dict(re.findall(r"^    (jaxnerf-\w+) = ([\w.]+):run$", (ROOT / "setup.cfg").read_text(), re.MULTILINE))
 COMMON = {"help", "config", "plugins", "verbosity", "page"}  # of absl, jaxnerf/runtime/cli.py, experiments/common.py
-FLAGS = {name: COMMON | defined_flags([ROOT / "jaxnerf" / f"{module}.py"]) for name, module in PROGRAMS.items()}
+FLAGS = {name: COMMON | defined_flags([ROOT / f"{module.replace('.', '/')}.py"]) for name, module in PROGRAMS.items()}
 ALL_FLAGS = set.union(*FLAGS.values(), defined_flags((ROOT / "experiments").rglob("*.py")))
 
 

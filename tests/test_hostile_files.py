@@ -9,18 +9,18 @@ import signal
 import pytest
 from PIL import EpsImagePlugin, Image
 
-from jaxnerf.capture_check import camera_plot
 from jaxnerf.data.images import image_files
 from jaxnerf.data.readers import colmap_model, ply, validation
 from jaxnerf.evaluation.evaluate import evaluate
 from jaxnerf.evaluation.paths.camera_path import read_path_file
 from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.exporters.base import export_run
-from jaxnerf.interop.published_weights import read_weights
 from jaxnerf.runtime import shards
-from jaxnerf.structure_from_motion.estimate import estimate_cameras
-from jaxnerf.structure_from_motion.images import is_rotated_jpeg
+from jaxnerf.tools.capture_check import camera_plot
+from jaxnerf.tools.exporters.base import export_run
+from jaxnerf.tools.interop.published_weights import read_weights
+from jaxnerf.tools.structure_from_motion.estimate import estimate_cameras
+from jaxnerf.tools.structure_from_motion.images import is_rotated_jpeg
 from jaxnerf.training.metric_log import MetricLog, read_rows
 from jaxnerf.training.workdir import load_config, workdir_lock
 from runs import ROOT

@@ -58,7 +58,7 @@ def test_the_wheel_holds_one_package_with_configs_and_types(wheel):
     assert "jaxnerf/py.typed" in files
     for path in (ROOT / "jaxnerf").rglob("*.py"):
         assert path.relative_to(ROOT).as_posix() in files
-    for path in (ROOT / "jaxnerf" / "exporters" / "web_page").iterdir():
+    for path in (ROOT / "jaxnerf" / "tools" / "exporters" / "web_page").iterdir():
         assert path.relative_to(ROOT).as_posix() in files
 
 

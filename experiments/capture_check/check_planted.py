@@ -14,8 +14,8 @@ from pathlib import Path
 
 import planting
 
-from jaxnerf.capture_check import images
-from jaxnerf.capture_check.report import inspect
+from jaxnerf.tools.capture_check import images
+from jaxnerf.tools.capture_check.report import inspect
 
 SCENES = {"lego": "lego", "fern": "fern", "fox": "fox", "can": "can", "can as LLFF": "can"}
 

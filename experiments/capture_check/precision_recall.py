@@ -19,10 +19,10 @@ import numpy as np
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import common
 
-from jaxnerf.capture_check import cameras, images, report, tracks, view_evidence
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import read_capture
 from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.tools.capture_check import cameras, images, report, tracks, view_evidence
 from test_scenes import synthetic_capture
 
 SCENES = ("fern", "fox", "can", "lego")

@@ -31,10 +31,10 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.metrics import pixel_mask
-from jaxnerf.evaluation.next_images.coverage import ViewCoverage, choose_views
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime import cli
+from jaxnerf.tools.next_images.coverage import ViewCoverage, choose_views
 from jaxnerf.training import auto_config
 
 _SCENES = flags.DEFINE_list("scenes", ["lego"], "lego, room.")

@@ -26,11 +26,11 @@ from scipy.spatial import cKDTree
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
-from jaxnerf.exporters import mesh as mesh_exporter
-from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.fields.still_life import BODIES
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.tools.exporters import mesh as mesh_exporter
+from jaxnerf.tools.exporters.base import ExportSettings, export_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run on the embedded scene.", required=True)
 _RESOLUTION = flags.DEFINE_integer("resolution", 256, "Voxels along the longest side.")

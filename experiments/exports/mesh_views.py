@@ -29,8 +29,8 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
-from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.runtime import cli
+from jaxnerf.tools.exporters.base import ExportSettings, export_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run.", required=True)
 _OUT = flags.DEFINE_string("out", None, "Folder for three.js and the picture.", required=True)

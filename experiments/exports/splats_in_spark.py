@@ -27,8 +27,8 @@ from jaxnerf.core.metrics import psnr
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
-from jaxnerf.exporters.gaussians import rasterize, read_spz
 from jaxnerf.runtime import cli
+from jaxnerf.tools.exporters.gaussians import rasterize, read_spz
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run.", required=True)
 _SPLATS = flags.DEFINE_string("splats", None, "The .spz file.", required=True)

@@ -28,10 +28,10 @@ from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.normals import density_normals
 from jaxnerf.core.rendering import points_on_rays, render_rays
 from jaxnerf.evaluation import restore
-from jaxnerf.exporters.surfaces import DepthImage
 from jaxnerf.fields.base import field_normals
 from jaxnerf.fields.still_life import FINISHES, still_life
 from jaxnerf.runtime import cli
+from jaxnerf.tools.exporters.surfaces import DepthImage
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs; finished ones are not repeated.", required=True)
 _FINISHES = flags.DEFINE_list("finishes", ["shiny", "matt"], "Finishes of the embedded scene.")

@@ -18,8 +18,8 @@ from PIL import Image
 
 from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.types import Camera
-from jaxnerf.exporters.points import write_ply
 from jaxnerf.runtime.atomic_files import open_regular, partial_file, write_text
+from jaxnerf.tools.exporters.points import write_ply
 from test_scenes import room
 
 PHONE_LENS = (-0.08, 0.03, 0.001, -0.0008)  # k1, k2, p1, p2

@@ -25,11 +25,11 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.evaluation.metrics import object_mask, pixel_mask
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
-from jaxnerf.evaluation.uncertainty import laplace
-from jaxnerf.evaluation.uncertainty.base import UncertaintySource
-from jaxnerf.evaluation.uncertainty.calibration import figures, pixel_error, score_order
-from jaxnerf.evaluation.uncertainty.predict import make_predictor
 from jaxnerf.runtime import cli
+from jaxnerf.tools.uncertainty import laplace
+from jaxnerf.tools.uncertainty.base import UncertaintySource
+from jaxnerf.tools.uncertainty.calibration import figures, pixel_error, score_order
+from jaxnerf.tools.uncertainty.predict import make_predictor
 
 SCENES = {
     "still": {"test": "still"},

@@ -31,9 +31,9 @@ from jaxnerf.data.geometry import path_poses
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.tools.viewer.frame_renderer import FrameCamera, FrameRenderer, frame_image
+from jaxnerf.tools.viewer.render_loop import RenderLoop, Request
 from jaxnerf.training import metric_log
-from jaxnerf.viewer.frame_renderer import FrameCamera, FrameRenderer, frame_image
-from jaxnerf.viewer.render_loop import RenderLoop, Request
 
 _WORKDIRS = flags.DEFINE_list("workdirs", [], "The runs to view.")
 _TRAIN = flags.DEFINE_string("train", None, "The config whose training is measured with and without the viewer.")

@@ -34,9 +34,9 @@ from jaxnerf.core.cameras import pixel_grid, rays_from_pixels
 from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.types import Camera
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
-from jaxnerf.exporters.base import export_run
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.tools.exporters.base import export_run
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]

@@ -12,9 +12,9 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.trained_run import TrainedRun
-from jaxnerf.evaluation.uncertainty.cleaning import cleaned
 from jaxnerf.options import Changes, changing, is_auto, replaced
 from jaxnerf.runtime.memory import image_renderer
+from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config

@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 
 import captures
 import jaxnerf
-from jaxnerf.capture_check import report
 from jaxnerf.core.cameras import project
 from jaxnerf.data import dataset
 from jaxnerf.data.geometry.bounds import unsuited_to_ndc
 from jaxnerf.data.readers.base import Capture, Frame, origin_near, read_capture
 from jaxnerf.evaluation.paths.camera_path import make_path
-from jaxnerf.exporters.base import ExportSettings, relative_to
-from jaxnerf.viewer.frame_renderer import FrameCamera
-from jaxnerf.viewer.keyframes import save_path
+from jaxnerf.tools.capture_check import report
+from jaxnerf.tools.exporters.base import ExportSettings, relative_to
+from jaxnerf.tools.viewer.frame_renderer import FrameCamera
+from jaxnerf.tools.viewer.keyframes import save_path
 
 SHIFTS = {
     "UTM": (500_000.0, 5_000_000.0, 120.0),

@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 import captures
 import export_sources
 import jaxnerf
-from jaxnerf.evaluation.uncertainty.base import UncertaintySource
 from jaxnerf.options import Options, option
 from jaxnerf.registry import ESTIMATORS, EXPORTERS, FIELDS, Part
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.config_fields import typed
+from jaxnerf.tools.uncertainty.base import UncertaintySource
 from jaxnerf.training import auto_config
 from jaxnerf.training.metric_log import read_rows
 from runs import ROOT, SMOKE_FLAGS, smoke_config, start

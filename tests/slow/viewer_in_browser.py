@@ -66,7 +66,9 @@ def refusals(run, port):
         ([f"--workdir={run}-none"], "no such file"),
         ([f"--workdir={run}", "--port=99999"], "99999"),
     ):
-        done = subprocess.run([sys.executable, "-m", "jaxnerf.view", *flags], capture_output=True, text=True, cwd=ROOT)
+        done = subprocess.run(
+            [sys.executable, "-m", "jaxnerf.tools.viewer.program", *flags], capture_output=True, text=True, cwd=ROOT
+        )
         lines = done.stderr.strip().splitlines()
         check(done.returncode and len(lines) == 1 and words in lines[0], f"refused in one line: {lines[-1]}")
 

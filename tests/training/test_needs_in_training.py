@@ -14,11 +14,11 @@ import jaxnerf
 from jaxnerf.core.scene import NEEDS, needs_of
 from jaxnerf.evaluation.evaluate import evaluate
 from jaxnerf.evaluation.restore import restore_with_grid
-from jaxnerf.exporters.base import ExportSettings, export_run
 from jaxnerf.fields.base import Field
+from jaxnerf.tools.exporters.base import ExportSettings, export_run
+from jaxnerf.tools.viewer.frame_renderer import FrameCamera, FrameRenderer
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.step import ProgressData
-from jaxnerf.viewer.frame_renderer import FrameCamera, FrameRenderer
 from runs import PACKED, smoke_config
 
 pytest_plugins = ["run_fixtures"]

@@ -7,13 +7,13 @@ import pytest
 
 import captures
 from jaxnerf import load_dataset
-from jaxnerf.capture_check import report
 from jaxnerf.data import dataset
 from jaxnerf.data.geometry import world
 from jaxnerf.data.geometry.poses import sideways, up_of
 from jaxnerf.data.readers.base import read_capture
 from jaxnerf.data.synthetic import load_synthetic
 from jaxnerf.evaluation.paths.camera_path import make_path
+from jaxnerf.tools.capture_check import report
 
 UP = np.array([0.2, -0.5, 0.84])
 UP /= np.linalg.norm(UP)

@@ -1,0 +1,123 @@
+"""Client-side rendering: the page of the web export, with the parameters that the viewer shows.
+
+The page asks for newer parameters every few seconds and renders by itself, so the viewer renders nothing for it.
+"""
+
+import asyncio
+import contextlib
+import http
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from jaxnerf.tools.exporters import web
+from jaxnerf.tools.exporters.base import ExportSettings, ExportSource
+from jaxnerf.tools.viewer.frame_renderer import SceneState
+
+FRAMES = "/frames/"  # the address of the page that shows frames of the server
+_PRECISION = "16 bits"  # of features: 8 would have to be scored, as the export does
+_COMPRESSION = 0  # of gzip: parameters are nearly noise, and compressing them takes longer than all else
+_ABSENT = 10.0  # s without a request after which a page counts as closed; it sends one every 2 s
+_TRANSFER_SECONDS = 120.0  # in which a scene has to reach the browser
+
+
+class ClientRendering:
+    """Answers the requests of pages that render by themselves."""
+
+    def __init__(self, viewer: Any, changed: Callable[[], None]):
+        """Prepares the answers; nothing is encoded before a page asks.
+
+        Args:
+            viewer: the Viewer.
+            changed: called at each request for a scene.
+        """
+        self._viewer, self._changed, self._lock = viewer, changed, threading.Lock()
+        self._encoded: tuple[SceneState | None, bytes] = None, b""
+        self._requested = -_ABSENT
+        try:
+            web.network_of(viewer.run)
+            self.refused = ""
+        except ValueError as error:
+            self.refused = str(error)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a page has asked recently."""
+        return time.monotonic() - self._requested < _ABSENT
+
+    async def answer(self, request: Any) -> tuple[http.HTTPStatus, str, bytes] | None:
+        """Returns the status, type and body for a request of a browser; None: it is for the page with frames."""
+        address = urlsplit(request.path)
+        if address.path == FRAMES:
+            request.path = "/"  # where viser has its page
+        elif address.path == "/" and not self.refused:
+            self._note_request()
+            return http.HTTPStatus.OK, "text/html; charset=utf-8", web.page(None, live=True).encode()
+        elif address.path == "/scene.bin" and not self.refused:
+            self._note_request()
+            return await self._scene(parse_qs(address.query).get("step", [""])[0])
+        return None
+
+    def _note_request(self):
+        self._requested = time.monotonic()
+        self._changed()
+
+    async def _scene(self, step):
+        state = self._viewer.state
+        if state is None or step == str(state.step):
+            return http.HTTPStatus.NO_CONTENT, "application/octet-stream", b""
+        try:
+            data = await asyncio.to_thread(self._encode, state)
+        except ValueError as error:
+            return http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", str(error).encode()
+        return http.HTTPStatus.OK, "application/octet-stream", data
+
+    def _encode(self, state):
+        viewer = self._viewer
+        with self._lock:  # several pages may ask at once
+            if self._encoded[0] is not state:
+                variables = state.params, state.grid
+                scene = web.scene_of(viewer.run, variables, _PRECISION)
+                source = ExportSource(viewer.run, state.step, variables, viewer.views, ExportSettings(), print)
+                self._encoded = state, web.encode(scene, web.about(source, scene, viewer.score), level=_COMPRESSION)
+            return self._encoded[1]
+
+
+@contextlib.contextmanager
+def answering(admits: Callable[[Any], str | None], answer: Callable[[Any], Any]) -> Iterator[None]:
+    """Lets a viser server that is made in this context answer requests of browsers by itself.
+
+    viser takes no function for this, so the one that it gives to websockets is wrapped.
+
+    Args:
+        admits: headers -> why the request is refused, or None.
+        answer: see `ClientRendering.answer`.
+    """
+    from websockets import datastructures, http11
+    from websockets.asyncio import server
+
+    def response(status, kind, body):
+        headers = {"Content-Type": kind, "Content-Length": str(len(body)), "Cache-Control": "no-store"}
+        return http11.Response(status, status.phrase, datastructures.Headers(**headers), body)
+
+    serve = server.serve
+
+    def wrapped(*args, process_request, **options):
+        async def process(connection, request):
+            if request.headers.get("Upgrade") != "websocket":
+                if why := admits(request.headers):
+                    return response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", why.encode())
+                if found := await answer(request):
+                    return response(*found)
+            return process_request(connection, request)
+
+        times = {"open_timeout": _TRANSFER_SECONDS, "close_timeout": _TRANSFER_SECONDS}
+        return serve(*args, process_request=process, **{**options, **times})
+
+    server.serve = wrapped
+    try:
+        yield
+    finally:
+        server.serve = serve
