@@ -3,7 +3,6 @@
 `jaxnerf.register_field` and its siblings say what each needs; docs/extending has an example of each.
 """
 
-from jaxnerf.core.normals import SurfaceSamples
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
 from jaxnerf.data.readers.base import Capture, Frame
@@ -28,7 +27,6 @@ from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource
 __all__ = [
     # fields and samplers
     "Field", "Model", "SamplerContext", "field_scene", "needs_of_fields", "split_key", "without_samples",
-    "SurfaceSamples",
     # readers and exporters
     "Capture", "Frame", "ExportSource",
     # estimators of uncertainty
