@@ -54,14 +54,7 @@ from jaxnerf.core.volume_rendering import (
     transmittance,
     weights_from_density,
 )
-from jaxnerf.registry import (
-    register_estimator,
-    register_exporter,
-    register_field,
-    register_loss,
-    register_reader,
-    register_sampler,
-)
+from jaxnerf.registry import register_field, register_loss, register_reader, register_sampler
 
 if _typing.TYPE_CHECKING:
     from jaxnerf.data.dataset import load_dataset
@@ -72,6 +65,8 @@ if _typing.TYPE_CHECKING:
     from jaxnerf.fields.hash_grid import hash_grid_field
     from jaxnerf.fields.mlp import mlp_field
     from jaxnerf.fields.still_life import still_life
+    from jaxnerf.tools.exporters.registration import register_exporter
+    from jaxnerf.tools.uncertainty.registration import register_estimator
 
 __version__ = "0.1.0"
 
@@ -86,6 +81,8 @@ _ON_DEMAND = {
     "TrainedRun": "jaxnerf.evaluation.trained_run",
     "train_and_evaluate": "jaxnerf.evaluation.evaluate",
     "train_many": "jaxnerf.evaluation.evaluate",
+    "register_exporter": "jaxnerf.tools.exporters.registration",
+    "register_estimator": "jaxnerf.tools.uncertainty.registration",
 }
 
 if not _typing.TYPE_CHECKING:  # a type checker would accept every name

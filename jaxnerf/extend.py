@@ -1,7 +1,11 @@
 """What code that registers a field, a sampler, a loss, a dataset reader, an exporter or an estimator builds on.
 
-`jaxnerf.register_field` and its siblings say what each needs; docs/extending has an example of each.
+`jaxnerf.register_field` and its siblings say what each needs; docs/extending has an example of each. What exporters and
+estimators build on is imported when it is first used.
 """
+
+import importlib
+import typing
 
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
@@ -21,8 +25,24 @@ from jaxnerf.options import (
     infer,
     option,
 )
-from jaxnerf.tools.exporters.base import ExportSource
-from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource
+
+if typing.TYPE_CHECKING:
+    from jaxnerf.tools.exporters.base import ExportSource
+    from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource
+
+_ON_DEMAND = {
+    "ExportSource": "jaxnerf.tools.exporters.base",
+    "Estimate": "jaxnerf.tools.uncertainty.base",
+    "UncertaintySource": "jaxnerf.tools.uncertainty.base",
+}
+
+if not typing.TYPE_CHECKING:  # a type checker would accept every name
+
+    def __getattr__(name):
+        if name not in _ON_DEMAND:
+            raise AttributeError(f"module 'jaxnerf.extend' has no attribute {name!r}")
+        return getattr(importlib.import_module(_ON_DEMAND[name]), name)
+
 
 __all__ = [
     # fields and samplers

@@ -1,4 +1,4 @@
-"""The parts that a config or a flag selects by name: fields, samplers, losses, dataset readers and exporters.
+"""The parts that a config selects by name: fields, samplers, losses and dataset readers.
 
 Built-in parts are imported when they are first used. Code outside the package adds parts with the `register_*`
 functions; a program imports such code with `--plugins=module,...`.
@@ -55,18 +55,6 @@ class Reader(NamedTuple):
 
     read: Callable[..., Any]
     detect: Callable[..., bool]
-
-
-class Exporter(NamedTuple):
-    """A way to export a trained run.
-
-    Attributes:
-        export: (ExportSource, folder) -> None.
-        check: raises a ValueError for a TrainedRun that cannot be exported; None: all can.
-    """
-
-    export: Callable[..., None]
-    check: Callable[..., Any] | None = None
 
 
 class Registry:
@@ -139,25 +127,6 @@ READERS = Registry(
         "transforms": "jaxnerf.data.readers.transforms:READER",
         "colmap": "jaxnerf.data.readers.colmap:READER",
         "llff": "jaxnerf.data.readers.llff:READER",
-    },
-)
-EXPORTERS = Registry(
-    "exporter",
-    "jaxnerf.register_exporter",
-    {
-        "mesh": "jaxnerf.tools.exporters.mesh:EXPORTER",
-        "points": "jaxnerf.tools.exporters.points:EXPORTER",
-        "depth": "jaxnerf.tools.exporters.depth:EXPORTER",
-        "splats": "jaxnerf.tools.exporters.splats:EXPORTER",
-        "web": "jaxnerf.tools.exporters.web:EXPORTER",
-    },
-)
-ESTIMATORS = Registry(
-    "estimator of uncertainty",
-    "jaxnerf.register_estimator",
-    {
-        "laplace": "jaxnerf.tools.uncertainty.laplace:estimate_laplace",
-        "ensemble": "jaxnerf.tools.uncertainty.ensemble:estimate_ensemble",
     },
 )
 
@@ -237,35 +206,6 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
         ValueError: if another format has that name.
     """
     READERS.add(name, Reader(read, detect or _never))
-
-
-def register_exporter(name: str, export: Callable[..., Any], *, check: Callable[..., Any] | None = None) -> None:
-    """Registers a way to export a trained run under a name for `jaxnerf-export --kind`.
-
-    Args:
-        name: of the exporter.
-        export: (source: ExportSource, folder: Path) -> None, see `jaxnerf.extend.ExportSource`. It writes files
-            into the folder, which is moved into place when it returns.
-        check: (run: TrainedRun) -> anything; raises a ValueError that says why the run cannot be exported. It is called
-            before anything is computed, and for a run without a grid before one is extracted. None: all runs can be.
-
-    Raises:
-        ValueError: if another exporter has that name.
-    """
-    EXPORTERS.add(name, Exporter(export, check))
-
-
-def register_estimator(name: str, estimate: Callable[..., Any]) -> None:
-    """Registers an estimator of the error of each pixel under a name for `--uncertainty`.
-
-    Args:
-        name: of the estimator.
-        estimate: (source: UncertaintySource) -> Estimate, see `jaxnerf.extend.UncertaintySource` and `Estimate`.
-
-    Raises:
-        ValueError: if another estimator has that name.
-    """
-    ESTIMATORS.add(name, estimate)
 
 
 def _checked_options(function, options):

@@ -9,6 +9,8 @@ from ml_collections import ConfigDict
 import jaxnerf
 from jaxnerf import registry
 from jaxnerf.configs import default
+from jaxnerf.tools.exporters.registration import EXPORTERS
+from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from runs import ROOT, run_forked
 
 pytest_plugins = ["run_fixtures"]
@@ -212,9 +214,8 @@ def test_python_examples_run(code, unoptimized, tmp_path, monkeypatch):
         (tmp_path / "runs" / "lego").mkdir(parents=True)
         (tmp_path / "runs" / "lego" / "config.json").write_text('{"seed": 0}')
         (tmp_path / "runs" / "lego" / "metrics.jsonl").write_text('{"step": 1, "seconds": 2.0, "psnr_fine": 20.0}\n')
-    for parts in (
-        *(getattr(registry, name) for name in ("LOSSES", "FIELDS", "SAMPLERS", "READERS", "EXPORTERS", "ESTIMATORS")),
-    ):
+    of_runs = (registry.LOSSES, registry.FIELDS, registry.SAMPLERS, registry.READERS)
+    for parts in (*of_runs, EXPORTERS, ESTIMATORS):
         monkeypatch.setattr(parts, "_parts", dict(parts._parts))  # what an example registers is forgotten
     with jax.numpy_rank_promotion("allow"):
         exec(compile(code, "example", "exec"), {})

@@ -72,11 +72,9 @@ class Checkpoints:
     def load_rendered(self, step: int, like: TrainState) -> tuple[dict[str, Any], Any]:
         """Returns what renders images at a step, `image_params` and the grid, and does not read the rest of the state.
 
-        Args and errors are those of `load`. A checkpoint of an earlier version is read as a whole.
+        Args and errors are those of `load`.
         """
         with self._reading(step) as saved:
-            if _RENDERED not in saved:
-                return _rendered(self.load(step, like))
             abstract = _abstract(like)
             numbers = jax.tree.unflatten(jax.tree.structure(abstract), range(len(jax.tree.leaves(abstract))))
             read = {numbers.step, *jax.tree.leaves(_rendered(numbers))}

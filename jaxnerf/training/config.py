@@ -31,6 +31,7 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part
 from jaxnerf.runtime import memory
 from jaxnerf.runtime.config_fields import typed
 from jaxnerf.training.camera_parameters import CameraOptions
+from jaxnerf.training.earlier_options import in_todays_names, refuse
 from jaxnerf.training.options import EvalOptions, TrainOptions
 
 _MAX_SEED = 2**63 - 1  # what jax.random.key takes
@@ -130,7 +131,8 @@ def read_config(config: Config) -> RunConfig:
     """
     if isinstance(config, RunConfig):
         return config
-    content = config.to_dict() if isinstance(config, ConfigDict) else dict(config)
+    content, left = in_todays_names(config.to_dict() if isinstance(config, ConfigDict) else config)
+    refuse(left, "--config.")
     kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
     top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "")
     parts = {name: read(kind, _section(content, name), f"{name}.") for name, kind in kinds.items()}

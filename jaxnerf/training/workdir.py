@@ -7,16 +7,16 @@ import pathlib
 import socket
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from ml_collections import ConfigDict
 
-from jaxnerf.options import Changes, values_of
+from jaxnerf.options import Changes
 from jaxnerf.registry import LOSSES
 from jaxnerf.runtime import atomic_files
-from jaxnerf.training.camera_parameters import CameraOptions
 from jaxnerf.training.config import RunConfig, changed, declared, flatten, read_config, to_config_dict
+from jaxnerf.training.earlier_options import in_todays_names, refuse
 
 try:
     import fcntl
@@ -24,27 +24,6 @@ except ImportError:  # Windows
     fcntl = None
 
 _FOLDERS = ("checkpoints", "previews", "eval", "tensorboard")  # that training writes to
-# Options that the config.json of an older version may lack though training depends on them, and what it did instead.
-_ADDED = {
-    "coarse.prefilter": False,
-    "coarse.reflections": False,
-    "data.background_color": (),
-    "data.num_scales": 1,
-    "data.up": "",
-    "data.view_indices": (),
-    "fine.prefilter": False,
-    "fine.reflections": False,
-    "hash_grid.prefilter": False,
-    "hash_grid.reflections": False,
-    "occupancy.min_views": 0,
-    "occupancy.uniform_fraction": 1.0,
-    "train.lr_decay_power": 1.0,
-    "train.one_ray_fraction": 0.6,
-    "train.rays_per_side": 1,
-    "train.table_momentum": True,
-}
-# Options that no longer exist, and the value with which training was as it is now.
-_REMOVED = {"occupancy.near_gradient_distance": 0.0}
 
 
 def save_config(workdir: str | os.PathLike, config: RunConfig) -> None:
@@ -69,12 +48,8 @@ def save_config(workdir: str | os.PathLike, config: RunConfig) -> None:
 
 
 def _check_same_run(workdir, config):
-    content, gone = migrate(_content(workdir))
-    if gone:
-        raise ValueError(
-            f"{workdir}: belongs to a run of another version, whose {gone[0]} no longer exists; resume it with "
-            "that version, or give another --workdir. It can still be evaluated, rendered and exported"
-        )
+    content, left = _saved(workdir)
+    refuse(left, f"{workdir}: belongs to a run of another version, whose ", Changes.TRAINING)
     old, new = (_as_saved(each) for each in (read_config(content), config))
     free = {name for name, option, _, _ in declared(config) if not option.changes & Changes.TRAINING}
     fixed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key) and key not in free]
@@ -95,7 +70,7 @@ def saved_options(workdir: str | os.PathLike) -> dict[str, Any]:
     Raises:
         ValueError: if there is no run; names the file.
     """
-    return _without_unused_losses(flatten(migrate(_content(workdir))[0]))
+    return _without_unused_losses(flatten(_saved(workdir)[0]))
 
 
 def _as_saved(config):
@@ -113,8 +88,10 @@ def load_config(workdir: str | os.PathLike, **values: Any) -> RunConfig:
     Raises:
         ValueError: if there is no run; names the file.
     """
+    content, left = _saved(workdir)
+    refuse(left, f"{workdir}: ", Changes.IMAGES)
     try:
-        config = read_config(migrate(_content(workdir))[0])
+        config = read_config(content)
     except ValueError as error:
         if not str(error).startswith("--config."):
             raise
@@ -147,27 +124,19 @@ def _content(workdir):
     return content
 
 
-def migrate(content: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Returns the content of a config.json, of any version, as this version writes it.
+def _saved(workdir):
+    """Returns the content of a config.json in today's names, and its options that are gone, see `in_todays_names`.
 
-    Options that were added have the values with which older versions trained and rendered.
-
-    Returns:
-        The content; and the options "section.option" that no longer exist and with which training was different.
+    What it lacks was added after it was written, or registered since: losses are off, and other options on which
+    training does not depend have their defaults.
     """
-    content = {name: dict(part) if isinstance(part, Mapping) else part for name, part in content.items()}
-    content.setdefault("cameras", values_of(CameraOptions()))  # all are off
+    content, left = in_todays_names(_content(workdir))
     added = {name: value for name, option, _, value in declared(RunConfig()) if not option.changes & Changes.TRAINING}
-    for name, value in {**added, **_ADDED, **{f"losses.{name}": 0.0 for name in LOSSES.names()}}.items():
+    for name, value in {**added, **{f"losses.{name}": 0.0 for name in LOSSES.names()}}.items():
         section, _, field = name.partition(".")
         if isinstance(content.get(section), dict):
             content[section].setdefault(field, value)
-    gone = []
-    for name, harmless in _REMOVED.items():
-        section, _, field = name.partition(".")
-        found = content[section].pop(field, harmless) if isinstance(content.get(section), dict) else harmless
-        gone += [name] if found != harmless else []
-    return content, gone
+    return content, left
 
 
 @contextlib.contextmanager

@@ -1,7 +1,10 @@
 """The examples of this folder: each adds a part from one file outside the package, and trains with it by name."""
 
 import dataclasses
+import os
+import pathlib
 import shutil
+import subprocess
 import sys
 
 import density_exporter
@@ -20,10 +23,12 @@ import captures
 import export_sources
 import jaxnerf
 from jaxnerf.options import Options, option
-from jaxnerf.registry import ESTIMATORS, EXPORTERS, FIELDS, Part
+from jaxnerf.registry import FIELDS, Part
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.config_fields import typed
+from jaxnerf.tools.exporters.registration import EXPORTERS
 from jaxnerf.tools.uncertainty.base import UncertaintySource
+from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from jaxnerf.training import auto_config
 from jaxnerf.training.metric_log import read_rows
 from runs import ROOT, SMOKE_FLAGS, smoke_config, start
@@ -56,6 +61,14 @@ def test_a_field(tmp_path):
     x = np.zeros((2, 3, 3), np.float32)
     density, rgb = jaxnerf.load_scene(tmp_path / "run")[0](x, x[:, :1])
     assert density.shape == (2, 3) and rgb.shape == (2, 3, 3)
+
+
+def test_a_field_imports_no_tool():
+    code = "import sys, gabor_field; print([name for name in sys.modules if name.startswith('jaxnerf.tools')])"
+    folders = os.pathsep.join([str(pathlib.Path(__file__).parent), str(ROOT)])
+    environment = {**os.environ, "PYTHONPATH": folders}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert result.stdout == "[]\n"
 
 
 def test_a_sampler(tmp_path):

@@ -11,8 +11,8 @@ import numpy as np
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry.poses import axis_of
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
-from jaxnerf.registry import EXPORTERS
 from jaxnerf.runtime import atomic_files
+from jaxnerf.tools.exporters.registration import EXPORTERS
 
 MAX_RESOLUTION, MAX_SIZE, MAX_POINTS = 1024, 4096, 10_000_000
 TEXTURE_SIZES = (64, 8192)

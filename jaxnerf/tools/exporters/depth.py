@@ -6,9 +6,9 @@ import pathlib
 import numpy as np
 
 from jaxnerf.evaluation.output_images import write_image
-from jaxnerf.registry import Exporter
 from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.surfaces import inside, render_depth_images
 
 

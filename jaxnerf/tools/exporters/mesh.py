@@ -24,9 +24,9 @@ from skimage import measure
 from jaxnerf.core.cameras import project
 from jaxnerf.data.geometry.poses import AXES, axis_of, up_of
 from jaxnerf.data.geometry.world import poses_in_file
-from jaxnerf.registry import Exporter
 from jaxnerf.runtime import atomic_files, memory, stages
 from jaxnerf.tools.exporters.base import TEXTURED_FACES, ExportSource, check_memory
+from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.surface_colors import surface_colors
 from jaxnerf.tools.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 from jaxnerf.tools.exporters.texture import textured

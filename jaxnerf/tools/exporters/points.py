@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from jaxnerf.registry import Exporter
 from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 
 _NUM_POINTS = 200_000  # by default

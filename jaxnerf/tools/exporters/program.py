@@ -9,8 +9,8 @@ import sys
 
 from absl import flags
 
-from jaxnerf.registry import EXPORTERS
 from jaxnerf.runtime import cli
+from jaxnerf.tools.exporters.registration import EXPORTERS
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
 _KIND = flags.DEFINE_string(

@@ -17,10 +17,10 @@ from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import refined_views
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.fields.hash_grid import harmonics
-from jaxnerf.registry import Exporter
 from jaxnerf.tools.exporters.base import ExportSource
 from jaxnerf.tools.exporters.gaussians import Gaussians, rasterize, read_spz, write_gaussians, write_spz
 from jaxnerf.tools.exporters.points import surface_points, thinned
+from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.splat_fit import fit_gaussians
 from jaxnerf.tools.exporters.surfaces import export_box, render_depth_images, sphere_directions
 

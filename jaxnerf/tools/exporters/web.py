@@ -23,9 +23,9 @@ from jaxnerf.data.geometry.poses import gaze_center, up_of
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import TrainedRun, refined_views
 from jaxnerf.fields.hash_grid import HashGrid
-from jaxnerf.registry import Exporter
 from jaxnerf.tools.exporters import web_scene
 from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.web_scene import WebScene
 
 MAGIC = b"JAXNERF1"

@@ -16,9 +16,9 @@ from jaxnerf.core.occupancy.grid import OccupancyGrid
 from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.options import is_auto
-from jaxnerf.registry import ESTIMATORS
 from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.uncertainty.base import UncertaintySource
+from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 
 ESTIMATOR = "laplace"  # whose estimate is a function of position
 _LIMITS = (0.99, 0.97, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5)  # that "auto" tries

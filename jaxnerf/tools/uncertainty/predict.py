@@ -14,12 +14,12 @@ from jaxnerf.core.views import Views
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views
 from jaxnerf.options import is_auto
-from jaxnerf.registry import ESTIMATORS
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty import calibration as calibrations
 from jaxnerf.tools.uncertainty.base import Score, UncertaintySource
 from jaxnerf.tools.uncertainty.calibration import Calibration, pixel_error, score_order
+from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 
 
 class Predictor(NamedTuple):

@@ -11,12 +11,12 @@ from PIL import Image
 from export_sources import CENTER, RADIUS, SIZE, source_of
 from jaxnerf.core.types import Camera
 from jaxnerf.fields.base import Field
-from jaxnerf.registry import Exporter
 from jaxnerf.tools.exporters import base, gaussians, surfaces
 from jaxnerf.tools.exporters.base import ExportSettings, export_run
 from jaxnerf.tools.exporters.depth import export_depth
 from jaxnerf.tools.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field, write_glb
 from jaxnerf.tools.exporters.points import export_points, thinned
+from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.splats import export_splats, score
 from runs import run_forked
 

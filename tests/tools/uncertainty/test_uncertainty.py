@@ -19,12 +19,12 @@ from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
 from jaxnerf.evaluation.restore import TrainedRun, restore_run
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import ViewOptions
-from jaxnerf.registry import ESTIMATORS
 from jaxnerf.tools.uncertainty import calibration, cleaning, laplace, predict
 from jaxnerf.tools.uncertainty.base import Estimate
 from jaxnerf.tools.uncertainty.cleaning import cell_centers, cleaned
 from jaxnerf.tools.uncertainty.laplace import deform, interpolate
 from jaxnerf.tools.uncertainty.predict import make_predictor
+from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from runs import PACKED, smoke_config
 
 pytest_plugins = ["run_fixtures"]
