@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf import pixel_grid
-from jaxnerf.data.dataset import select_views
+from jaxnerf.data.view_selection import select_views
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.models.occupancy import render_with_grid
 from jaxnerf.training import auto_config

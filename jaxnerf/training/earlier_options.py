@@ -20,7 +20,7 @@ class Gone(NamedTuple):
     instead: str
 
 
-RENAMED: dict[str, str] = {}  # "section.option" -> its name now
+RENAMED: dict[str, str] = {"data.fingerprint": "fingerprint"}  # "section.option" -> its name now
 GONE: dict[str, Gone] = {}  # by "section.option"
 
 
