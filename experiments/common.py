@@ -39,7 +39,7 @@ _MATRIX_SIDE = 1024
 _MOST_SPLITS = 6
 _splits: dict[tuple[str, str], Views] = {}
 PAGE = flags.DEFINE_string(
-    "page", None, "Markdown file, such as docs/results/speed.md, in which the tables of this study are replaced."
+    "page", None, "Markdown file, such as docs/results/benchmark.md, in which the tables of this study are replaced."
 )
 
 
@@ -181,7 +181,7 @@ def compile_step(config, views=None) -> Step:
     valid, data = experiment.prepare(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
     parts = experiment.model, experiment.optimizer, experiment.draw, experiment.losses
-    step = make_train_step(*parts, patches=experiment.draw_patches, pixel_rays=experiment.pixel_rays)
+    step = make_train_step(*parts, pixel_rays=experiment.pixel_rays)
     positions = jnp.asarray(split_positions(config.train.batch_size, 1, config.train.microbatch_size)[0])
 
     def count_flops():

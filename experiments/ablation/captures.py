@@ -1,7 +1,7 @@
 """Measures what parts of the training of a capture gain and cost: PSNR of held-out and training views, depth, time.
 
     JAXNERF_SCENES=... python experiments/ablation/captures.py --out=DIR [--data_dir=can] [--steps=3000] [--seeds=0] \
-        [--only="capture,depth off"] [--page=docs/results/capture_settings.md --table=NAME]
+        [--only="capture,depth off"] [--page=docs/results/settings.md --table=NAME]
 
 Trains configs/capture.py for --steps steps with one setting changed at a time, on the training views without every 8th,
 and scores those. The depth error is |t - D| / D at the observations of the dataset's sparse points in the held-out
@@ -36,8 +36,6 @@ VARIANTS = {
     "distortion 0.003": {"losses.distortion": 0.003},
     "distortion 0.01": {"losses.distortion": 0.01},
     "opaque 0.01": {"losses.opaque": 0.01},
-    "hash_decay 0.1": {"losses.hash_decay": 0.1},
-    "hash_decay 1": {"losses.hash_decay": 1.0},
     "total_variation 0.1": {"losses.total_variation": 0.1},
     "total_variation 1": {"losses.total_variation": 1.0},
     "cells that no view sees may be occupied": {"occupancy.min_views": 0},
