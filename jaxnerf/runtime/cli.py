@@ -20,7 +20,7 @@ from typing import Any
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from jaxnerf.registry import READERS
+from jaxnerf.registry import READERS, needs_folder
 from jaxnerf.runtime import signals, stages
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
@@ -172,7 +172,7 @@ def use_data(config, data_dir: str | None, format: str | None = None):
         READERS.get(format)
     if data_dir:
         config.data.dir = data_dir
-        if config.data.format == "synthetic":  # the embedded scene has no folder
+        if not needs_folder(config.data.format):
             config.data.format = "auto"
     if format:
         config.data.format = format
