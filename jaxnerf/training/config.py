@@ -134,8 +134,8 @@ def read_config(config: Config) -> RunConfig:
     content, left = in_todays_names(config.to_dict() if isinstance(config, ConfigDict) else config)
     refuse(left, "--config.")
     kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
-    top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "")
-    parts = {name: read(kind, _section(content, name), f"{name}.") for name, kind in kinds.items()}
+    top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "config.")
+    parts = {name: read(kind, _section(content, name), f"config.{name}.") for name, kind in kinds.items()}
     losses = {name: _read_weight(name, weight) for name, weight in _section(content, "losses").items()}
     plugins = {name: _read_plugin(name, section) for name, section in {**top.plugins, **content}.items()}
     config = dataclasses.replace(top, **parts, losses=losses, plugins=plugins)
@@ -230,7 +230,7 @@ def identity(config: RunConfig) -> str:
 
 def _read_weight(name, weight):
     declaration = weight_option(name)._replace(auto=is_auto(weight))  # a loss that is not registered may have "auto"
-    return read_value(declaration, Schedule, weight, f"losses.{name}")
+    return read_value(declaration, Schedule, weight, f"config.losses.{name}")
 
 
 def _is_section(kind):
@@ -255,7 +255,7 @@ def _read_plugin(name, section):
         raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
     if part is None or part.options is None:
         return {field: as_tuples(value) for field, value in section.items()}
-    return read(part.options, {**values_of(part.options()), **section}, f"{name}.")
+    return read(part.options, {**values_of(part.options()), **section}, f"config.{name}.")
 
 
 def _check(config):
