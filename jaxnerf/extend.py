@@ -7,7 +7,6 @@ estimators build on is imported when it is first used.
 import importlib
 import typing
 
-from jaxnerf.core.normals import SurfaceSamples
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
 from jaxnerf.data.readers.base import Capture, Frame
@@ -50,7 +49,6 @@ if not typing.TYPE_CHECKING:  # a type checker would accept every name
 __all__ = [
     # fields and samplers
     "Field", "Model", "SamplerContext", "field_scene", "needs_of_fields", "split_key", "without_samples",
-    "SurfaceSamples",
     # readers and exporters
     "Capture", "Frame", "ExportSource", "ExportOptions",
     # estimators of uncertainty

@@ -137,7 +137,6 @@ class Facts(NamedTuple):
         contracted: whether the box holds all of space.
         contraction_reason: why.
         sampler: the name of the run's sampler.
-        predicts_normals: whether the run's field predicts normals.
         large_field: whether an update of the field's parameters takes as long as half of a step's rays.
         factor: by which the images were downscaled.
         trains_cameras: whether the run trains parameters of the training images.
@@ -159,7 +158,6 @@ class Facts(NamedTuple):
     contracted: bool = False
     contraction_reason: str = ""
     sampler: str = ""
-    predicts_normals: bool = False
     large_field: bool = False
     factor: int = 1
     trains_cameras: bool = False

@@ -30,7 +30,7 @@ class Loss(NamedTuple):
 
     Attributes:
         function: see `register_loss`.
-        on: "renderings", "patches", "surfaces", "params" or "field", see `register_loss`.
+        on: "renderings", "params" or "field", see `register_loss`.
         needs: the optional fields of Batch that it reads.
         weight: where the config sets none; "auto" needs `infer`.
         infer: (facts) -> the weight in place of "auto", and the line that reports it, or "".
@@ -116,10 +116,6 @@ LOSSES = Registry(
         "distortion": "jaxnerf.training.losses:DISTORTION",
         "depth": "jaxnerf.training.losses:DEPTH",
         "opaque": "jaxnerf.training.losses:OPAQUE",
-        "near_opacity": "jaxnerf.training.losses:NEAR_OPACITY",
-        "depth_smoothness": "jaxnerf.training.losses:DEPTH_SMOOTHNESS",
-        "normals": "jaxnerf.training.losses:NORMALS",
-        "hash_decay": "jaxnerf.fields.hash_grid:HASH_DECAY",
         "total_variation": "jaxnerf.fields.hash_grid:TOTAL_VARIATION",
     },
 )
@@ -188,15 +184,10 @@ def register_loss(
         name: of the loss.
         function: with on="renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
             of a step, with weights and samples: a tuple of those that show colours, the final one last, and
-            `outputs["name"]` that of any network. `batch` is a Batch. With on="patches" (outputs, rays) -> [P], one
-            value per patch: the Renderings, without weights and samples, and the Rays [P, 4, 4] of patches of
-            neighbouring pixels, seen from poses between those of the training cameras. With on="surfaces" (scene,
-            normals, samples) -> [N], one value for each of every fourth ray: the scene of the network that images show,
-            its function (x, viewdirs) -> predicted normals, or None, and the `SurfaceSamples` of these rays, at which
-            the function evaluates them. With on="params" (params)
-            -> scalar, where params has an entry for each network. With on="field" None: the run's fields bring the
-            function, see `Field.regularizers`.
-        on: "renderings", "patches", "surfaces", "params" or "field".
+            `outputs["name"]` that of any network. `batch` is a Batch. With on="params" (params) -> scalar, where params
+            has an entry for each network. With on="field" None: the run's fields bring the function, see
+            `Field.regularizers`.
+        on: "renderings", "params" or "field".
         needs: the optional fields of Batch that the function reads, of "image_index", "pixel", "alpha", "depth" and
             "depth_weight". Fields that no loss needs are None. Where one needs a depth, some rays of each batch go
             through observations of the dataset's sparse points, see `draw_batch`.
@@ -206,7 +197,7 @@ def register_loss(
     Raises:
         ValueError: if another loss has that name, or on another value of `on`.
     """
-    if on not in (kinds := ("renderings", "patches", "surfaces", "params", "field")):
+    if on not in (kinds := ("renderings", "params", "field")):
         raise ValueError(f"register_loss: on is {on!r}, expected one of {', '.join(map(repr, kinds))}")
     LOSSES.add(name, Loss(function, on, tuple(needs), weight, help=help))
 

@@ -67,7 +67,6 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         for registry, name in ((FIELDS, config.field), (SAMPLERS, config.sampler))
     )
     facts = facts._replace(
-        predicts_normals=getattr(field, "reflections", False),
         large_field=getattr(field, "is_large", False),
         factor=config.data.factor,
         trains_cameras=config.cameras.any,

@@ -381,7 +381,6 @@ def _compile(experiment, views, together=()):
         experiment.draw,
         experiment.losses,
         experiment.cameras,
-        experiment.draw_patches,
         experiment.pixel_rays,
     )
     turns = many and many_runs.runs_in_turn()

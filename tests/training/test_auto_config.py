@@ -282,7 +282,6 @@ def test_explicit_values_do_not_change(views):
     names = ("contracted", "lower", "upper", "step_size", "resolution", "min_views")
     expected = {"data.world", "data.fingerprint", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
     expected |= {"data.near", "data.background_color", "cameras.num_images", "losses.depth", "hash_grid.prefilter"}
-    expected |= {"losses.normals"}
     assert changed == expected
 
 

@@ -82,8 +82,6 @@ def network_of(run: TrainedRun) -> HashGrid:
         reason = f"sampler is {config.sampler!r}, expected 'occupancy'"
     elif config.data.ndc:
         reason = "data.ndc is True, expected False: the page has no normalised device coordinates"
-    elif config.hash_grid.reflections:
-        reason = "hash_grid.reflections is True, expected False: the page has no reflected directions"
     elif run.experiment.model.needs:
         reason = f"the field asks for {', '.join(run.experiment.model.needs)}, expected position and direction"
     if reason:
