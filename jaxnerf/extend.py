@@ -9,7 +9,7 @@ import typing
 
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.options import (
@@ -50,7 +50,7 @@ __all__ = [
     # fields and samplers
     "Field", "Model", "SamplerContext", "field_scene", "needs_of_fields", "split_key", "without_samples",
     # readers and exporters
-    "Capture", "Frame", "ExportSource", "ExportOptions",
+    "Capture", "Frame", "CameraFiles", "ExportSource", "ExportOptions",
     # estimators of uncertainty
     "Estimate", "UncertaintySource",
     # options

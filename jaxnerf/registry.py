@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from jaxnerf.options import Facts, Options, Schedule
+from jaxnerf.options import Facts, Options, Schedule, is_auto
 
 
 class Part(NamedTuple):
@@ -49,12 +49,14 @@ class Reader(NamedTuple):
     """A reader of one dataset format.
 
     Attributes:
-        read: folder -> Capture.
+        read: folder -> Capture, see `register_reader`.
         detect: folder -> whether the folder holds this format.
+        views: (DataOptions, split) -> Views, of a dataset without a folder; `read` is not called then.
     """
 
     read: Callable[..., Any]
     detect: Callable[..., bool]
+    views: Callable[..., Any] | None = None
 
 
 class Registry:
@@ -127,6 +129,7 @@ READERS = Registry(
         "transforms": "jaxnerf.data.readers.transforms:READER",
         "colmap": "jaxnerf.data.readers.colmap:READER",
         "llff": "jaxnerf.data.readers.llff:READER",
+        "synthetic": "jaxnerf.data.synthetic:READER",
     },
 )
 
@@ -207,13 +210,19 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
 
     Args:
         name: of the format.
-        read: (folder: Path) -> Capture, see `jaxnerf.extend.Capture`.
+        read: (folder: Path) -> Capture, see `jaxnerf.extend.Capture`. If each split has a file of its own, `read` may
+            ask for `split` by name: the Capture then needs the frames of that split only; None: those of all.
         detect: (folder: Path) -> whether the folder holds this format, for `data.format` "auto"; None: never.
 
     Raises:
         ValueError: if another format has that name.
     """
     READERS.add(name, Reader(read, detect or _never))
+
+
+def needs_folder(format: str) -> bool:
+    """Returns whether datasets of a format, or of "auto", lie in a folder, unlike the embedded scene."""
+    return is_auto(format) or READERS.get(format).views is None
 
 
 def _never(folder):

@@ -21,7 +21,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from jaxnerf.options import Option, at_least, is_auto, is_tuple
-from jaxnerf.registry import READERS
+from jaxnerf.registry import READERS, needs_folder
 from jaxnerf.runtime import signals, stages
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
@@ -186,7 +186,7 @@ def use_data(config, data_dir: str | None, format: str | None = None):
         READERS.get(format)
     if data_dir:
         config.data.dir = data_dir
-        if config.data.format == "synthetic":  # the embedded scene has no folder
+        if not needs_folder(config.data.format):
             config.data.format = "auto"
     if format:
         config.data.format = format

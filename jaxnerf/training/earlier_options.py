@@ -20,7 +20,7 @@ class Gone(NamedTuple):
     instead: str
 
 
-RENAMED: dict[str, str] = {}  # "section.option" -> its name now
+RENAMED: dict[str, str] = {"data.fingerprint": "fingerprint"}  # "section.option" -> its name now
 _DROP = "use the version that wrote it"
 _REFLECTIONS = Gone((False,), Changes.TRAINING | Changes.IMAGES, _DROP)
 _LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")

@@ -193,10 +193,10 @@ def flight(relief, *, apart=30.0, height=20.0, size=24):
 def test_a_flight_over_hills_is_trained_around(tmp_path, writer, relief, shift):
     shots, points = flight(relief)
     WRITERS[writer](tmp_path, moved(shots, shift), points=points._replace(xyz=points.xyz + shift))
-    data, lines = dataset.resolve(dataset.DataOptions(format="auto", dir=str(tmp_path), world="auto", ndc="auto"))
+    data, lines, _ = dataset.resolve(dataset.DataOptions(format="auto", dir=str(tmp_path), world="auto", ndc="auto"))
     assert (data.world, data.ndc) == ("around", False)
     assert any("a layer that is thin" in line for line in lines)
-    forward, _ = dataset.resolve(dataset.replaced(data, world="auto", ndc=True))
+    forward, *_ = dataset.resolve(dataset.replaced(data, world="auto", ndc=True))
     assert forward.world == "forward"  # what is asked for stays
 
 
