@@ -26,14 +26,15 @@ flags.FLAGS.set_default("config", "lego_small")
 def main(argv: list[str]) -> None:
     """Trains and scores at each of the times."""
     del argv
-    from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+    from jaxnerf.evaluation.evaluate import score_run, train_and_evaluate
+    from jaxnerf.evaluation.restore import restore_run
 
     config = _CONFIG.value
     for minutes in map(float, _MINUTES.value):
         config.train.max_seconds = 60 * minutes
         if not train_and_evaluate(config, _WORKDIR.value):
             return
-        evaluate(_WORKDIR.value, overwrite=True)
+        score_run(restore_run(_WORKDIR.value), _WORKDIR.value, overwrite=True)
     rows = [table.row(path) for path in table.scored(pathlib.Path(_WORKDIR.value))]
     print("\n".join(common.markdown(table.HEADS, rows)))
 

@@ -21,7 +21,13 @@ class Gone(NamedTuple):
 
 
 RENAMED: dict[str, str] = {}  # "section.option" -> its name now
-GONE: dict[str, Gone] = {}  # by "section.option"
+GONE: dict[str, Gone] = {  # by "section.option"
+    "eval.max_uncertainty": Gone(
+        (1.0,),
+        Changes.IMAGES,
+        "set it to 1 in config.json, and give --max_uncertainty to jaxnerf-eval, jaxnerf-render and jaxnerf-export",
+    ),
+}
 
 
 def in_todays_names(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

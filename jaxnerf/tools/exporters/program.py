@@ -18,11 +18,7 @@ _KIND = flags.DEFINE_string(
 )
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is exported.")
-_MAX_UNCERTAINTY = cli.define_number(
-    "max_uncertainty",
-    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
-    "allow; 1: off. It overrides config.eval.max_uncertainty.",
-)
+_MAX_UNCERTAINTY = cli.define_max_uncertainty()
 _RESOLUTION = flags.DEFINE_integer("resolution", 256, "mesh: the voxels along the longest side of the box.")
 _BOX = flags.DEFINE_list(
     "box",
