@@ -48,7 +48,6 @@ test-extra: $(BIN)/.dev
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/kill_many.py --kills=20 --seed=1 --out=runs/extra/kill_many
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/faults/each.py --out=runs/extra/faults
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/cameras_from_images.py runs/extra/cameras
-	$(BIN)/python experiments/gpu/roofline.py --tiny
 	$(BIN)/python experiments/gpu/run.py --tiny --minutes=60 --out=runs/extra/gpu
 	$(BIN)/pip install --quiet playwright
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/viewer_in_browser.py runs/extra/viewer

@@ -39,7 +39,7 @@ _MATRIX_SIDE = 1024
 _MOST_SPLITS = 6
 _splits: dict[tuple[str, str], Views] = {}
 PAGE = flags.DEFINE_string(
-    "page", None, "Markdown file, such as docs/results/speed.md, in which the tables of this study are replaced."
+    "page", None, "Markdown file, such as docs/results/benchmark.md, in which the tables of this study are replaced."
 )
 
 

@@ -1,7 +1,7 @@
 """Measures what parts of the training of a capture gain and cost: PSNR of held-out and training views, depth, time.
 
     JAXNERF_SCENES=... python experiments/ablation/captures.py --out=DIR [--data_dir=can] [--steps=3000] [--seeds=0] \
-        [--only="capture,depth off"] [--page=docs/results/capture_settings.md --table=NAME]
+        [--only="capture,depth off"] [--page=docs/results/settings.md --table=NAME]
 
 Trains configs/capture.py for --steps steps with one setting changed at a time, on the training views without every 8th,
 and scores those. The depth error is |t - D| / D at the observations of the dataset's sparse points in the held-out

@@ -1,7 +1,6 @@
-"""Measures how many planted images jaxnerf-check accuses, and how many good ones: docs/results/capture_check.md.
+"""Measures how many planted images jaxnerf-check accuses, and how many good ones.
 
-    JAXNERF_SCENES=... python experiments/capture_check/precision_recall.py [--images=10] [--seed=0] \
-        [--out=FILE]
+    JAXNERF_SCENES=... python experiments/capture_check/precision_recall.py [--images=10] [--seed=0]
 
 Each check has one planted defect, in one random image (a swap concerns two). Images are read once for each scene, and
 each pair of images is matched once, so that only the judgement of the views is repeated.
@@ -21,7 +20,6 @@ import common
 
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import read_capture
-from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.tools.capture_check import cameras, images, report, tracks, view_evidence
 from test_scenes import synthetic_capture
 
@@ -30,8 +28,8 @@ PERIODS = (0.12, 0.3)  # of the dots in the embedded room, world units
 DEFECTS = ("swapped with the next image", "swapped with a far image", "camera turned by 30 degrees", "camera displaced")
 
 
-def main(count: int, seed: int, out: str) -> None:
-    """Measures all scenes and writes the table."""
+def main(count: int, seed: int) -> None:
+    """Measures all scenes and prints the table."""
     cached = functools.cache(lambda first, second: tracks_match(*(_KEPT[key] for key in (first, second))))
     tracks_match = tracks.match
     remembered = lambda first, second: cached(_keep(first), _keep(second))  # noqa: E731
@@ -47,7 +45,7 @@ def main(count: int, seed: int, out: str) -> None:
         for name, folder in folders.items():
             rows += list(_measure(name, folder, count if name in SCENES else 0, seed))
             cached.cache_clear()
-            write_text(out, _document(rows))
+    print("\n".join([*common.provenance(), "", *_table(rows)]))
 
 
 def _measure(name, folder, count, seed):
@@ -117,35 +115,19 @@ def _keep(keypoints):
     return id(keypoints)
 
 
-def _document(rows):
+def _table(rows):
     planted, found, false, checks = (sum(row[index] for row in rows) for index in (2, 3, 4, 5))
     precision = found / max(found + false, 1)
-    lines = [
-        "# What jaxnerf-check flags",
-        "",
-        *common.provenance(),
-        "",
-        "Each check has one planted defect in one random image; a swap concerns two. An image is flagged if an",
-        "error names it. A displaced camera is moved by half the median distance of the cameras from their middle.",
-        "",
-        "| scene | defect | checks | images planted | of these flagged | good images flagged |",
-        "|---|---|---|---|---|---|",
-        *(
-            f"| {scene} | {defect} | {n} | {there} | {right} | {wrong} |"
-            for scene, defect, there, right, wrong, n in rows
-        ),
-        "",
-        f"Together: precision {precision:.1%}, recall {found / max(planted, 1):.1%}, {false} good images flagged in "
-        f"{checks} checks.",
-        "",
-    ]
-    return "\n".join(lines)
+    heads = ("scene", "defect", "checks", "images planted", "of these flagged", "good images flagged")
+    cells = [[scene, defect, *map(str, (n, there, right, wrong))] for scene, defect, there, right, wrong, n in rows]
+    recall = found / max(planted, 1)
+    together = f"precision {precision:.1%}, recall {recall:.1%}, {false} good images flagged in {checks} checks"
+    return [*common.markdown(heads, cells), "", f"Together: {together}."]
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--images", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0, help="of the images and the defects")
-    parser.add_argument("--out", default="docs/results/capture_check.md")
     known = parser.parse_args()
-    main(known.images, known.seed, known.out)
+    main(known.images, known.seed)

@@ -1,6 +1,6 @@
 """Adds images to a training set by coverage, at random, and by distance, and prints the PSNR after each addition.
 
-    python experiments/coverage/next_images.py --scenes=lego --seeds=0,1,2,3,4 --page=docs/results/next_images.md
+    python experiments/coverage/next_images.py --scenes=lego --seeds=0,1,2,3,4 --page=docs/results/few_views.md
     python experiments/coverage/next_images.py --scenes=room --room=DIR      # of experiments/room/make_room.py
 
 A scene's training images are the pool. Each seed begins with its own random images. A method then adds --add images at

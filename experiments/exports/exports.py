@@ -1,6 +1,6 @@
 """Measures the exports of a run on the embedded scene against its closed form.
 
-    python experiments/exports/exports.py --workdir=W [--resolution=256] [--out=docs/results/exports.md]
+    python experiments/exports/exports.py --workdir=W [--resolution=256]
 
 The run was trained on the embedded scene. The chamfer distance of a mesh to the surfaces of the opaque bodies is the
 sum of two means in world units: from points of the mesh to the bodies, in closed form, and from points of the bodies
@@ -28,7 +28,6 @@ import common
 
 from jaxnerf.fields.still_life import BODIES
 from jaxnerf.runtime import cli
-from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.tools.exporters import mesh as mesh_exporter
 from jaxnerf.tools.exporters.base import ExportSettings, export_run
 
@@ -36,7 +35,6 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run on the embedded
 _RESOLUTION = flags.DEFINE_integer("resolution", 256, "Voxels along the longest side.")
 _NUM_POINTS = flags.DEFINE_integer("num_points", None, "Points or Gaussians; None: the exporter's own.")
 _EXPORTS = flags.DEFINE_list("exports", ["mesh", "closed", "points", "splats"], "Of mesh, closed, points, splats.")
-_OUT = flags.DEFINE_string("out", None, "Markdown page; replaces it.")
 _KINDS = {
     "mesh": ("mesh", {}),
     "closed": ("mesh", {"closed": True}),
@@ -98,10 +96,7 @@ def main(argv: list[str]) -> None:
     lines = [*common.markdown(("mesh", *heads), measured), ""] if measured else []
     lines += [*common.markdown(("CPU seconds", *_STAGES, "all"), profiles), ""] if profiles else []
     lines += common.markdown(("export", "seconds", "CPU seconds", "MB", "what the program says"), rows)
-    print("\n".join(lines))
-    if _OUT.value:
-        head = ["# Exports", "", *common.provenance(), "", *__doc__.strip().split("\n\n", 2)[2].splitlines(), ""]
-        write_text(_OUT.value, "\n".join([*head, *lines, ""]))
+    print("\n".join([*common.provenance(), "", *lines]))
 
 
 def timed_stages() -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Scores a run that was trained on a capture of the embedded room against its ground truth.
 
     python experiments/room/score_room.py --workdir=W --room=DIR [--step=...] [--rays=256] [--out=FILE] \
-        [--page=docs/results/room.md]
+        [--page=docs/results/captures.md]
 
 For the held-out views near the path ("val") and the far novel views ("test"), prints and writes as JSON:
 

@@ -2,7 +2,7 @@
 
     JAXNERF_SCENES=... python experiments/uncertainty/cleaning.py [--folder=runs/uncertainty] \
         [--scenes=room20,room70,lego8,can,demo] [--limits=1,0.95,0.9,0.8,0.7,0.5,auto] [--views=12] \
-        [--page=docs/results/cleaning.md]
+        [--page=docs/results/uncertainty.md]
 
 It trains what it needs in --folder, see uncertainty_runs.py, and keeps it there. The views of room20 and room70 are
 rendered from the embedded room, so that views that no training view is close to have an exact ground truth, too.

@@ -1,6 +1,6 @@
 """Measures the viewer: frames per second, latency, and what it costs a training.
 
-latency.py --workdirs=runs/demo,runs/lego --train=quickstart --report=docs/results/viewer.md replaces the report.
+latency.py --workdirs=runs/demo,runs/lego --train=quickstart prints the report.
 """
 
 import functools
@@ -30,7 +30,6 @@ import common
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
 from jaxnerf.runtime import cli
-from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.tools.viewer.frame_renderer import FrameCamera, FrameRenderer, frame_image
 from jaxnerf.tools.viewer.render_loop import RenderLoop, Request
 from jaxnerf.training import metric_log
@@ -39,7 +38,6 @@ _WORKDIRS = flags.DEFINE_list("workdirs", [], "The runs to view.")
 _TRAIN = flags.DEFINE_string("train", None, "The config whose training is measured with and without the viewer.")
 _STEPS = flags.DEFINE_integer("steps", 400, "The steps of each training without a browser; 0: none.")
 _SECONDS = flags.DEFINE_float("seconds", 20.0, "The time with and without a browser in turn.")
-_REPORT = flags.DEFINE_string("report", None, "The Markdown file to write.")
 _CLIENT = flags.DEFINE_integer("client", 0, "Internal: acts as a browser on this port that moves its camera.")
 SIDES = (100, 200, 400)  # px
 MESSAGES_PER_SECOND = 20.0  # of a camera that is dragged
@@ -52,15 +50,12 @@ def main(argv):
     del argv
     if _CLIENT.value:
         return _act_as_browser(_CLIENT.value)
-    parts = ["\n".join(["# The viewer in figures", "", *common.provenance(), "", _ABOUT, ""])]
+    parts = ["\n".join([*common.provenance(), "", _ABOUT, ""])]
     parts += [_view(workdir) for workdir in _WORKDIRS.value]
     if _TRAIN.value:
         parts += [_idle_cost(_TRAIN.value)] if _STEPS.value else []
         parts += [_busy_cost(_TRAIN.value)]
-    text = "\n".join(parts)
-    print(text)
-    if _REPORT.value:
-        write_text(_REPORT.value, text)
+    print("\n".join(parts))
 
 
 _ABOUT = f"""The load average at the start was {os.getloadavg()[0]:.1f}. Above the number of cores, other programs

@@ -1,6 +1,6 @@
 """Compares exported web pages, drawn by headless Chromium, with the renderer of jaxnerf-eval.
 
-    python experiments/web/web.py [--runs=demo,lego,fox] [--workdirs=W1,W2] [--size=100] [--out=docs/results/web.md]
+    python experiments/web/web.py [--runs=demo,lego,fox] [--workdirs=W1,W2] [--size=100]
 
 Each of `--runs` is trained to runs/web/NAME unless it is there, by `jaxnerf-train` with the flags of RUNS. Each run is
 exported with `--kind=web`. The first three test views, without their lens, are drawn at the same size by
@@ -35,7 +35,6 @@ from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.types import Camera
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import cli
-from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.tools.exporters.base import export_run
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
@@ -86,11 +85,7 @@ def main(argv: list[str]) -> None:
             )
     heads = ("scene", "MB", "features", "PSNR (dB)", "loss (dB)", "equal to (dB)")
     heads += ("s, page", "s, jaxnerf", "GFLOP", "s, export", "requests")
-    lines = common.markdown(heads, rows)
-    print("\n".join(lines))
-    if _OUT.value:
-        head = ["# Web pages", "", *common.provenance(), "", *__doc__.strip().split("\n\n")[2].splitlines(), ""]
-        write_text(_OUT.value, "\n".join([*head, *lines, ""]))
+    print("\n".join([*common.provenance(), "", *common.markdown(heads, rows)]))
 
 
 def train(name: str) -> None:
@@ -190,5 +185,4 @@ if __name__ == "__main__":
     _WORKDIRS = flags.DEFINE_list("workdirs", [], "Folders of trained runs.")
     _RUNS = flags.DEFINE_list("runs", list(RUNS), "Of RUNS.")
     _SIZE = flags.DEFINE_integer("size", 100, "px, the longer side of what is drawn.")
-    _OUT = flags.DEFINE_string("out", None, "Markdown page; replaces it.")
     cli.run(main)

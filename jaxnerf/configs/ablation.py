@@ -2,7 +2,7 @@
 
 The two networks have equal sizes: half the paper's depth and a fifth of its width. Pixels are eight times as
 large, so the model has an eighth of the samples (their distance in pixels stays the same) and three octaves less.
-Softplus and the learning rate come from lego_small.py. Adam updates all parameters, as in the paper.
+Softplus and the learning rate are those of `lego_small`. Adam updates all parameters, as in the paper.
 """
 
 from jaxnerf.configs import lego_small

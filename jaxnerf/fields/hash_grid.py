@@ -43,7 +43,7 @@ _LEVELS, _FIVE_LEVELS_SIDE = 4, 600
 _ROWS_PER_PIXEL, _MIN_ROWS, _MAX_ROWS = 1311, 2**17, 2**20
 _LARGE_TABLE = 2**19  # rows of a level, from which on an update of the table takes as long as half of the step's rays
 # With fine cells a third layer for the colour costs 7 % of a step's time, with others a quarter
-# (docs/results/thin_matter.md).
+# (docs/results/settings.md).
 _FINE_DEPTH, _DEPTH = 3, 2
 # A larger table and wider networks take little time on an accelerator: each gained 0.3 dB for lego at 800 x 800 on an
 # H200 (docs/guides/accelerators.md).

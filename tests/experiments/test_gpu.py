@@ -1,30 +1,12 @@
-"""The studies of accelerators: what the runbook does without one, its page, the counts of a step, and the packing."""
+"""The studies of accelerators: what the runbook does without one, its page, and the packing."""
 
 import json
 
-import jax
-import jax.numpy as jnp
 import pytest
 
 from studies import study
 
-pack, roofline, runbook = (study(f"gpu/{name}") for name in ("pack", "roofline", "run"))
-
-
-def test_counts_of_products_rows_and_loops():
-    def function(table, rows, kernel):
-        def body(total, _):
-            return total + table[rows] @ kernel, None
-
-        total = jax.lax.scan(body, jnp.zeros((8, 5)), length=3)[0]
-        return table.at[rows].add(1.0), jax.lax.cond(total.sum() > 0, lambda: total @ kernel.T, lambda: total[:, :4])
-
-    arguments = jnp.ones((100, 4)), jnp.zeros(8, int), jnp.ones((4, 5))
-    counts = roofline.count(jax.make_jaxpr(function)(*arguments).jaxpr)
-    assert counts.flops == {"float32": 2 * 8 * 4 * 5 * (3 + 1)}
-    assert (counts.gathered, counts.scattered, counts.conditionals) == (3 * 8, 8, 1)
-    # A row has 16 bytes, and a sector 32. What is gathered is written once, and an addition reads and writes.
-    assert counts.row_bytes == 3 * (8 * 32 + 8 * 16) + 2 * 8 * 32
+pack, runbook = study("gpu/pack"), study("gpu/run")
 
 
 def test_page_has_a_section_for_each_finished_piece():
