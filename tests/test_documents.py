@@ -108,7 +108,16 @@ def defined_flags(files):
 
 PROGRAMS = dict(re.findall(r"^    (jaxnerf-\w+) = ([\w.]+):run$", (ROOT / "setup.cfg").read_text(), re.MULTILINE))
 COMMON = {"help", "config", "plugins", "verbosity", "page"}  # of absl, jaxnerf/runtime/cli.py, experiments/common.py
-FLAGS = {name: COMMON | defined_flags([ROOT / f"{module.replace('.', '/')}.py"]) for name, module in PROGRAMS.items()}
+OF_RUNS = ROOT / "jaxnerf" / "evaluation" / "run_flags.py"  # of several programs
+
+
+def program_flags(module):
+    """Returns the names of the flags of a program."""
+    file = ROOT / f"{module.replace('.', '/')}.py"
+    return COMMON | defined_flags([file, *([OF_RUNS] if "run_flags.define(" in file.read_text() else [])])
+
+
+FLAGS = {name: program_flags(module) for name, module in PROGRAMS.items()}
 ALL_FLAGS = set.union(*FLAGS.values(), defined_flags((ROOT / "experiments").rglob("*.py")))
 
 

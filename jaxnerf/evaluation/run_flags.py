@@ -10,6 +10,11 @@ from jaxnerf.runtime import cli
 if TYPE_CHECKING:
     from jaxnerf.evaluation.trained_run import TrainedRun
 
+MAX_UNCERTAINTY = (  # the help of --max_uncertainty
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
+    "allow; 1, or not given: all cells stay."
+)
+
 flags.disclaim_key_flags()  # a flag defined here belongs to the program that calls
 
 
@@ -72,7 +77,7 @@ def define(done: str, written: str, *, required: bool = False) -> RunFlags:
             "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
             "config.eval.bake_occupancy.",
         ),
-        max_uncertainty=cli.define_max_uncertainty(),
+        max_uncertainty=cli.define_number("max_uncertainty", MAX_UNCERTAINTY),
         uncertainty=flags.DEFINE_string(
             "uncertainty",
             None,

@@ -34,4 +34,4 @@ class TrainedRun(NamedTuple):
     render_image: Callable[..., Rendering]
     variables_of: Callable[[Any, Any], tuple]
     model_with: Callable[..., Model]
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any] = {}

@@ -157,15 +157,9 @@ def define_count(name: str, help: str) -> flags.FlagHolder:
     return flags.DEFINE(_Count(), name, None, help)
 
 
-def define_max_uncertainty() -> flags.FlagHolder:
-    """Defines --max_uncertainty, "auto" or a number; None when it is not given."""
-    return flags.DEFINE(
-        _Number(),
-        "max_uncertainty",
-        None,
-        "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training "
-        "rays allow; 1 or not given: none is.",
-    )
+def define_number(name: str, help: str) -> flags.FlagHolder:
+    """Defines a flag that is "auto" or a number; None when it is not given."""
+    return flags.DEFINE(_Number(), name, None, help)
 
 
 def use_data(config, data_dir: str | None, format: str | None = None):

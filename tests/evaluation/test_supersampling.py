@@ -57,12 +57,7 @@ def test_a_small_frame_is_the_mean_of_a_large_one(trained, tmp_path, capsys):
     file.write_text(json.dumps({"frames": [{"transform_matrix": matrix.tolist()}]}))
     images = {}
     for name, scale, most in (("whole", 1, 16), ("small", 4, 16), ("point", 4, 1)):
-        options = {
-            "width": int(width) // scale,
-            "height": int(height) // scale,
-            "max_rays_per_pixel": most,
-            "overwrite": True,
-        }
+        options = {"width": int(width) // scale, "height": int(height) // scale, "max_rays_per_pixel": most}
         folder, *_ = render_path(workdir, path=str(file), name=name, video="none", overwrite=True, **options)
         images[name] = iio.imread(folder / "color" / "0000.png") / 255
         text = capsys.readouterr().err

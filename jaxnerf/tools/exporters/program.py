@@ -9,6 +9,7 @@ import sys
 
 from absl import flags
 
+from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
 from jaxnerf.tools.exporters.registration import EXPORTERS
 
@@ -18,7 +19,7 @@ _KIND = flags.DEFINE_string(
 )
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is exported.")
-_MAX_UNCERTAINTY = cli.define_max_uncertainty()
+_MAX_UNCERTAINTY = cli.define_number("max_uncertainty", run_flags.MAX_UNCERTAINTY)
 _RESOLUTION = flags.DEFINE_integer("resolution", 256, "mesh: the voxels along the longest side of the box.")
 _BOX = flags.DEFINE_list(
     "box",
