@@ -131,8 +131,8 @@ def _reference_config():
 
 def run():
     """Runs the program."""
-    cli.use_saved_config(only_for_fields=True)
-    cli.run(main, stopped="between two views; the same command continues from there")
+    prepare = functools.partial(cli.with_saved_config, only_for_fields=True)
+    cli.run(main, prepare=prepare, stopped="between two views; the same command continues from there")
 
 
 if __name__ == "__main__":

@@ -20,8 +20,13 @@ class Gone(NamedTuple):
     instead: str
 
 
-RENAMED: dict[str, str] = {}  # "section.option" -> its name now
+RENAMED: dict[str, str] = {"data.fingerprint": "fingerprint"}  # "section.option" -> its name now
+_DROP = "use the version that wrote it"
+_REFLECTIONS = Gone((False,), Changes.TRAINING | Changes.IMAGES, _DROP)
+_LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")
 GONE: dict[str, Gone] = {  # by "section.option"
+    **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
+    **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
     "eval.max_uncertainty": Gone(
         (1.0,),
         Changes.IMAGES,
