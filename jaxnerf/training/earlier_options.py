@@ -27,6 +27,11 @@ _LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")
 GONE: dict[str, Gone] = {  # by "section.option"
     **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
+    "eval.max_uncertainty": Gone(
+        (1.0,),
+        Changes.IMAGES,
+        "set it to 1 in config.json, and give --max_uncertainty to jaxnerf-eval, jaxnerf-render and jaxnerf-export",
+    ),
 }
 
 
