@@ -134,6 +134,14 @@ READERS = Registry(
 )
 
 
+def checked_options(function: str, options: type[Options] | None) -> type[Options] | None:
+    """Returns the class of options of a part; ValueError, with the name of the register function, if it is none."""
+    is_class = isinstance(options, type) and issubclass(options, Options) and "__dataclass_fields__" in vars(options)
+    if options is not None and not is_class:
+        raise ValueError(f"{function}: options is {options!r}, expected a frozen dataclass that inherits from Options")
+    return options
+
+
 def register_field(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
     """Registers a field under a name for the config's `field`.
 
@@ -147,7 +155,7 @@ def register_field(name: str, make: Callable[..., Any], *, options: type[Options
     Raises:
         ValueError: if another field has that name, or if `options` is no such class.
     """
-    FIELDS.add(name, Part(make, _checked_options("register_field", options)))
+    FIELDS.add(name, Part(make, checked_options("register_field", options)))
 
 
 def register_sampler(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
@@ -161,7 +169,7 @@ def register_sampler(name: str, make: Callable[..., Any], *, options: type[Optio
     Raises:
         ValueError: if another sampler has that name, or if `options` is no such class.
     """
-    SAMPLERS.add(name, Part(make, _checked_options("register_sampler", options)))
+    SAMPLERS.add(name, Part(make, checked_options("register_sampler", options)))
 
 
 def register_loss(
@@ -215,14 +223,6 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
 def needs_folder(format: str) -> bool:
     """Returns whether datasets of a format, or of "auto", lie in a folder, unlike the embedded scene."""
     return is_auto(format) or READERS.get(format).views is None
-
-
-def _checked_options(function, options):
-    """Returns the class of options of a part; ValueError if it is none."""
-    is_class = isinstance(options, type) and issubclass(options, Options) and "__dataclass_fields__" in vars(options)
-    if options is not None and not is_class:
-        raise ValueError(f"{function}: options is {options!r}, expected a frozen dataclass that inherits from Options")
-    return options
 
 
 def _never(folder):

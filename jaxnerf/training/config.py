@@ -138,8 +138,8 @@ def read_config(config: Config) -> RunConfig:
     refuse(left, "--config.")
     record = content.pop("fingerprint", "")
     kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
-    top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "")
-    parts = {name: read(kind, _section(content, name), f"{name}.") for name, kind in kinds.items()}
+    top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "config.")
+    parts = {name: read(kind, _section(content, name), f"config.{name}.") for name, kind in kinds.items()}
     losses = {name: _read_weight(name, weight) for name, weight in _section(content, "losses").items()}
     plugins = {name: _read_plugin(name, section) for name, section in {**top.plugins, **content}.items()}
     fingerprint = "" if is_auto(record) else record  # a run that was converted without its dataset has "auto"
@@ -168,11 +168,7 @@ def to_config_dict(config: RunConfig) -> ConfigDict:
 def auto_fields(config: Config) -> list[str]:
     """Returns the dotted names of the options that are still "auto"; for some "auto" is a value like any other."""
     config = read_config(config)
-    values = {
-        name
-        for name, option_, _, _ in declared(config)
-        if option_.late or not (option_.auto or name.startswith("losses."))
-    }
+    values = {name for name, option_, _, _ in declared(config) if not (option_.auto or name.startswith("losses."))}
     return [name for name, value in flatten(config.to_dict()).items() if is_auto(value) and name not in values]
 
 
@@ -235,7 +231,7 @@ def identity(config: RunConfig) -> str:
 
 def _read_weight(name, weight):
     declaration = weight_option(name)._replace(auto=is_auto(weight))  # a loss that is not registered may have "auto"
-    return read_value(declaration, Schedule, weight, f"losses.{name}")
+    return read_value(declaration, Schedule, weight, f"config.losses.{name}")
 
 
 def _is_section(kind):
@@ -260,7 +256,7 @@ def _read_plugin(name, section):
         raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
     if part is None or part.options is None:
         return {field: as_tuples(value) for field, value in section.items()}
-    return read(part.options, {**values_of(part.options()), **section}, f"{name}.")
+    return read(part.options, {**values_of(part.options()), **section}, f"config.{name}.")
 
 
 def _check(config):
