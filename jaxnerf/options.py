@@ -73,7 +73,6 @@ class Option(NamedTuple):
     range: Range | None
     choices: tuple[str, ...]
     auto: bool
-    late: bool
     changes: Changes | None
     check: Callable[[Any], str | None] | None
     protocol: bool
@@ -88,7 +87,6 @@ def option(
     range: Range | None = None,
     choices: tuple[str, ...] = (),
     auto: bool = False,
-    late: bool = False,
     changes: Changes | None = None,
     check: Callable[[Any], str | None] | None = None,
     protocol: bool = False,
@@ -105,13 +103,12 @@ def option(
         range: of a number.
         choices: all values of a text; empty: any.
         auto: whether the value may be "auto", which `Options.resolve` or `Options.resolve_for_device` replaces.
-        late: whether "auto" stays in the config instead, as the value is inferred for each checkpoint.
         changes: what depends on the value; None: as the class says in `Options.changes`.
         check: value -> what is expected in place of it, or None where the value is right. For tuples.
         protocol: whether an evaluation records the value, as it determines which images are compared.
         max_int: the largest whole number.
     """
-    declared = Option(help, unit, range, tuple(choices), auto, late, changes, check, protocol, max_int)
+    declared = Option(help, unit, range, tuple(choices), auto, changes, check, protocol, max_int)
     return dataclasses.field(default=default, metadata={"option": declared})
 
 
@@ -127,7 +124,7 @@ class Facts(NamedTuple):
         side: px, that of a square image with as many pixels as an image has, the mean over the images.
         footprint: world units that a pixel covers at the point that the cameras look at.
         footprint_spread: side of the largest pixels' footprint over that of the smallest, at what each view shows, for
-            all but the outermost twentieths of the views, and for all sizes that training draws from.
+            all but the outermost twentieths of the views.
         num_observations: of sparse points that at least two views show; 0 unless the run can use them.
         has_alpha: whether alpha bounds the scene.
         mean_alpha: of the pixels; 1 without alpha.

@@ -24,9 +24,16 @@ RENAMED: dict[str, str] = {"data.fingerprint": "fingerprint"}  # "section.option
 _DROP = "use the version that wrote it"
 _REFLECTIONS = Gone((False,), Changes.TRAINING | Changes.IMAGES, _DROP)
 _LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")
+_SCALES = "write the images at all sizes as experiments/multiscale does"
 GONE: dict[str, Gone] = {  # by "section.option"
+    "data.num_scales": Gone((1,), Changes.TRAINING, _SCALES),
     **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
+    "eval.max_uncertainty": Gone(
+        (1.0,),
+        Changes.IMAGES,
+        "set it to 1 in config.json, and give --max_uncertainty to jaxnerf-eval, jaxnerf-render and jaxnerf-export",
+    ),
 }
 
 
