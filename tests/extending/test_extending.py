@@ -204,7 +204,7 @@ def test_an_estimator(tmp_path):
 def test_the_export_program_restores_a_run_without_a_grid(trained, tmp_path):
     """Its grid is extracted; the second call finds the folder."""
     folder = shutil.copytree(trained, tmp_path / "run")
-    flags = ["--plugins=density_exporter", "--kind=density", "--resolution=16", f"--workdir={folder}"]
+    flags = ["--plugins=density_exporter", "--kind=density", "--num_cells=16", f"--workdir={folder}"]
     path = f"{ROOT / 'tests' / 'extending'}:{ROOT}"
     for code, want in ((0, "exports/density-20/density.npz"), (1, "exists already; give --overwrite")):
         process = start("export", *flags, PYTHONPATH=path)
