@@ -150,7 +150,7 @@ def _row(steps):
     parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
     rays, started = experiment.config.train.batch_size, time.perf_counter()
     size = experiment.config.train.microbatch_size
-    run, state, data = devices.compile_step(step, state, data, batch_size=rays, microbatch_size=size, mode="sharded")
+    run, state, data = devices.compile_step(step, state, data, batch_size=rays, microbatch_size=size)
     compile_seconds, taken = time.perf_counter() - started, []
     for _ in range(steps):
         started = time.perf_counter()

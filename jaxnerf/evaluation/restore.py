@@ -11,9 +11,9 @@ from jaxnerf.core.types import Rays, Rendering, SceneFn
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
+from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.options import Changes, changing, is_auto, replaced
-from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints

@@ -21,7 +21,12 @@ class Gone(NamedTuple):
 
 
 RENAMED: dict[str, str] = {}  # "section.option" -> its name now
-GONE: dict[str, Gone] = {}  # by "section.option"
+GONE: dict[str, Gone] = {  # by "section.option"
+    "train.beta1": Gone((0.9,), Changes.TRAINING, "Adam's first moment always decays by 0.9; leave it out"),
+    "train.max_nonfinite": Gone((20,), Changes.NOTHING, "a run fails after 20 such steps in a row; leave it out"),
+    "train.parallel": Gone(("auto",), Changes.SPEED, "CUDA_VISIBLE_DEVICES limits the devices; leave it out"),
+    "train.steps_per_dispatch": Gone(("auto",), Changes.SPEED, "the device determines it; leave it out"),
+}
 
 
 def in_todays_names(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -20,7 +20,7 @@ def test_the_compiled_step_sums_the_gradient_and_four_numbers():
     data = random_rays(0, (16,)), jnp.array([-1])
     step = make_train_step(model, optax.sgd(0.1), toy_draw, LOSSES)
     state = create_state(model, optax.sgd(0.1), 0)
-    run, _, _ = devices.compile_step(step, state, data, batch_size=16, mode="sharded")
+    run, _, _ = devices.compile_step(step, state, data, batch_size=16)
     size, count = scaling.collective_bytes(run.compiled.as_text())
     assert size == scaling.gradient_bytes(2 * 9) and count >= 1
 
