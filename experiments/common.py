@@ -181,7 +181,7 @@ def compile_step(config, views=None) -> Step:
     valid, data = experiment.prepare(views)
     state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
     parts = experiment.model, experiment.optimizer, experiment.draw, experiment.losses
-    step = make_train_step(*parts, patches=experiment.draw_patches, pixel_rays=experiment.pixel_rays)
+    step = make_train_step(*parts, pixel_rays=experiment.pixel_rays)
     positions = jnp.asarray(split_positions(config.train.batch_size, 1, config.train.microbatch_size)[0])
 
     def count_flops():

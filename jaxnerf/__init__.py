@@ -10,7 +10,12 @@ import typing as _typing
 
 import jaxnerf.runtime.quiet_start as _quiet_start  # noqa: F401
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, pixel_radius, project, rays_from_pixels, undistort
-from jaxnerf.core.encoding import frustum_variance, integrated_encoding, positional_encoding
+from jaxnerf.core.encoding import (
+    frustum_variance,
+    integrated_directional_encoding,
+    integrated_encoding,
+    positional_encoding,
+)
 from jaxnerf.core.losses import distortion_loss
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
 from jaxnerf.core.normals import density_normals
@@ -23,7 +28,6 @@ from jaxnerf.core.occupancy.grid import (
 )
 from jaxnerf.core.occupancy.packed import render_packed
 from jaxnerf.core.poses import look_at, se3_exponential, turntable
-from jaxnerf.core.reflections import integrated_directional_encoding
 from jaxnerf.core.rendering import (
     points_on_rays,
     render_hierarchical,

@@ -3,6 +3,8 @@
 `python -m jaxnerf.eval` is the same program. It writes DIR/eval/STEP/results.json, or DIR/results.json.
 """
 
+import functools
+
 from absl import flags
 
 from jaxnerf.runtime import cli
@@ -166,8 +168,8 @@ def _reference_config():
 
 def run():
     """Runs the program."""
-    cli.use_saved_config(only_for_fields=True)
-    cli.run(main, stopped="between two views; the same command continues from there")
+    prepare = functools.partial(cli.with_saved_config, only_for_fields=True)
+    cli.run(main, prepare=prepare, stopped="between two views; the same command continues from there")
 
 
 if __name__ == "__main__":

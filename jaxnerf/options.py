@@ -137,7 +137,6 @@ class Facts(NamedTuple):
         contracted: whether the box holds all of space.
         contraction_reason: why.
         sampler: the name of the run's sampler.
-        predicts_normals: whether the run's field predicts normals.
         large_field: whether an update of the field's parameters takes as long as half of a step's rays.
         factor: by which the images were downscaled.
         trains_cameras: whether the run trains parameters of the training images.
@@ -159,7 +158,6 @@ class Facts(NamedTuple):
     contracted: bool = False
     contraction_reason: str = ""
     sampler: str = ""
-    predicts_normals: bool = False
     large_field: bool = False
     factor: int = 1
     trains_cameras: bool = False
@@ -318,7 +316,7 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
     Args:
         kind: the part's class of options.
         values: of all options, by name; lists become tuples.
-        prefix: of the names in messages, such as "train.".
+        prefix: of the flags in messages, such as "config.train.".
 
     Raises:
         ValueError: names the option, its value and what is expected, or the option that is missing or unknown.
@@ -326,18 +324,18 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
     known = declarations(kind)
     missing, unknown = [name for name in known if name not in values], sorted(set(values) - set(known))
     if missing:
-        raise ValueError(f"--config.{prefix}{missing[0]} is missing; restore the config, or set it")
+        raise ValueError(f"--{prefix}{missing[0]} is missing; restore the config, or set it")
     if unknown:
-        raise ValueError(f"--config.{prefix}{unknown[0]} is no field, expected one of {sorted(known)}")
+        raise ValueError(f"--{prefix}{unknown[0]} is no field, expected one of {sorted(known)}")
     return kind(**{name: read_value(*known[name], values[name], f"{prefix}{name}") for name in known})
 
 
-def read_value(declared: Option, kind: Any, value: Any, name: str) -> Any:
-    """Returns the value of one option, with tuples in place of lists; ValueError where it is none."""
+def read_value(declared: Option, kind: Any, value: Any, flag: str) -> Any:
+    """Returns the value of one option, with tuples in place of lists; ValueError, with its flag, where it is none."""
     value = as_tuples(value)
 
     def refuse(expected):
-        raise ValueError(f"--config.{name} is {short_repr(value)}, expected {expected}; correct it")
+        raise ValueError(f"--{flag} is {short_repr(value)}, expected {expected}; correct it")
 
     if is_auto(value) and (declared.auto or AUTO in declared.choices):
         return value

@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from jaxnerf.options import Facts, Options, Schedule
+from jaxnerf.options import Facts, Options, Schedule, is_auto
 
 
 class Part(NamedTuple):
@@ -30,7 +30,7 @@ class Loss(NamedTuple):
 
     Attributes:
         function: see `register_loss`.
-        on: "renderings", "patches", "surfaces", "params" or "field", see `register_loss`.
+        on: "renderings", "params" or "field", see `register_loss`.
         needs: the optional fields of Batch that it reads.
         weight: where the config sets none; "auto" needs `infer`.
         infer: (facts) -> the weight in place of "auto", and the line that reports it, or "".
@@ -49,12 +49,14 @@ class Reader(NamedTuple):
     """A reader of one dataset format.
 
     Attributes:
-        read: folder -> Capture.
+        read: folder -> Capture, see `register_reader`.
         detect: folder -> whether the folder holds this format.
+        views: (DataOptions, split) -> Views, of a dataset without a folder; `read` is not called then.
     """
 
     read: Callable[..., Any]
     detect: Callable[..., bool]
+    views: Callable[..., Any] | None = None
 
 
 class Registry:
@@ -116,10 +118,6 @@ LOSSES = Registry(
         "distortion": "jaxnerf.training.losses:DISTORTION",
         "depth": "jaxnerf.training.losses:DEPTH",
         "opaque": "jaxnerf.training.losses:OPAQUE",
-        "near_opacity": "jaxnerf.training.losses:NEAR_OPACITY",
-        "depth_smoothness": "jaxnerf.training.losses:DEPTH_SMOOTHNESS",
-        "normals": "jaxnerf.training.losses:NORMALS",
-        "hash_decay": "jaxnerf.fields.hash_grid:HASH_DECAY",
         "total_variation": "jaxnerf.fields.hash_grid:TOTAL_VARIATION",
     },
 )
@@ -131,8 +129,17 @@ READERS = Registry(
         "transforms": "jaxnerf.data.readers.transforms:READER",
         "colmap": "jaxnerf.data.readers.colmap:READER",
         "llff": "jaxnerf.data.readers.llff:READER",
+        "synthetic": "jaxnerf.data.synthetic:READER",
     },
 )
+
+
+def checked_options(function: str, options: type[Options] | None) -> type[Options] | None:
+    """Returns the class of options of a part; ValueError, with the name of the register function, if it is none."""
+    is_class = isinstance(options, type) and issubclass(options, Options) and "__dataclass_fields__" in vars(options)
+    if options is not None and not is_class:
+        raise ValueError(f"{function}: options is {options!r}, expected a frozen dataclass that inherits from Options")
+    return options
 
 
 def register_field(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
@@ -148,7 +155,7 @@ def register_field(name: str, make: Callable[..., Any], *, options: type[Options
     Raises:
         ValueError: if another field has that name, or if `options` is no such class.
     """
-    FIELDS.add(name, Part(make, _checked_options("register_field", options)))
+    FIELDS.add(name, Part(make, checked_options("register_field", options)))
 
 
 def register_sampler(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
@@ -162,7 +169,7 @@ def register_sampler(name: str, make: Callable[..., Any], *, options: type[Optio
     Raises:
         ValueError: if another sampler has that name, or if `options` is no such class.
     """
-    SAMPLERS.add(name, Part(make, _checked_options("register_sampler", options)))
+    SAMPLERS.add(name, Part(make, checked_options("register_sampler", options)))
 
 
 def register_loss(
@@ -180,15 +187,10 @@ def register_loss(
         name: of the loss.
         function: with on="renderings" (outputs, batch) -> [B], one value per ray: `outputs` are the Renderings
             of a step, with weights and samples: a tuple of those that show colours, the final one last, and
-            `outputs["name"]` that of any network. `batch` is a Batch. With on="patches" (outputs, rays) -> [P], one
-            value per patch: the Renderings, without weights and samples, and the Rays [P, 4, 4] of patches of
-            neighbouring pixels, seen from poses between those of the training cameras. With on="surfaces" (scene,
-            normals, samples) -> [N], one value for each of every fourth ray: the scene of the network that images show,
-            its function (x, viewdirs) -> predicted normals, or None, and the `SurfaceSamples` of these rays, at which
-            the function evaluates them. With on="params" (params)
-            -> scalar, where params has an entry for each network. With on="field" None: the run's fields bring the
-            function, see `Field.regularizers`.
-        on: "renderings", "patches", "surfaces", "params" or "field".
+            `outputs["name"]` that of any network. `batch` is a Batch. With on="params" (params) -> scalar, where params
+            has an entry for each network. With on="field" None: the run's fields bring the function, see
+            `Field.regularizers`.
+        on: "renderings", "params" or "field".
         needs: the optional fields of Batch that the function reads, of "image_index", "pixel", "alpha", "depth" and
             "depth_weight". Fields that no loss needs are None. Where one needs a depth, some rays of each batch go
             through observations of the dataset's sparse points, see `draw_batch`.
@@ -198,7 +200,7 @@ def register_loss(
     Raises:
         ValueError: if another loss has that name, or on another value of `on`.
     """
-    if on not in (kinds := ("renderings", "patches", "surfaces", "params", "field")):
+    if on not in (kinds := ("renderings", "params", "field")):
         raise ValueError(f"register_loss: on is {on!r}, expected one of {', '.join(map(repr, kinds))}")
     LOSSES.add(name, Loss(function, on, tuple(needs), weight, help=help))
 
@@ -208,7 +210,8 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
 
     Args:
         name: of the format.
-        read: (folder: Path) -> Capture, see `jaxnerf.extend.Capture`.
+        read: (folder: Path) -> Capture, see `jaxnerf.extend.Capture`. If each split has a file of its own, `read` may
+            ask for `split` by name: the Capture then needs the frames of that split only; None: those of all.
         detect: (folder: Path) -> whether the folder holds this format, for `data.format` "auto"; None: never.
 
     Raises:
@@ -217,12 +220,9 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
     READERS.add(name, Reader(read, detect or _never))
 
 
-def _checked_options(function, options):
-    """Returns the class of options of a part; ValueError if it is none."""
-    is_class = isinstance(options, type) and issubclass(options, Options) and "__dataclass_fields__" in vars(options)
-    if options is not None and not is_class:
-        raise ValueError(f"{function}: options is {options!r}, expected a frozen dataclass that inherits from Options")
-    return options
+def needs_folder(format: str) -> bool:
+    """Returns whether datasets of a format, or of "auto", lie in a folder, unlike the embedded scene."""
+    return is_auto(format) or READERS.get(format).views is None
 
 
 def _never(folder):

@@ -36,8 +36,6 @@ VARIANTS = {
     "distortion 0.003": {"losses.distortion": 0.003},
     "distortion 0.01": {"losses.distortion": 0.01},
     "opaque 0.01": {"losses.opaque": 0.01},
-    "hash_decay 0.1": {"losses.hash_decay": 0.1},
-    "hash_decay 1": {"losses.hash_decay": 1.0},
     "total_variation 0.1": {"losses.total_variation": 0.1},
     "total_variation 1": {"losses.total_variation": 1.0},
     "cells that no view sees may be occupied": {"occupancy.min_views": 0},

@@ -36,9 +36,6 @@ SCENES = {
 PARTS = {
     "total_variation 1": {"losses.total_variation": 1.0},
     "total_variation 10": {"losses.total_variation": 10.0},
-    "depth_smoothness 0.1": {"losses.depth_smoothness": 0.1},
-    "depth_smoothness 1": {"losses.depth_smoothness": 1.0},
-    "near_opacity 0.1": {"losses.near_opacity": 0.1},
     "distortion 0.01": {"losses.distortion": 0.01},
 }
 NONE, WHOLE = "none", "few_views"

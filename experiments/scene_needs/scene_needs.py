@@ -35,15 +35,7 @@ def view_dependence(config, alpha):
     """Colour does not depend on the view direction."""
     del alpha
     names = _sections(config)
-    changes = {f"{name}.use_viewdirs": False for name in names if config[name].use_viewdirs}
-    return changes and changes | reflections(config, None)
-
-
-def reflections(config, alpha):
-    """Colour does not depend on the reflected direction."""
-    del alpha
-    names = [name for name in _sections(config) if config[name].reflections]
-    return {f"{name}.reflections": False for name in names} | ({"losses.normals": 0.0} if names else {})
+    return {f"{name}.use_viewdirs": False for name in names if config[name].use_viewdirs}
 
 
 def coarse_network(config, alpha):
@@ -121,7 +113,6 @@ PARTS = {
     part.__name__: part
     for part in (
         view_dependence,
-        reflections,
         coarse_network,
         frequencies,
         width,

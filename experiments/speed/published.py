@@ -12,12 +12,7 @@ def _entry(name, psnr, seconds, hardware, what, source, kind="published"):
 
 _LEGO, _MEAN = "lego, 800x800", "mean of 8 scenes, 800x800"
 _RERUN = "nerfbaselines README, reruns by one protocol"
-_CORE, _PART_E, _BEFORE = (
-    "one core, 2.5 GHz AVX-512 Xeon",
-    "one run of each, by hand",
-    "measured before the start",
-)
-_LEGO_100 = "lego, 100x100, 13 held-out training views"
+_BY_HAND = "one run of each, by hand"
 
 TRAINING = [
     _entry("NeRF paper", 32.54, 3 * 86400, "not said", _LEGO, "nerf_spec.py; '3 days' by the JaxNeRF README"),
@@ -35,15 +30,6 @@ TRAINING = [
     _entry("3DGS, rerun", 33.31, 366, "not said", _MEAN, _RERUN),
     _entry("Zip-NeRF, rerun", 33.67, 5 * 3600 + 22 * 60, "not said", _MEAN, _RERUN),
 ]
-TRAINING += [
-    _entry(f"{name}, {minutes:g} min", psnr, 60 * minutes, _CORE, _LEGO_100, _PART_E, _BEFORE)
-    for name, points in {
-        "nerf-pytorch, 64+64, 512 rays": {5: 10.8, 12: 16.5},
-        "JaxNeRF, 64+64, 512 rays": {5: 15.3, 12: 18.2},
-        "JaxNeRF, 32+32, 256 rays": {2.5: 17.3, 5: 18.9, 12: 20.6, 25: 21.4, 40: 22.2},
-    }.items()
-    for minutes, psnr in points.items()
-]
 RENDERING = [  # seconds of an 800x800 frame, but where another size is said
     _entry("NeRF, TensorFlow", None, 27.74, "not said", "800x800", "JaxNeRF README"),
     _entry("JaxNeRF", None, 20.77, "1 V100", "800x800", "JaxNeRF README"),
@@ -52,10 +38,8 @@ RENDERING = [  # seconds of an 800x800 frame, but where another size is said
     _entry("ngp_pl", None, 1 / 32.4, "2080 Ti", "mean of the scenes' frames a second", "ngp_pl README"),
     _entry("torch-ngp", None, 1 / 7.8, "2080 Ti", "lego", "ngp_pl README"),
     _entry("jaxngp", None, 3.75, "GTX 1080 Ti", "1080p, of 288 frames", "jaxngp README"),
-    _entry("nerf-pytorch", None, 4870, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
-    _entry("JaxNeRF", None, 3840, _CORE, "800x800, extrapolated", _PART_E, _BEFORE),
-    _entry("TensoRF", None, 6.8, "one core, AVX2", "lego, 800x800, trained at 100x100", _PART_E, "measured by hand"),
-    _entry("OpenSplat", None, 0.6, "one core, AVX2", "lego, 800x800, trained at 100x100", _PART_E, "measured by hand"),
+    _entry("TensoRF", None, 6.8, "one core, AVX2", "lego, 800x800, trained at 100x100", _BY_HAND, "measured by hand"),
+    _entry("OpenSplat", None, 0.6, "one core, AVX2", "lego, 800x800, trained at 100x100", _BY_HAND, "measured by hand"),
 ]
 
 # Peers on one core of a machine with AVX2, process CPU seconds, one run each, by hand: TensoRF (VM decomposition, grid
@@ -71,7 +55,7 @@ PEERS = {
 _LEGO_25, _MIC, _MIC_25 = "lego, 800x800, 25 test views", "mic, 800x800", "mic, 800x800, 25 test views"
 _PER_IMAGE = "nerfbaselines, results of each image"
 _TABLE = "nerfbaselines, table of November 2025"
-_BY_HAND, _AVX2, _TWO_CORES = "one run of each, by hand", "one core, AVX2, CPU s", "two busy cores, AVX-512, CPU s"
+_AVX2, _TWO_CORES = "one core, AVX2, CPU s", "two busy cores, AVX-512, CPU s"
 
 # Beside the benchmark, with the entries of TRAINING for the same images.
 BENCHMARK = [

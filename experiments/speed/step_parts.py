@@ -18,7 +18,6 @@ from typing import Any
 
 import common
 import jax
-from speed.step import field_flops
 
 # The first entry whose file, and function if one is given, is in an operation's call stack names its part.
 _PARTS = (
@@ -189,3 +188,17 @@ def table(kept: dict[str, Any]) -> list[str]:
 
 def _fraction(result):
     return f"{result['network_gflop'] / result['parts']['networks'] * 1e3 / result['gflops']:.0%}"
+
+
+def field_flops(params) -> int:
+    """Returns the FLOPs of one sample: twice the multiply-adds of its matrix products and interpolations.
+
+    The bottleneck is not among them: it is multiplied with the next layer once for all samples.
+    """
+    sizes = [
+        leaf.size
+        for path, leaf in jax.tree.leaves_with_path(params)
+        if leaf.ndim == 2 and not {"table", "bottleneck"} & {part.key for part in path}
+    ]
+    corners = 8 * params["kernel"].shape[0] if "table" in params else 0
+    return 2 * (sum(sizes) + corners)

@@ -1,4 +1,4 @@
-"""A scene of 3 to 12 images: capture.py with regularizers of its density and depth."""
+"""A scene of 3 to 12 images: capture.py with regularizers."""
 
 from jaxnerf.configs import capture
 
@@ -8,7 +8,6 @@ def get_config():
     config = capture.get_config()
     # So few pixels do not fill larger tables, which train longer. A third layer was not measured with them.
     config.hash_grid.table_size, config.hash_grid.view_depth = 2**17, 2
-    config.losses.total_variation, config.losses.depth_smoothness, config.losses.near_opacity = 1.0, 0.1, 0.1
-    config.losses.distortion = "auto"
+    config.losses.total_variation, config.losses.distortion = 1.0, "auto"
     config.train.max_seconds, config.train.table_momentum = 300.0, True
     return config

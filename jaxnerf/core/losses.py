@@ -12,10 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnerf.core.types import Batch, PackedSamples, Rays, Rendering, Samples, check_shapes
+from jaxnerf.core.types import Batch, PackedSamples, Rendering, Samples, check_shapes
 from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
-
-_CLOSE = 0.2  # of a ray between near and far, which counts as close to its camera
 
 
 def squared_error(rendering: Rendering, batch: Batch) -> Float[Array, "*batch"]:
@@ -195,73 +193,6 @@ def opaque_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*ba
         [B] in [0, 1].
     """
     return jnp.asarray(batch.alpha) * (1 - outputs[-1].opacity) ** 2
-
-
-def near_opacity_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
-    """Computes the last rendering's opacity close to the cameras, where few views leave fog (after arXiv:2303.07418).
-
-        sum_k w_k max(0, 1 - s_k / 0.2)
-
-    s_k is the position of a sample as in `distortion_loss`: 0 at near and 1 at far. FreeNeRF's occlusion regularizer is
-    the mean density of the first samples of a ray; weights have no unit, and a linear cutoff no edge.
-
-    Args:
-        outputs: Renderings [B] with samples; those of a packed rendering may be PackedSamples.
-        batch: Batch [B], for near and far of its rays.
-
-    Returns:
-        [B] in [0, 1]; 0 where near equals far.
-
-    Raises:
-        ValueError: if the last rendering carries no samples.
-    """
-    rendering, rays = outputs[-1], batch.rays
-    samples = _samples("near_opacity_loss", rendering)
-    near, far = jnp.asarray(rays.near), jnp.asarray(rays.far)
-    packed = isinstance(samples, PackedSamples)
-    if packed:
-        ray, shape, used, weights = samples.ray_index, near.shape, samples.used, samples.weights
-        first, last = near.reshape(-1)[ray], far.reshape(-1)[ray]
-    else:
-        check_shapes(
-            "near_opacity_loss", weights=(rendering.weights, "... S"), t=(samples.t, "... S"), near=(near, "...")
-        )
-        used, weights, first, last = ~(samples.delta <= 0), rendering.weights, near[..., None], far[..., None]
-    s, _ = _fractions(samples.t, samples.delta, used, first, last, samples.rule)
-    closeness = jnp.where(last > first, jnp.maximum(1 - s / _CLOSE, 0), 0)
-    values = jnp.where(used, weights, 0) * jax.lax.stop_gradient(closeness)
-    if not packed:
-        return values.sum(axis=-1)
-    return jax.ops.segment_sum(values, ray, near.size, indices_are_sorted=True).reshape(shape)
-
-
-def depth_smoothness_loss(outputs: Sequence[Rendering], rays: Rays) -> Float[Array, "*patches"]:
-    """Computes how much the last rendering's depth varies over patches of neighbouring pixels (after arXiv:2112.00724).
-
-        mean over neighbours i, j in a patch of o_i o_j (s_i - s_j)^2
-
-    s is the expected depth, or disparity where far is infinite, as a fraction of the ray, see `distortion_loss`: the
-    loss has no unit. Unlike RegNeRF's it is weighted by the opacities o, which get no gradient, so that the edge
-    between an object and the background does not count.
-
-    Args:
-        outputs: Renderings [P, H, W] of patches.
-        rays: [P, H, W].
-
-    Returns:
-        [P] in [0, 1]; 0 for patches of one pixel.
-    """
-    rendering, near, far = outputs[-1], jnp.asarray(rays.near), jnp.asarray(rays.far)
-    check_shapes("depth_smoothness_loss", depth=(rendering.depth, "... H W"), near=(near, "... H W"))
-    infinite, start = jnp.isinf(far), jnp.where(near > 0, near, 1)
-    span = jnp.where(infinite | (far <= near), 1, far - near)
-    linear = jnp.where(infinite, 0, rendering.depth - near) / span
-    s = jnp.where(infinite, 1 - jnp.minimum(start * rendering.disparity, 1), linear)
-    opacity = jax.lax.stop_gradient(jnp.asarray(rendering.opacity))
-    down = opacity[..., 1:, :] * opacity[..., :-1, :] * jnp.diff(s, axis=-2) ** 2
-    right = opacity[..., 1:] * opacity[..., :-1] * jnp.diff(s, axis=-1) ** 2
-    (height, width), total = s.shape[-2:], down.sum(axis=(-2, -1)) + right.sum(axis=(-2, -1))
-    return total / max((height - 1) * width + height * (width - 1), 1)
 
 
 def _samples(function, rendering):

@@ -1,15 +1,11 @@
 """Normals of a scene's surfaces: the direction in which its density falls fastest."""
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from jaxnerf.core.rendering import points_on_rays, sample_inputs, segment_lengths
 from jaxnerf.core.safe_math import normalize
-from jaxnerf.core.types import PackedSamples, Rays, Rendering, SceneFn, check_shapes
+from jaxnerf.core.types import SceneFn, check_shapes
 
 # The corners of a tetrahedron at distance 1: four evaluations, where differences along the axes take six.
 _CORNERS = tuple(tuple(sign / 3**0.5 for sign in signs) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)))
@@ -62,99 +58,3 @@ def density_normals(
     levels = jnp.log1p(jnp.minimum(density * repeated(length) / _LEAST_DEPTH, _LARGEST_DEPTH))
     change = levels - levels[:1]  # exactly 0 where all are equal
     return -normalize(jnp.einsum("c...,ca->...a", change, jnp.asarray(_CORNERS, change.dtype)))
-
-
-class SurfaceSamples(NamedTuple):
-    """One sample of each of N rays: that which contributes most to its colour, so that it is at a surface.
-
-    Attributes:
-        x: [N, 1, 3] world units.
-        viewdirs: [N, 1, 3] unit length.
-        weights: [N] compositing weight, 0 for a ray without samples.
-        length: [N] world units, of the interval that the sample stands for.
-        inputs: what the scene asks for there, each [N, 1], or a number.
-    """
-
-    x: Float[Array, "N 1 3"]
-    viewdirs: Float[Array, "N 1 3"]
-    weights: Float[Array, " N"]
-    length: Float[Array, " N"]
-    inputs: dict[str, Num[Array, "..."]]
-
-
-def surface_samples(scene: SceneFn, rays: Rays, rendering: Rendering, *, every: int = 1) -> SurfaceSamples:
-    """Finds the heaviest sample of rays, from a rendering of them that carries its samples.
-
-    Args:
-        scene: that the samples are for.
-        rays: Rays [B].
-        rendering: Rendering [B] with samples.
-        every: only each ray of this number, the first one included.
-
-    Returns:
-        SurfaceSamples of N = ceil(B / every) rays, without gradient. A ray without samples has its near end.
-
-    Raises:
-        ValueError: if the rendering carries no samples.
-    """
-    if rendering.samples is None:
-        raise ValueError("surface_samples: the rendering has no samples, expected those of a training step")
-    rays, rendering = jax.lax.stop_gradient((rays, rendering))
-    find = _heaviest_of_packed if isinstance(rendering.samples, PackedSamples) else _heaviest
-    t, delta, weights = (each[::every] for each in find(rendering, rays))
-    rays = jax.tree.map(lambda leaf: leaf[::every], rays)
-    t = jnp.where(weights > 0, t, rays.near)[:, None]
-    delta = delta[:, None]
-    inputs = sample_inputs("surface_samples", scene, rays, t, delta)
-    length = segment_lengths(delta, rays)[:, 0]
-    return SurfaceSamples(points_on_rays(rays, t), rays.viewdirs[:, None], weights, length, inputs)
-
-
-def _heaviest(rendering, rays):
-    """Returns t, delta and the weight [B] of the heaviest of the samples [B, S]."""
-    samples, weights = rendering.samples, rendering.weights
-    at = weights.argmax(axis=-1, keepdims=True)
-    return [jnp.take_along_axis(each, at, axis=-1)[..., 0] for each in (samples.t, samples.delta, weights)]
-
-
-def _heaviest_of_packed(rendering, rays):
-    """As _heaviest, of PackedSamples."""
-    samples, (count,) = rendering.samples, rays.near.shape
-    options = {"num_segments": count, "indices_are_sorted": True}
-    weights = jnp.where(samples.used, samples.weights, 0)
-    largest = jax.ops.segment_max(weights, samples.ray_index, **options)
-    slots = jnp.where(weights == largest[samples.ray_index], jnp.arange(weights.size), weights.size)
-    first = jax.ops.segment_min(slots, samples.ray_index, **options)
-    chosen = (jnp.asarray(each) for each in (samples.t, samples.delta, weights))
-    return [each.at[first].get(mode="fill", fill_value=0) for each in chosen]
-
-
-def normal_loss(scene: SceneFn, normals: Callable[..., Array] | None, samples: SurfaceSamples) -> Float[Array, " N"]:
-    """Computes how far predicted normals are from those of the density (after arXiv:2112.03907, Eq. 10).
-
-        w |n - n'|^2
-
-    n is that of `density_normals`, with the length of the sample's interval as spacing, n' the predicted one and w the
-    weight of the heaviest sample of a ray, where Ref-NeRF sums over all samples. No gradient flows into the density:
-    it would make the surfaces follow normals that are still wrong.
-
-    Args:
-        scene: of the network that predicts the normals.
-        normals: (x, viewdirs, **inputs) -> [..., S, 3] unit length, see `Field.normals`.
-        samples: SurfaceSamples of N rays.
-
-    Returns:
-        [N] in [0, 4].
-
-    Raises:
-        ValueError: if normals is None.
-    """
-    if normals is None:
-        raise ValueError(
-            "normal_loss: normals is None, expected those that the field predicts; turn on its option reflections, or "
-            "set losses.normals to 0"
-        )
-    x, viewdirs, weights, length, inputs = samples
-    truth = density_normals(scene, x, viewdirs, spacing=jnp.maximum(length, 1e-6)[:, None], **inputs)
-    error = normals(x, viewdirs, **inputs) - jax.lax.stop_gradient(truth)
-    return weights * (error**2).sum(axis=-1)[:, 0]

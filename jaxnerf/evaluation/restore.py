@@ -13,7 +13,8 @@ from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
-from jaxnerf.options import Changes, changing, is_auto, replaced
+from jaxnerf.options import AUTO, Changes, changing, is_auto, replaced
+from jaxnerf.registry import needs_folder
 from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
@@ -126,8 +127,8 @@ def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:
     """Returns the config with another folder of the dataset; None: its own."""
     if not folder:
         return config
-    synthetic = config.data.format == "synthetic"  # it has no folder, so the format is detected
-    return changed(config, {"data.dir": folder, **({"data.format": "auto"} if synthetic else {})})
+    format = config.data.format if needs_folder(config.data.format) else AUTO
+    return changed(config, {"data.dir": folder, "data.format": format})
 
 
 def _with_settings(config, settings):

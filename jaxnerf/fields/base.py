@@ -37,8 +37,6 @@ class Field(NamedTuple):
         regularizers: by the name of a registered loss, the function (params) -> scalar; see `register_loss`.
         color_layers: keys of params: the first layers that serve colour alone; empty: not checked. A field is dead,
             too, if no gradient reaches these layers.
-        normals: (params, x, viewdirs), and what `apply` asks for, -> the normals [..., S, 3] that the field predicts,
-            of unit length, outward; None: it predicts none.
     """
 
     init: Callable[[jax.Array], Any]
@@ -46,7 +44,6 @@ class Field(NamedTuple):
     input_layers: tuple[str, ...] = ()
     regularizers: Mapping[str, Callable[[Any], jax.Array]] = {}
     color_layers: tuple[str, ...] = ()
-    normals: Callable[..., jax.Array] | None = None
 
 
 def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
@@ -59,21 +56,17 @@ def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
     middle = (jnp.asarray(lower) + jnp.asarray(upper)) / 2
     quarter = (jnp.asarray(upper) - jnp.asarray(lower)) / 4
 
-    def evaluate(function, params, x, viewdirs, **options):
+    @functools.wraps(field.apply)
+    def apply(params, x, viewdirs, **options):
         lead = (1,) * (x.ndim - 1)
         center, scale = middle.reshape(*lead, 3), quarter.reshape(*lead, 3)
         for name in ("radius", "length"):
             if name in options:
                 sizes = jnp.minimum(options[name], 1e30)  # infinity times 0 would be NaN
                 options[name] = sizes * contraction.length_scale((x - center) / scale)
-        return function(params, center + scale * contraction.contract((x - center) / scale), viewdirs, **options)
+        return field.apply(params, center + scale * contraction.contract((x - center) / scale), viewdirs, **options)
 
-    @functools.wraps(field.apply)
-    def apply(params, x, viewdirs, **options):
-        return evaluate(field.apply, params, x, viewdirs, **options)
-
-    normals = None if field.normals is None else functools.partial(evaluate, field.normals)
-    return field._replace(apply=apply, normals=normals)
+    return field._replace(apply=apply)
 
 
 def field_scene(field: Field, params: Mapping[str, Any], name: str = "fine", **options: Any) -> SceneFn:
@@ -90,11 +83,6 @@ def field_scene(field: Field, params: Mapping[str, Any], name: str = "fine", **o
     return functools.partial(field.apply, params[name], **options)
 
 
-def field_normals(field: Field, params: Mapping[str, Any], name: str = "fine") -> Callable[..., jax.Array] | None:
-    """Returns the normals that a network predicts, as a function of x and viewdirs; None: it predicts none."""
-    return None if field.normals is None else functools.partial(field.normals, params[name])
-
-
 def needs_of_fields(*fields: Field) -> tuple[str, ...]:
     """Returns all that fields ask for, see `Model.needs`."""
     return tuple(sorted({name for field in fields for name in needs_of(field.apply)}))
@@ -106,7 +94,7 @@ def apply_network(
     x: Float[ArrayLike, "*batch samples 3"],
     viewdirs: Float[ArrayLike, "*batch #samples 3"],
     **inputs: Num[ArrayLike, "..."],
-) -> tuple[Float[Array, "..."], ...]:
+) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
     """Evaluates a network at positions in a layout that suits a CPU's cache.
 
     Rows of features whose length is a multiple of 2 KiB collide in the cache, which slows down each product.
@@ -114,8 +102,7 @@ def apply_network(
     prefers such a batch: it divides products among its processors.
 
     Args:
-        network: its call takes x and viewdirs, and returns [..., S] and [..., S, 3], and any number of further
-            arrays [..., S, 3].
+        network: its call takes x and viewdirs, and returns [..., S] and [..., S, 3].
         params: of the network.
         x: [..., S, 3].
         viewdirs: [..., 1 or S, 3].

@@ -21,7 +21,6 @@ from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector, check_shapes
 from jaxnerf.fields.base import Box, Field, apply_network, infer_prefilter
 from jaxnerf.fields.mlp import Dense
-from jaxnerf.fields.reflections import HELP, NUM_OUTPUTS, reflection_features
 from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
 
@@ -101,7 +100,6 @@ class HashGridOptions(Options):
         128, "outputs of a hidden layer of the colour network; auto: as `width`", range=at_least(1), auto=True
     )
     use_viewdirs: bool = option(True, "whether colour depends on the direction")
-    reflections: bool = option(False, HELP)
     feature_scale: float = option(
         4.0, "features are table entries times this; it scales the table's learning rate", range=POSITIVE
     )
@@ -149,10 +147,6 @@ class HashGridOptions(Options):
         line = f"precision     {dtype} in the layers of the hash grid's networks, for this device"
         return infer(self, compute_dtype=(dtype, line))
 
-    def check(self) -> None:
-        if self.reflections and not self.use_viewdirs:
-            raise ValueError("reflections is True and use_viewdirs False, expected both or neither; correct one")
-
     def bytes_needed(self) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
         table, width, view_width, view_depth = (
@@ -183,7 +177,7 @@ def hash_grid_field(**options: Any) -> Field:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3]) returns density [..., S] in
         1 / world unit, an exponential of at most e^15, and rgb [..., S, 3] in [0, 1], both float32.
         Outside the box the values are those of the nearest point inside. With prefilter, apply asks for the radius
-        [..., 1 or S] of the cone at each sample, too, see `damping`. With reflections the field has normals.
+        [..., 1 or S] of the cone at each sample, too, see `damping`.
 
     Raises:
         ValueError: if the box is empty, or a level has fewer than 2 vertices along its longest side.
@@ -205,7 +199,7 @@ def hash_grid_field(**options: Any) -> Field:
         return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
     def apply(params, x, viewdirs, **inputs):
-        density, rgb, *_ = apply_network(network, params, x, viewdirs, **inputs)
+        density, rgb = apply_network(network, params, x, viewdirs, **inputs)
         return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), color_activation(rgb)
 
     def apply_to_rays(params, x, viewdirs):
@@ -214,18 +208,10 @@ def hash_grid_field(**options: Any) -> Field:
     def apply_to_cones(params, x, viewdirs, *, radius):
         return apply(params, x, viewdirs, radius=jnp.broadcast_to(radius, x.shape[:-1]))
 
-    def normals(params, x, viewdirs, **inputs):
-        inputs = {name: jnp.broadcast_to(value, x.shape[:-1]) for name, value in inputs.items()}
-        return apply_network(network, params, x, viewdirs, **inputs)[2]
-
     color_layers = ("view_0",) if network.view_depth else ("rgb",)
-    regularizers = {
-        name: functools.partial(function, levels=network.levels())
-        for name, function in (("hash_decay", hash_decay), ("total_variation", total_variation))
-    }
+    regularizers = {"total_variation": functools.partial(total_variation, levels=network.levels())}
     scene = apply_to_cones if network.prefilter else apply_to_rays
-    options = {"regularizers": regularizers, "color_layers": color_layers}
-    return Field(init, scene, **options, normals=normals if network.reflections else None)
+    return Field(init, scene, regularizers=regularizers, color_layers=color_layers)
 
 
 def from_options(options: HashGridOptions, box: Box | None) -> Field:
@@ -283,7 +269,6 @@ class HashGrid(linen.Module):
         view_depth: hidden layers of the colour network.
         view_width: features of such a layer.
         use_viewdirs: False: colour does not depend on the direction.
-        reflections: whether colour depends on the reflected direction, too, see `reflection_features`.
         feature_scale: features over table entries. A step reaches few entries, so each should change more.
         prefilter: whether the features of each level are multiplied by its `damping`, which is an input, too.
         compute_dtype: of the inputs of both networks' layers; parameters, interpolation and outputs keep the
@@ -300,7 +285,6 @@ class HashGrid(linen.Module):
     view_depth: int = 2
     view_width: int = 128
     use_viewdirs: bool = True
-    reflections: bool = False
     feature_scale: float = 4.0
     prefilter: bool = False
     compute_dtype: Any = None
@@ -323,11 +307,8 @@ class HashGrid(linen.Module):
         x: Float[ArrayLike, "*batch samples 3"],
         viewdirs: Float[ArrayLike, "*batch #samples 3"],
         radius: Float[ArrayLike, "*batch samples"] | None = None,
-    ) -> tuple[Float[Array, "..."], ...]:
-        """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N].
-
-        With reflections, the predicted normals [..., S, 3] follow.
-        """
+    ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
+        """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N]."""
         shape = x.shape[:-1]
         side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
         place = _stored([(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)])
@@ -347,19 +328,15 @@ class HashGrid(linen.Module):
         hidden = jax.nn.relu(_first_product(kernel, features) + bias[:, None])
         # The logarithm of a density is up to 15, where bfloat16 has steps of 1/16.
         outputs = {"dtype": None if self.compute_dtype is None else table.dtype}
-        size, more = 1 + self.geometry_features, NUM_OUTPUTS if self.reflections else 0
-        geometry = Dense(size + more, name="density", **outputs)(hidden)
-        density, hidden, normals = geometry[0], self._rounded(geometry[1:size]), ()
+        geometry = Dense(1 + self.geometry_features, name="density", **outputs)(hidden)
+        density, hidden = geometry[0], self._rounded(geometry[1:])
         if self.use_viewdirs:
             directions = jnp.broadcast_to(harmonics(viewdirs), (*shape, 9))
             hidden = jnp.concatenate([hidden, self._rounded(directions.reshape(-1, 9).T)])
-        if self.reflections:
-            reflected, *normals = reflection_features(geometry[size:], viewdirs, shape)
-            hidden = jnp.concatenate([hidden, self._rounded(reflected)])
         for layer in range(self.view_depth):
             hidden = jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(hidden))
         rgb = Dense(3, name="rgb", **outputs)(hidden)
-        return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1), *normals
+        return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 
 def vertices(side: Vector, resolution: int) -> tuple[int, int, int]:
@@ -546,21 +523,6 @@ def _first_product_jvp(primals, tangents):
     return product(kernel, features), product(tangents[0], features) + product(kernel, change)
 
 
-def hash_decay(params: Mapping[str, Any], *, levels: Sequence[TableLevel]) -> Float[Array, ""]:
-    """Computes the mean over levels of the mean square of a level's table entries (arXiv:2304.06706, Section 3.2).
-
-    The mean of each level has the same weight, so an entry of a coarse level is pulled towards 0 more strongly than
-    one of a fine level, which fewer samples reach.
-
-    Args:
-        params: of the field.
-        levels: of the table.
-    """
-    table = params["table"]
-    each = [jnp.full(len(level.rows), 1 / len(level.rows)) for level in levels]
-    return jnp.concatenate(each) @ (table**2).mean(axis=-1) / len(levels)
-
-
 def total_variation(params: Mapping[str, Any], *, levels: Sequence[TableLevel]) -> Float[Array, ""]:
     """Computes the mean squared difference of neighbouring vertices' features, summed over axes (arXiv:2112.05131).
 
@@ -583,7 +545,6 @@ def total_variation(params: Mapping[str, Any], *, levels: Sequence[TableLevel]) 
     return total / max(len(dense), 1)
 
 
-HASH_DECAY = Loss(None, on="field", help="mean square of the entries of each level of the hash grid (arXiv:2304.06706)")
 TOTAL_VARIATION = Loss(
     None,
     on="field",

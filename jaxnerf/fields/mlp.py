@@ -13,7 +13,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.encoding import encode_planes, frustum_variance
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
 from jaxnerf.fields.base import Box, Field, apply_network, infer_prefilter
-from jaxnerf.fields.reflections import HELP, NUM_OUTPUTS, reflection_features
 from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Part
 
@@ -46,7 +45,6 @@ class MlpOptions(Options):
         auto=True,
     )
     use_viewdirs: bool = option(True, "whether colour depends on the direction")
-    reflections: bool = option(False, HELP)
     density_activation: str = option("relu", "activation of the density", choices=tuple(sorted(DENSITY_ACTIVATIONS)))
     density_bias: float = option(0.0, "added to the density before its activation")
     compute_dtype: str = option(
@@ -72,8 +70,6 @@ class MlpOptions(Options):
             raise ValueError("compute_dtype is 'float64', which requires the environment's JAX_ENABLE_X64=1")
         if self.prefilter and not is_auto(self.prefilter) and not self.encode:
             raise ValueError("prefilter is True and encode False, which leaves no encoding to average; set one of them")
-        if self.reflections and not self.use_viewdirs:
-            raise ValueError("reflections is True and use_viewdirs False, expected both or neither; correct one")
 
     def bytes_needed(self) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
@@ -91,7 +87,7 @@ def mlp_field(**options: Any) -> Field:
         returns density [..., S] in 1 / world unit and rgb [..., S, 3] in [0, 1], both float32.
         With a key (one, or one per ray) normal noise of that standard deviation is added to the density
         before its activation, the paper's regulariser for real scenes. With prefilter, apply asks for the radius and
-        the length [..., 1 or S] at each sample, too, see `cone_variance`. With reflections the field has normals.
+        the length [..., 1 or S] at each sample, too, see `cone_variance`.
 
     Raises:
         ValueError: if density_activation is unknown.
@@ -117,25 +113,18 @@ def mlp_field(**options: Any) -> Field:
     def apply_to_cones(params, x, viewdirs, *, radius, length, key=None, density_noise=0.0):
         return evaluate(params, x, viewdirs, key, density_noise, radius=radius, length=length)
 
-    def outputs(params, x, viewdirs, **inputs):
-        inputs = {name: jnp.broadcast_to(value, x.shape[:-1]) for name, value in inputs.items()}
-        return apply_network(network, params, x, viewdirs, **inputs)
-
     def evaluate(params, x, viewdirs, key, density_noise, **inputs):
-        density, rgb, *_ = outputs(params, x, viewdirs, **inputs)
+        inputs = {name: jnp.broadcast_to(value, x.shape[:-1]) for name, value in inputs.items()}
+        density, rgb = apply_network(network, params, x, viewdirs, **inputs)
         if key is not None and density_noise:
             density = density + density_noise * normal(key, density.shape)
         return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
 
-    def normals(params, x, viewdirs, **inputs):
-        return outputs(params, x, viewdirs, **inputs)[2]
-
     layers = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
     color_layers = ("view",) if network.use_viewdirs else ("rgb",)
     scene = apply_to_cones if network.prefilter else apply
-    predicted = normals if network.reflections else None
     input_layers = tuple(f"trunk_{layer}" for layer in layers)
-    return Field(init, scene, input_layers, color_layers=color_layers, normals=predicted)
+    return Field(init, scene, input_layers, color_layers=color_layers)
 
 
 def from_options(options: MlpOptions, box: Box | None) -> Field:
@@ -161,7 +150,6 @@ class MLP(linen.Module):
         prefilter: whether the position's encoding is the `integrated_encoding` over the cone at each sample, of the
             variance `cone_variance`, followed by the `damping_of_octaves`; radius and length are inputs, too.
         use_viewdirs: False: colour depends on position alone; there is no bottleneck and no view layer.
-        reflections: whether colour depends on the reflected direction, too, see `reflection_features`.
         density_activation: "relu" or "softplus".
         density_bias: added to the density before its activation.
         compute_dtype: of the layers; the outputs are at least float32.
@@ -176,7 +164,6 @@ class MLP(linen.Module):
     encode: bool = True
     prefilter: bool = False
     use_viewdirs: bool = True
-    reflections: bool = False
     density_activation: str = "relu"
     density_bias: float = 0.0
     compute_dtype: Any = jnp.float32
@@ -188,10 +175,8 @@ class MLP(linen.Module):
         viewdirs: Float[ArrayLike, "*batch #samples 3"],
         radius: Float[ArrayLike, "*batch samples"] | None = None,
         length: Float[ArrayLike, "*batch samples"] | None = None,
-    ) -> tuple[Float[Array, "..."], ...]:
+    ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations.
-
-        With reflections, the predicted normals [..., S, 3] follow.
 
         Arrays inside are [features, N], so that the encoding and all three products of a layer's forward and
         backward pass read memory contiguously. A small network on a CPU gains most from this.
@@ -209,21 +194,17 @@ class MLP(linen.Module):
             inputs = ((encoded,) if joins else ()) + hidden
             hidden = (jax.nn.relu(Dense(self.width, name=f"trunk_{layer}")(*inputs)),)
         dtype = jnp.promote_types(jnp.float32, self.compute_dtype)
-        density, normals = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape), ()
+        density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
         if self.use_viewdirs:
             # The direction is encoded and multiplied once per ray, and broadcast over its samples.
             directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
-            directions = (directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1]),)
-            if self.reflections:
-                outputs = Dense(NUM_OUTPUTS, name="reflection")(*hidden).astype(dtype)
-                reflected, *normals = reflection_features(outputs, viewdirs, shape)
-                directions += (reflected.astype(self.compute_dtype).reshape(-1, *shape),)
+            directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
             bottleneck = Affine(self.width, name="bottleneck")(self.width)
             features = hidden[0].reshape(-1, *shape)
-            view = Dense(self.view_width, name="view")(features, *directions, before=bottleneck)
+            view = Dense(self.view_width, name="view")(features, directions, before=bottleneck)
             hidden = (jax.nn.relu(view).reshape(self.view_width, -1),)
         rgb = Dense(3, name="rgb")(*hidden).astype(dtype)
-        return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1), *normals
+        return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 
 
 class Affine(linen.Module):

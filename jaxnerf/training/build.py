@@ -12,7 +12,7 @@ import optax
 
 from jaxnerf.core.fixed_order import with_fixed_order
 from jaxnerf.core.views import Views
-from jaxnerf.data import dataset, patch_rays, ray_batches
+from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.facts import footprint_radii
 from jaxnerf.data.geometry.free_space import interpolated_depths
@@ -45,7 +45,6 @@ class Experiment(NamedTuple):
         schedule: step -> learning rate.
         load_split: split -> Views.
         draw: (step, positions, TrainData) -> (keys, Batch).
-        draw_patches: (step, count, TrainData) -> (keys, Rays), see `patch_rays.draw_patches`.
         pixel_ids: (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes.
         view_rays: (Views, index, pixels) -> Rays.
         world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
@@ -62,7 +61,6 @@ class Experiment(NamedTuple):
     schedule: Callable[[int], float]
     load_split: Callable[..., Views]
     draw: Callable[..., tuple]
-    draw_patches: Callable[..., tuple]
     pixel_ids: Callable[..., Any]
     view_rays: Callable[..., Any]
     world_depth: Callable[..., Any]
@@ -87,7 +85,7 @@ def build(config: Config) -> Experiment:
     if cameras is not None:
         model = cameras.added_to(model)
     if train.deterministic:
-        model, losses = _in_fixed_order(model, losses, cameras)
+        model = _in_fixed_order(model, losses, cameras)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
     options = {"batching": train.batching, "extras": extras}
@@ -110,10 +108,6 @@ def build(config: Config) -> Experiment:
             **rays_per_side(step, data),
         )
 
-    def draw_patches(step, count, data):
-        common = {"pixel_offset": given.pixel_offset, "ndc": given.ndc, "needs": model.needs}
-        return patch_rays.draw_patches(data.seed, step, data.views, count=count, **common)
-
     def pixel_ids(step, positions, data):
         common = {**options, **rays_per_side(step, data)}
         return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **common)[1]
@@ -125,9 +119,8 @@ def build(config: Config) -> Experiment:
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,
-        load_split=functools.partial(_load_views, given, model.needs),
+        load_split=functools.partial(_load_views, config, model.needs),
         draw=draw,
-        draw_patches=draw_patches,
         pixel_ids=pixel_ids,
         view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc, needs=model.needs)),
         world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=given.ndc)),
@@ -152,7 +145,7 @@ def _pixel_rays(train, cameras, extras):
 
 
 def _in_fixed_order(model, losses, cameras):
-    """Returns a model and losses whose sums have a fixed order."""
+    """Returns a model whose sums have a fixed order."""
     others = {"cameras.exposure or cameras.refine": cameras is not None}
     # The gradient of the depth loss depends on its own sums over rays; those of other losses do not.
     others["losses.depth"] = any(loss.name == "depth" for loss in losses)
@@ -162,10 +155,7 @@ def _in_fixed_order(model, losses, cameras):
             f"train.deterministic is True, and {' and '.join(found)} is on, whose gradient has no fixed order on an "
             "accelerator; set it to False, or turn the other off"
         )
-    losses = tuple(
-        loss._replace(function=with_fixed_order(loss.function)) if loss.on == "surfaces" else loss for loss in losses
-    )
-    return model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view)), losses
+    return model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view))
 
 
 def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) -> Model:
@@ -277,8 +267,9 @@ def load_split(config: Config, split: str | None = None) -> tuple[Views, str, di
         Views; the split's name, which is eval.split where none is given; and the conventions.
     """
     config = read_config(config)
-    data, split = dataset.resolve(config.data)[0], split or config.eval.split
-    return dataset.load_split(data, split), split, dataset.conventions(data)
+    (data, _, capture), split = dataset.resolve(config.data), split or config.eval.split
+    views = dataset.load_split(data, split, capture=capture, fingerprint=config.fingerprint)
+    return views, split, dataset.conventions(data, capture)
 
 
 def check_released(config: RunConfig, origin: str) -> None:
@@ -414,9 +405,9 @@ def _prepare(config, model, extras, views):
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)
 
 
-def _load_views(data, needs, split, **options):
+def _load_views(config, needs, split, **options):
     """Returns the Views of a split; a scene that asks for the image_index gets 0 for views that are not trained on."""
-    views = dataset.load_split(data, split, **options)
+    views = dataset.load_split(config.data, split, fingerprint=config.fingerprint, **options)
     if split == "train" or "image_index" not in needs:
         return views
     return dataclasses.replace(views, image_index=np.zeros(len(views.size), np.int32))

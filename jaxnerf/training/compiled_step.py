@@ -101,7 +101,6 @@ class CompiledStep:
             experiment.draw,
             experiment.losses,
             experiment.cameras,
-            experiment.draw_patches,
             experiment.pixel_rays,
         )
 

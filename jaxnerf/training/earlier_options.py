@@ -20,8 +20,13 @@ class Gone(NamedTuple):
     instead: str
 
 
-RENAMED: dict[str, str] = {}  # "section.option" -> its name now
+RENAMED: dict[str, str] = {"data.fingerprint": "fingerprint"}  # "section.option" -> its name now
+_DROP = "use the version that wrote it"
+_REFLECTIONS = Gone((False,), Changes.TRAINING | Changes.IMAGES, _DROP)
+_LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")
 GONE: dict[str, Gone] = {  # by "section.option"
+    **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
+    **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
     "train.beta1": Gone((0.9,), Changes.TRAINING, "Adam's first moment always decays by 0.9; leave it out"),
     "train.max_nonfinite": Gone((20,), Changes.NOTHING, "a run fails after 20 such steps in a row; leave it out"),
     "train.parallel": Gone(("auto",), Changes.SPEED, "CUDA_VISIBLE_DEVICES limits the devices; leave it out"),

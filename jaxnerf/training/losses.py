@@ -1,18 +1,9 @@
 """The built-in losses of renderings by name: their functions are in `core.losses`."""
 
-from jaxnerf.core.losses import (
-    depth_loss,
-    depth_smoothness_loss,
-    distortion_loss,
-    mse_loss,
-    near_opacity_loss,
-    opaque_loss,
-)
-from jaxnerf.core.normals import normal_loss
+from jaxnerf.core.losses import depth_loss, distortion_loss, mse_loss, opaque_loss
 from jaxnerf.registry import Loss
 
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
-_NORMALS_WEIGHT = 0.01  # where a field predicts normals
 _DEPTH_WEIGHT = ((0, 0.1), (1000, 0.0))  # of the depth loss: between points the depth is a guess, so it ends
 
 
@@ -28,12 +19,6 @@ def _weight_of_distortion(facts):
     weight = 0.01 if bounded else 0.001
     where = "a box bounds the scene" if bounded else "the scene is seen as far as it reaches"
     return weight, f"distortion    weight {weight:g}, as {where}"
-
-
-def _weight_of_normals(facts):
-    if not facts.predicts_normals:
-        return 0.0, ""
-    return _NORMALS_WEIGHT, "normals       those that the field predicts are tied to the gradient of its density"
 
 
 MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over all renderings")
@@ -52,20 +37,3 @@ DEPTH = Loss(
     "arXiv:2107.02791); auto: at the start of training where space is contracted and there are such points",
 )
 OPAQUE = Loss(opaque_loss, needs=("alpha",), help="squared transmittance of rays where the image is opaque")
-NEAR_OPACITY = Loss(
-    near_opacity_loss, help="opacity in the first fifth of a ray between near and far; for few views (arXiv:2303.07418)"
-)
-DEPTH_SMOOTHNESS = Loss(
-    depth_smoothness_loss,
-    on="patches",
-    help="squared difference of the depths of neighbouring pixels, seen from poses between the training cameras; for "
-    "few views (arXiv:2112.00724)",
-)
-NORMALS = Loss(
-    normal_loss,
-    on="surfaces",
-    weight="auto",
-    infer=_weight_of_normals,
-    help="squared distance of the normals that a field predicts from those of its density (arXiv:2112.03907, Eq. 10); "
-    "auto: 0.01 where the field predicts normals",
-)

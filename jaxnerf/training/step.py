@@ -9,21 +9,15 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.core.losses import squared_error
-from jaxnerf.core.normals import surface_samples
-from jaxnerf.core.types import Renderings, without_samples
+from jaxnerf.core.types import Renderings
 from jaxnerf.core.views import Views
 from jaxnerf.data import ray_batches
 from jaxnerf.data.active_pixels import PixelRuns
-from jaxnerf.data.patch_rays import in_patches
-from jaxnerf.fields.base import field_normals, field_scene
 from jaxnerf.models.base import Model
 from jaxnerf.training.camera_parameters import CameraParameters, networks
 from jaxnerf.training.dead_networks import count_dead_steps
 from jaxnerf.training.pixel_rays import PixelRays
 from jaxnerf.training.state import PROGRESS, TrainState
-
-_RAYS_PER_SURFACE = 4  # of a batch: a loss of surfaces evaluates the field at one sample of every fourth ray
-_RAYS_PER_PATCH = 64  # of a batch: losses of patches then render a quarter more rays
 
 
 class ProgressData(NamedTuple):
@@ -88,7 +82,6 @@ def make_train_step(
     draw: Callable[..., tuple],
     losses: Sequence[StepLoss],
     cameras: CameraParameters | None = None,
-    patches: Callable[..., tuple] | None = None,
     pixel_rays: PixelRays | None = None,
 ) -> Callable[..., tuple]:
     """Makes the pure training step.
@@ -99,7 +92,6 @@ def make_train_step(
         draw: (step, positions [B], data) -> (keys [B], Batch [B]); see `draw_batch`.
         losses: at least one must be a loss of the renderings.
         cameras: the parameters of the training images; None: none.
-        patches: (step, count, data) -> (keys [B], Rays [B]), see `draw_patches`; for losses of patches.
         pixel_rays: the several rays of a pixel that `draw` then draws; None: each ray is a pixel.
 
     Returns:
@@ -117,30 +109,22 @@ def make_train_step(
         `count_dead_steps`; "num_reinits", which only reinitialization changes; with a grid "rays_dropped",
         the rays that were ignored because some of their samples did not fit into the sample buffer; and "progress"
         if the model asks for it.
-
-    Raises:
-        ValueError: if a loss of patches is given without `patches`.
     """
     ray_losses = [loss for loss in losses if loss.on == "renderings"]
-    patch_losses = [loss for loss in losses if loss.on == "patches"]
-    surface_losses = [loss for loss in losses if loss.on == "surfaces"]
-    if patch_losses and patches is None:
-        names = ", ".join(loss.name for loss in patch_losses)
-        raise ValueError(f"make_train_step: {names} need patches of rays, and patches is None; pass draw_patches")
-    regularizers = [loss for loss in losses if loss.on in ("params", "field")]
+    regularizers = [loss for loss in losses if loss.on != "renderings"]
 
-    def progress_at(step, data):
-        return {PROGRESS: data.progress.at(step)} if PROGRESS in model.needs else {}
-
-    def loss_fn(params, grid, step, keys, batch, views, progress, rays_per_side):
+    def loss_of_rays(params, state, data, positions):
+        """Returns the weighted sum of the losses of the rays at some positions; and sums of what is logged."""
+        keys, batch = draw(state.step, positions, data)
         if cameras is not None:
-            batch = cameras.refined_batch(params, batch, views)
-        renderings = model.render(keys, {**params, **progress}, grid, batch.rays, step)
-        rendered = renderings
+            batch = cameras.refined_batch(params, batch, data.views)
+        given = {**params, **_progress_at(state.step, model, data)}
+        renderings = model.render(keys, given, state.grid, batch.rays, state.step)
         if cameras is not None:
             renderings = cameras.exposed(params, renderings, batch)
         if pixel_rays is not None:
-            renderings = {name: pixel_rays.averaged(each, rays_per_side) for name, each in renderings.items()}
+            side = pixel_rays.side_at(data.progress.at(state.step))
+            renderings = {name: pixel_rays.averaged(each, side) for name, each in renderings.items()}
         renderings = Renderings(renderings, model.image_networks)
         complete = renderings[-1].num_dropped == 0
 
@@ -149,9 +133,7 @@ def make_train_step(
             return jnp.where(complete, values, 0).sum()
 
         parts = {loss.name: total(loss.function(renderings, batch)) for loss in ray_losses}
-        if surface_losses:
-            parts |= at_surfaces({**params, **progress}, batch.rays, rendered, complete)
-        weighted = sum(_scaled(loss.weight(step), parts[loss.name]) for loss in ray_losses + surface_losses)
+        weighted = sum(_scaled(loss.weight(state.step), parts[loss.name]) for loss in ray_losses)
         errors = zip(model.image_networks, renderings, strict=True)
         sums = {f"mse_{name}": total(squared_error(rendering, batch)) for name, rendering in errors}
         sums["rays"] = complete.sum(dtype=jnp.int32)
@@ -159,57 +141,13 @@ def make_train_step(
             sums |= {f"loss_{name}": part for name, part in parts.items()}
         return weighted, sums
 
-    def at_surfaces(params, rays, renderings, complete):
-        """Returns the sums of the losses of surfaces, of as many rays as others are summed over."""
-        name = model.image_networks[-1]
-        field = model.fields[name]
-        scene, normals = field_scene(field, params, name), field_normals(field, params, name)
-        samples = surface_samples(scene, rays, renderings[name], every=_RAYS_PER_SURFACE)
-        counted = complete[::_RAYS_PER_SURFACE]
-        scale = complete.size / counted.size
-        values = {loss.name: loss.function(scene, normals, samples) for loss in surface_losses}
-        return {name: scale * jnp.where(counted, value, 0).sum() for name, value in values.items()}
-
-    def microbatch(state, data, positions):
-        keys, batch = draw(state.step, positions, data)
-        views, progress = None if cameras is None else data.views, progress_at(state.step, data)
-        rays_per_side = None if pixel_rays is None else pixel_rays.side_at(data.progress.at(state.step))
-        (loss, sums), grads = jax.value_and_grad(loss_fn, has_aux=True)(
-            state.params, state.grid, state.step, keys, batch, views, progress, rays_per_side
-        )
+    def sums_and_gradient(state, data, positions):
+        differentiated = jax.value_and_grad(loss_of_rays, has_aux=True)
+        (loss, sums), grads = differentiated(state.params, state, data, positions)
         return {"loss": loss, **sums}, grads
 
-    def regularize(state, metrics, grads):
-        for loss in regularizers:
-            value, gradient = jax.value_and_grad(loss.function)(networks(state.params))
-            weight = loss.weight(state.step)
-            metrics[f"loss_{loss.name}"] = value
-            metrics["loss"] += weight * value
-            grads |= jax.tree.map(lambda a, b, weight=weight: a + weight * b, networks(grads), gradient)
-        return metrics, grads
-
-    def patch_loss_fn(params, grid, step, keys, rays, progress):
-        renderings = model.render(keys, {**params, **progress}, grid, rays, step)
-        renderings = {name: without_samples(rendering) for name, rendering in renderings.items()}
-        renderings, rays = jax.tree.map(in_patches, (renderings, rays))
-        renderings = Renderings(renderings, model.image_networks)
-        complete = (renderings[-1].num_dropped == 0).all(axis=(1, 2))
-        parts = {loss.name: jnp.where(complete, loss.function(renderings, rays), 0).mean() for loss in patch_losses}
-        return sum(_scaled(loss.weight(step), parts[loss.name]) for loss in patch_losses), parts
-
-    def add_patches(state, data, drawn, metrics, grads):
-        """Adds the gradient of the losses of patches; each device computes the same."""
-        keys, rays = patches(state.step, max(drawn // _RAYS_PER_PATCH, 1), data)
-        (value, parts), gradient = jax.value_and_grad(patch_loss_fn, has_aux=True)(
-            networks(state.params), state.grid, state.step, keys, rays, progress_at(state.step, data)
-        )
-        metrics |= {f"loss_{name}": part for name, part in parts.items()}
-        metrics["loss"] += value
-        return metrics, grads | jax.tree.map(jnp.add, networks(grads), gradient)
-
     def train_step(state, data, positions, *, axis_name=None):
-        drawn = positions.size * (1 if axis_name is None else jax.lax.axis_size(axis_name))
-        total = _sum_over_microbatches(lambda part: microbatch(state, data, part), positions)
+        total = _sum_over_microbatches(lambda part: sums_and_gradient(state, data, part), positions)
         if axis_name is not None:
             total = jax.lax.psum(total, axis_name)
         sums, grads = total
@@ -218,33 +156,12 @@ def make_train_step(
         metrics = jax.tree.map(lambda leaf: leaf * scale, sums)
         errors = {name: metrics[f"mse_{name}"] for name in model.image_networks}
         dead = count_dead_steps(state.counters, networks(grads), errors, model.fields, scale)
-        if regularizers or patch_losses:
-            grads, scale = jax.tree.map(lambda leaf: leaf * scale, grads), 1.0
         if regularizers:
-            metrics, grads = regularize(state, metrics, grads)
-        if patch_losses:
-            metrics, grads = add_patches(state, data, drawn, metrics, grads)
+            grads, scale = jax.tree.map(lambda leaf: leaf * scale, grads), 1.0
+            metrics, grads = _regularized(regularizers, state, metrics, grads)
         metrics["grad_norm"] = scale * optax.tree.norm(grads)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
-
-        decay = getattr(data, "decay", None)
-        options = {} if decay is None else {"decay": decay}
-
-        def descend():
-            # The optimizer's own passes over the gradient scale it: a pass more would take long for a large table.
-            mean = jax.tree.map(lambda leaf: leaf * scale, grads)
-            updates, opt_state = optimizer.update(mean, state.opt_state, state.params, **options)
-            return optax.apply_updates(state.params, updates), opt_state
-
-        def selected():
-            return jax.tree.map(
-                lambda new, old: jnp.where(finite, new, old), descend(), (state.params, state.opt_state)
-            )
-
-        # On a CPU a branch: the selection would take about as long as the update itself. On an accelerator it is part
-        # of the update's kernels, and a branch would make the host wait for its condition.
-        branch = functools.partial(jax.lax.cond, finite, descend, lambda: (state.params, state.opt_state))
-        params, opt_state = jax.lax.platform_dependent(cpu=branch, default=selected)
+        params, opt_state = _descend_if(finite, optimizer, state, grads, scale, getattr(data, "decay", None))
         missed = (~finite).astype(jnp.int32)
         counters = {
             **dead,
@@ -254,12 +171,13 @@ def make_train_step(
         }
         grid = state.grid
         if model.grid_schedule is not None:
+            drawn = positions.size * (1 if axis_name is None else jax.lax.axis_size(axis_name))
             counters["rays_dropped"] = state.counters["rays_dropped"] + drawn - rays
             # No ray has this position in the batch, so the key is unused otherwise.
             key = jax.random.fold_in(ray_batches.step_key(data.seed, state.step), 2**32 - 2)
-            now = {**params, **progress_at(state.step, data)}
+            now = {**params, **_progress_at(state.step, model, data)}
             grid = model.grid_schedule.update(key, state.step, now, grid, data.cells, getattr(data, "radii", None))
-        counters |= progress_at(state.step + 1, data)
+        counters |= _progress_at(state.step + 1, model, data)
         state = TrainState(step=state.step + 1, params=params, opt_state=opt_state, grid=grid, counters=counters)
         return state, {**metrics, "rays": rays, **counters}
 
@@ -286,6 +204,11 @@ def repeat_step(train_step: Callable[..., tuple], num_steps: int) -> Callable[..
     return repeated
 
 
+def _progress_at(step, model, data):
+    """Returns the entry "progress" of the parameters at a step; none if the model does not ask for it."""
+    return {PROGRESS: data.progress.at(step)} if PROGRESS in model.needs else {}
+
+
 def _scaled(weight, value):
     """Returns weight * value; a constant weight of 1 adds no operation."""
     return value if isinstance(weight, int | float) and weight == 1 else weight * value
@@ -300,3 +223,33 @@ def _sum_over_microbatches(function, positions):
 
     zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(function, positions[0]))
     return jax.lax.scan(add, zeros, positions)[0]
+
+
+def _regularized(regularizers, state, metrics, grads):
+    """Adds the regularizers' values to the metrics and to the loss, and their gradients."""
+    for loss in regularizers:
+        value, gradient = jax.value_and_grad(loss.function)(networks(state.params))
+        weight = loss.weight(state.step)
+        metrics[f"loss_{loss.name}"] = value
+        metrics["loss"] += weight * value
+        grads |= jax.tree.map(lambda a, b, weight=weight: a + weight * b, networks(grads), gradient)
+    return metrics, grads
+
+
+def _descend_if(finite, optimizer, state, grads, scale, decay):
+    """Returns the parameters and the optimizer's state after an update by scale * grads; if not finite, unchanged."""
+    options = {} if decay is None else {"decay": decay}
+
+    def descend():
+        # The optimizer's own passes over the gradient scale it: a pass more would take long for a large table.
+        mean = jax.tree.map(lambda leaf: leaf * scale, grads)
+        updates, opt_state = optimizer.update(mean, state.opt_state, state.params, **options)
+        return optax.apply_updates(state.params, updates), opt_state
+
+    def selected():
+        return jax.tree.map(lambda new, old: jnp.where(finite, new, old), descend(), (state.params, state.opt_state))
+
+    # On a CPU a branch: the selection would take about as long as the update itself. On an accelerator it is part
+    # of the update's kernels, and a branch would make the host wait for its condition.
+    branch = functools.partial(jax.lax.cond, finite, descend, lambda: (state.params, state.opt_state))
+    return jax.lax.platform_dependent(cpu=branch, default=selected)

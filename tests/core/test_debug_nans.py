@@ -311,10 +311,6 @@ def cases():
         "mlp_field": field(jaxnerf.mlp_field, depth=2, width=16),
         "hash_grid_field": field(
             jaxnerf.hash_grid_field, lower=(-1, -1, -1), upper=(1, 1, 1), table_size=1024, resolutions=(4, 16)),
-        "mlp_field reflections": field(jaxnerf.mlp_field, depth=2, width=16, reflections=True),
-        "hash_grid_field reflections": field(
-            jaxnerf.hash_grid_field, lower=(-1, -1, -1), upper=(1, 1, 1), table_size=1024, resolutions=(4, 16),
-            reflections=True),
         "create_grid": (lambda density: jaxnerf.create_grid(
             jnp.zeros(3), jnp.ones(3), jnp.ones((2, 2, 2), bool), initial_density=density), (numbers((2, 2, 2)),)),
         "render_image": of_rays(render_in_chunks, "soft", rays()),

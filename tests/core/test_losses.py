@@ -13,9 +13,7 @@ import jaxnerf
 from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compiled, full_grid, rays_past_origin
 from jaxnerf.core.losses import (
     depth_loss,
-    depth_smoothness_loss,
     mse_loss,
-    near_opacity_loss,
     opaque_loss,
 )
 from jaxnerf.core.occupancy.grid import is_occupied
@@ -416,40 +414,3 @@ def test_the_opaque_loss_is_the_squared_transmittance_of_opaque_pixels():
     rendering = dataclasses.replace(make_rendering(np.zeros((4, 1)), None, None), opacity=opacity)
     batch = dataclasses.replace(make_batch(np.ones(4), 2.0), alpha=np.float32([1, 1, 1, 0]))
     np.testing.assert_allclose(opaque_loss([rendering], batch), [1, 0.5625, 0, 0])
-
-
-@pytest.mark.parametrize("far, t", [(6.0, [1.0, 1.5, 2.0, 5.0]), (np.inf, [1.0, 1 / 0.9, 1.25, 5.0])])
-def test_opacity_counts_close_to_the_camera(far, t):
-    """Fully at near, half at a tenth of the ray, and not from a fifth on; dense and packed."""
-    weights, t = np.float32([[0.1, 0.2, 0.3, 0.4]]), np.float32([t])
-    batch, delta = make_batch(np.ones(1), far), np.full_like(t, 0.01)
-    expected = 0.1 + 0.2 * 0.5
-    np.testing.assert_allclose(near_opacity_loss([make_rendering(weights, t, delta)], batch), [expected], rtol=1e-5)
-    slots = {"ray_index": np.zeros(4, np.int32), "used": np.array([True, True, True, False])}
-    samples = jaxnerf.PackedSamples(weights=weights[0], t=t[0], delta=delta[0], **slots)
-    packed = dataclasses.replace(make_rendering(*[np.zeros((1, 1), np.float32)] * 3), samples=samples)
-    np.testing.assert_allclose(near_opacity_loss([packed], batch), [expected], rtol=1e-5)
-    assert near_opacity_loss([make_rendering(weights, t, delta)], make_batch(np.ones(1), 1.0)) == 0
-
-
-def patch(depth, opacity, near=2.0, far=6.0):
-    """Returns the smoothness of a patch's depth [H, W]."""
-    depth = jnp.asarray(depth)
-    made = dataclasses.replace(make_rendering(jnp.zeros((*depth.shape, 1)), None, None), depth=depth)
-    made = dataclasses.replace(made, opacity=jnp.broadcast_to(opacity, depth.shape), disparity=1 / depth)
-    return depth_smoothness_loss([made], make_batch(np.full(depth.shape, near), far).rays)
-
-
-def test_the_depth_of_a_patch_is_smooth_where_neighbours_agree():
-    steps = np.float32([[3, 4, 4], [3, 4, 4]])  # two of seven pairs of neighbours are a quarter of the ray apart
-    np.testing.assert_allclose(patch(steps, 1.0), 2 * 0.25**2 / 7, rtol=1e-5)
-    np.testing.assert_allclose(patch(steps, 0.5), 2 * 0.25**2 / 7 / 4, rtol=1e-5)
-    np.testing.assert_allclose(patch(10 * steps, 1.0, 20.0, 60.0), 2 * 0.25**2 / 7, rtol=1e-5)
-    np.testing.assert_allclose(patch(steps, 1.0, far=np.inf), 2 * (2 / 3 - 2 / 4) ** 2 / 7, rtol=1e-5)
-    assert patch(np.full((3, 3), 5.0), 1.0) == 0 and patch(np.float32([[5]]), 1.0) == 0
-
-
-def test_the_smoothness_of_a_patch_has_finite_gradients_where_far_is_infinite():
-    depth = jnp.array([[np.inf, 3.0], [4.0, 5.0]])
-    slope = jax.grad(lambda depth: patch(depth, 1.0, far=np.inf))(depth)
-    assert all_finite(slope) and np.any(slope)

@@ -4,7 +4,6 @@ import math
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from captures import orbit, shoot, write_transforms
@@ -17,20 +16,6 @@ from studies import common, study
 speed = study("speed/speed_vs_error")
 training = study("speed/training")
 step_parts = study("speed/step_parts")
-
-
-def test_the_front_contains_the_points_that_no_other_beats():
-    points = [(3.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 5.0), (1.0, 1.0), (5.0, 4.0)]
-    assert speed.pareto_front(points) == [(1.0, 2.0), (4.0, 5.0)]
-    assert speed.pareto_front([]) == []
-
-
-def test_every_point_is_on_the_front_or_beaten_by_one_that_is():
-    points = [tuple(pair) for pair in np.random.default_rng(0).uniform(size=(200, 2)).tolist()]
-    front = speed.pareto_front(points)
-    assert front == sorted(front) and front == sorted(front, key=lambda point: point[1])
-    for cost, value in points:
-        assert any(a <= cost and b >= value for a, b in front)
 
 
 def test_comparable_seconds_are_those_of_the_reference_machine():
@@ -49,12 +34,6 @@ def test_a_curve_has_medians_where_all_seeds_were_scored():
     runs = {"0": run((1, 20.0), (2, 25.0)), "1": run((1, 22.0)), "2": run((1, 27.0), (2, 21.0))}
     (point,) = training.medians(runs)
     assert point["psnr"] == 22.0 and point["seeds"] == [20.0, 22.0, 27.0]
-
-
-@pytest.mark.parametrize("power", [0.0, 1.0, 2.0])
-def test_the_slope_is_the_power(power):
-    values = [1.0, 2.0, 4.0]
-    assert speed.slope(values, [3 * value**power for value in values]) == pytest.approx(power, abs=1e-9)
 
 
 @pytest.mark.parametrize("step, ended", [(5, False), (7, True)])

@@ -15,7 +15,6 @@ from jaxnerf.fields.hash_grid import (
     color_activation,
     damping,
     harmonics,
-    hash_decay,
     hash_grid_field,
     interpolate,
     total_variation,
@@ -419,14 +418,6 @@ def test_a_table_of_another_shape_is_named():
 
 
 LEVELS = (TableLevel((2, 3, 2), range(12)), TableLevel((4, 4, 4), range(12, 32)), TableLevel((3, 2, 2), range(32, 44)))
-
-
-def test_hash_decay_weights_all_levels_alike():
-    table = np.float32(np.random.default_rng(0).normal(size=(44, 2)))
-    value, slope = jax.value_and_grad(lambda table: hash_decay({"table": table}, levels=LEVELS))(table)
-    each = [table[level.rows.start : level.rows.stop] for level in LEVELS]
-    np.testing.assert_allclose(value, np.mean([(part**2).mean() for part in each]), rtol=1e-5)
-    np.testing.assert_allclose(slope, np.concatenate([2 * part / part.size / 3 for part in each]), rtol=1e-5)
 
 
 def test_total_variation_compares_neighbours_in_levels_that_are_not_hashed():

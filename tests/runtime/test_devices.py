@@ -1,5 +1,7 @@
 """jit on one device and sharded jit on four: the same run."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,6 +111,17 @@ def test_uneven_batch_is_an_error():
     state = create_state(toy_model(), optax.sgd(0.1), 0)
     with pytest.raises(ValueError, match="batch_size 30 does not split evenly over 4 device"):
         devices.compile_step(step, state, None, batch_size=30)
+
+
+def test_the_compiled_step_sums_the_gradient_and_four_numbers():
+    model = toy_model()
+    step = make_train_step(model, optax.sgd(0.1), toy_draw, LOSSES)
+    state = create_state(model, optax.sgd(0.1), 0)
+    data = random_rays(0, (16,)), jnp.array([-1])
+    run, _, _ = devices.compile_step(step, state, data, batch_size=16)
+    sums = re.findall(r"= (.*?) all-reduce(?:-start)?\(", run.compiled.as_text())
+    shapes = [shape for each in sums for shape in re.findall(r"\w+\[([\d,]*)\]", each)]
+    assert sum(np.prod([int(side) for side in shape.split(",") if side]) for shape in shapes) == 2 * 9 + 4
 
 
 def test_seed_does_not_change_the_program():

@@ -16,7 +16,7 @@ from jaxnerf.registry import FIELDS, LOSSES
 from jaxnerf.training import auto_config
 from jaxnerf.training.build import build, build_losses
 from jaxnerf.training.state import create_state
-from jaxnerf.training.step import StepLoss, make_train_step
+from jaxnerf.training.step import make_train_step
 from runs import PACKED, smoke_config
 
 pytest_plugins = ["run_fixtures"]
@@ -68,7 +68,6 @@ def make_step(weights, packed=False):
         optimizer,
         lambda step, positions, data: draw(data.seed, step, positions, data.views, data.active_pixels),
         losses,
-        patches=experiment.draw_patches,
     )
     return step, (state, data, jnp.arange(RAYS)[None])
 
@@ -99,8 +98,7 @@ def test_a_loss_of_weight_0_is_absent_from_the_step(packed):
         return jax.jit(step).lower(*given).as_text()
 
     alone = text({"mse": 1.0})
-    names = ("distortion", "depth", "opaque", "hash_decay", "total_variation", "depth_smoothness", "near_opacity")
-    names += ("normals",)
+    names = ("distortion", "depth", "opaque", "total_variation")
     assert text({"mse": 1.0, **dict.fromkeys(names, 0.0)}) == alone
     assert len(text({"mse": 1.0, "distortion": 0.1})) > len(alone)
 
@@ -125,59 +123,6 @@ def test_a_regularizer_adds_its_gradient():
     assert row["loss"] == pytest.approx(row["loss_mse"] + 0.25 * row["loss_half_squares"], rel=1e-5)
     for without, with_it, value in zip(*map(jax.tree.leaves, (plain.params, decayed.params, start)), strict=True):
         np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.25 * value, atol=1e-6)
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_loss_of_surfaces_evaluates_the_field_at_every_fourth_ray(packed):
-    seen = {}
-
-    def log_density(scene, normals, samples):
-        seen.update(x=samples.x.shape, normals=normals)
-        return jnp.log(scene(samples.x, samples.viewdirs)[0][:, 0])
-
-    jaxnerf.register_loss("log_density", log_density, on="surfaces")
-    plain, _ = train({"mse": 1.0}, packed=packed)
-    moved, (row,) = train({"mse": 1.0, "log_density": 0.5}, packed=packed)
-    assert seen == {"x": (RAYS // 4, 1, 3), "normals": None}
-    assert row["loss"] == pytest.approx(row["mse_fine"] + 0.5 * row["loss_log_density"], rel=1e-5)
-    # The logarithm of the blob's density grows with its parameter by 1 at each sample.
-    without, with_it = (state.params["fine"]["log_density"] for state in (plain, moved))
-    np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.5, atol=1e-5)
-
-
-def test_a_loss_of_normals_needs_a_field_that_predicts_them():
-    with pytest.raises(ValueError, match="normals is None, expected those that the field predicts"):
-        train({"mse": 1.0, "normals": 0.1})
-
-
-@pytest.mark.parametrize("packed", [False, pytest.param(True, marks=pytest.mark.extra)])
-def test_a_loss_of_patches_adds_its_gradient(packed):
-    """That of the mean over patches, which are rendered from poses between the cameras."""
-    seen = {}
-
-    def opacity(outputs, rays):
-        seen.update(opacity=outputs[-1].opacity.shape, samples=outputs[-1].samples, near=rays.near.shape)
-        return outputs[-1].opacity.mean(axis=(1, 2))
-
-    jaxnerf.register_loss("patch_opacity", opacity, on="patches")
-    plain, _ = train({"mse": 1.0}, packed=packed)
-    moved, (row,) = train({"mse": 1.0, "patch_opacity": 0.5}, packed=packed)
-    assert seen == {"opacity": (1, 4, 4), "samples": None, "near": (1, 4, 4)}
-    assert row["loss"] == pytest.approx(row["mse_fine"] + 0.5 * row["loss_patch_opacity"], rel=1e-5)
-    experiment, _, data = experiment_and_data(packed)
-    start = make_step({"mse": 1.0}, packed)[1][0]
-    keys, rays = jax.jit(experiment.draw_patches, static_argnums=1)(0, 1, data)
-
-    def mean(params):
-        return experiment.model.render(keys, params, start.grid, rays, 0)["fine"].opacity.mean()
-
-    value, slope = jax.jit(jax.value_and_grad(mean))(start.params)
-    assert row["loss_patch_opacity"] == pytest.approx(float(value), rel=1e-5)
-    for without, with_it, each in zip(*map(jax.tree.leaves, (plain.params, moved.params, slope)), strict=True):
-        np.testing.assert_allclose(with_it, without - LEARNING_RATE * 0.5 * each, atol=1e-6)
-    losses = [StepLoss("patch_opacity", opacity, "patches", lambda step: 1)]
-    with pytest.raises(ValueError, match="patch_opacity need patches of rays"):
-        make_train_step(experiment.model, experiment.optimizer, experiment.draw, losses)
 
 
 @pytest.mark.parametrize("needs", [(), ("alpha",), ("image_index", "pixel")])
@@ -294,11 +239,12 @@ def test_the_depth_loss_moves_matter_to_the_sparse_points(observed_views):
 def test_a_regularizer_of_levels_gets_those_of_the_hash_grid():
     config = smoke_config()
     config.update_from_flattened_dict(PACKED)
-    config.losses.hash_decay = 0.5
+    config.losses.total_variation = 0.5
     config = auto_config.resolve_for_device(auto_config.resolve(config).config)[0]
     experiment = build(config)
-    (decay,) = [loss for loss in experiment.losses if loss.name == "hash_decay"]
+    (variation,) = [loss for loss in experiment.losses if loss.name == "total_variation"]
     params = experiment.model.init(jax.random.key(0))
-    assert decay.needs == () and decay.function(params) == pytest.approx(0.025**2 / 3, rel=0.1)  # uniform entries
-    with pytest.raises(ValueError, match="losses.hash_decay needs a field that brings it, as a hash grid does"):
-        build_losses({"mse": 1.0, "hash_decay": 0.1})
+    # Of independent entries, uniform in [-0.025, 0.025], along three axes.
+    assert variation.needs == () and variation.function(params) == pytest.approx(3 * 2 * 0.05**2 / 12, rel=0.1)
+    with pytest.raises(ValueError, match="losses.total_variation needs a field that brings it, as a hash grid does"):
+        build_losses({"mse": 1.0, "total_variation": 0.1})

@@ -165,7 +165,6 @@ def test_parameters_that_are_not_finite_are_refused():
         ({"field": "mlp"}, (), "web: field is 'mlp', expected 'hash_grid'"),
         ({"sampler": "hierarchical"}, (), "web: sampler is 'hierarchical', expected 'occupancy'"),
         ({"data.ndc": True}, (), "web: data.ndc is True"),
-        ({"hash_grid.reflections": True}, (), "web: hash_grid.reflections is True"),
         ({}, ("time",), "web: the field asks for time, expected position and direction"),
     ],
 )

@@ -1,16 +1,14 @@
-"""Reflected directions and their encoding: against scipy's harmonics and the exact mean over a lobe, in float64."""
+"""The encoding of directions: against scipy's harmonics and the exact mean over a lobe, in float64."""
 
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import ive, sph_harm_y
 
 from helpers import assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import integrated_directional_encoding
-from jaxnerf.core.reflections import reflect
 
 encode = compiled(integrated_directional_encoding, "degrees")
 
@@ -110,18 +108,3 @@ def test_wrong_degrees_are_reported(degrees):
 def test_batch_is_vmap_is_jit():
     function = functools.partial(integrated_directional_encoding, degrees=(2,))
     assert_batch_is_vmap_is_jit(function, directions(6), np.float32(np.linspace(0, 2, 6)))
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-4, 1.0, np.pi / 2 - 1e-6, np.pi / 2])
-def test_a_reflection_keeps_the_angle(angle):
-    """From a ray along the normal to one that grazes the surface."""
-    view = np.array([np.sin(angle), 0, -np.cos(angle)])
-    got = reflect(np.float32(view), np.float32([0, 0, 1]))
-    np.testing.assert_allclose(got, view * [1, 1, -1], atol=1e-7)
-    np.testing.assert_array_equal(reflect(np.float32(view), np.float32([0, 0, -1])), got)
-
-
-def test_a_normal_of_zero_reflects_nothing_and_has_a_gradient():
-    view = directions(7)[6:]
-    np.testing.assert_array_equal(reflect(view, jnp.zeros((1, 3))), view)
-    assert jnp.isfinite(jax.grad(lambda n: reflect(view, n).sum())(jnp.zeros((1, 3)))).all()
