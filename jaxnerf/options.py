@@ -73,7 +73,6 @@ class Option(NamedTuple):
     range: Range | None
     choices: tuple[str, ...]
     auto: bool
-    late: bool
     changes: Changes | None
     check: Callable[[Any], str | None] | None
     protocol: bool
@@ -88,7 +87,6 @@ def option(
     range: Range | None = None,
     choices: tuple[str, ...] = (),
     auto: bool = False,
-    late: bool = False,
     changes: Changes | None = None,
     check: Callable[[Any], str | None] | None = None,
     protocol: bool = False,
@@ -105,13 +103,12 @@ def option(
         range: of a number.
         choices: all values of a text; empty: any.
         auto: whether the value may be "auto", which `Options.resolve` or `Options.resolve_for_device` replaces.
-        late: whether "auto" stays in the config instead, as the value is inferred for each checkpoint.
         changes: what depends on the value; None: as the class says in `Options.changes`.
         check: value -> what is expected in place of it, or None where the value is right. For tuples.
         protocol: whether an evaluation records the value, as it determines which images are compared.
         max_int: the largest whole number.
     """
-    declared = Option(help, unit, range, tuple(choices), auto, late, changes, check, protocol, max_int)
+    declared = Option(help, unit, range, tuple(choices), auto, changes, check, protocol, max_int)
     return dataclasses.field(default=default, metadata={"option": declared})
 
 

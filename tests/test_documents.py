@@ -111,6 +111,8 @@ PROGRAMS = dict(re.findall(r"^    (jaxnerf-\w+) = ([\w.]+):run$", (ROOT / "setup
 COMMON = {"help", "config", "plugins", "verbosity", "page"}  # of absl, jaxnerf/runtime/cli.py, experiments/common.py
 FLAGS = {name: COMMON | defined_flags([ROOT / f"{module.replace('.', '/')}.py"]) for name, module in PROGRAMS.items()}
 FLAGS["jaxnerf-export"] |= {name for kind in EXPORTERS.names() for name in declarations(EXPORTERS.get(kind).options)}
+for name in ("jaxnerf-eval", "jaxnerf-render"):
+    FLAGS[name] |= defined_flags([ROOT / "jaxnerf" / "evaluation" / "run_flags.py"])
 ALL_FLAGS = set.union(*FLAGS.values(), defined_flags((ROOT / "experiments").rglob("*.py")))
 
 

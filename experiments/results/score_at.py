@@ -10,7 +10,8 @@ import shutil
 
 from absl import flags
 
-from jaxnerf.evaluation.evaluate import evaluate, summary
+from jaxnerf.evaluation.evaluate import score_run, summary
+from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.options import replaced, values_of
 from jaxnerf.runtime import cli
 from jaxnerf.training import workdir
@@ -39,7 +40,7 @@ def main(argv: list[str]) -> None:
             )
     config = replaced(config, data=like.data, fingerprint=like.fingerprint)
     shutil.copytree(_WORKDIR.value, out, ignore=shutil.ignore_patterns("eval", "renders"))
-    print(summary(evaluate(out, config=config)))
+    print(summary(score_run(restore_run(out, config), out)))
 
 
 if __name__ == "__main__":

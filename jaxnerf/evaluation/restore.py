@@ -15,7 +15,6 @@ from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.options import AUTO, Changes, changing, is_auto, replaced
 from jaxnerf.registry import needs_folder
-from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
@@ -110,7 +109,8 @@ def _restore(workdir, config, data_dir, settings, *, crop):
     def render_image(variables, rays, chunk=None, median_depth=False):
         return renderer(**{"median_depth": True} if median_depth else {})(variables, rays, chunk)
 
-    run = TrainedRun(
+    options = config.eval
+    return TrainedRun(
         experiment,
         checkpoints.steps,
         variables,
@@ -119,8 +119,8 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         render_image,
         variables_of,
         model_with,
+        {name: getattr(options, name) for name in changing(options, Changes.IMAGES)},
     )
-    return cleaned(run, workdir)
 
 
 def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:
@@ -133,12 +133,6 @@ def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:
 
 def _with_settings(config, settings):
     return changed(config, {f"eval.{name}": value for name, value in settings.items()}) if settings else config
-
-
-def render_settings(run: TrainedRun) -> dict[str, Any]:
-    """Returns the settings of the config's section `eval` that change what a run renders, by name."""
-    options = run.experiment.config.eval
-    return {name: getattr(options, name) for name in changing(options, Changes.IMAGES)}
 
 
 def refined_views(run: TrainedRun, views: Views, split: str, params: Any) -> Views:

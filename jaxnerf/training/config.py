@@ -168,11 +168,7 @@ def to_config_dict(config: RunConfig) -> ConfigDict:
 def auto_fields(config: Config) -> list[str]:
     """Returns the dotted names of the options that are still "auto"; for some "auto" is a value like any other."""
     config = read_config(config)
-    values = {
-        name
-        for name, option_, _, _ in declared(config)
-        if option_.late or not (option_.auto or name.startswith("losses."))
-    }
+    values = {name for name, option_, _, _ in declared(config) if not (option_.auto or name.startswith("losses."))}
     return [name for name, value in flatten(config.to_dict()).items() if is_auto(value) and name not in values]
 
 

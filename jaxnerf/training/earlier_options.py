@@ -31,6 +31,11 @@ GONE: dict[str, Gone] = {  # by "section.option"
     "train.max_nonfinite": Gone((20,), Changes.NOTHING, "a run fails after 20 such steps in a row; leave it out"),
     "train.parallel": Gone(("auto",), Changes.SPEED, "CUDA_VISIBLE_DEVICES limits the devices; leave it out"),
     "train.steps_per_dispatch": Gone(("auto",), Changes.SPEED, "the device determines it; leave it out"),
+    "eval.max_uncertainty": Gone(
+        (1.0,),
+        Changes.IMAGES,
+        "set it to 1 in config.json, and give --max_uncertainty to jaxnerf-eval, jaxnerf-render and jaxnerf-export",
+    ),
 }
 
 

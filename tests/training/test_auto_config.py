@@ -64,7 +64,6 @@ AUTO_FIELDS = {
     "train.lr_steps": 300,
     "eval.sample_multiplier": 3,
     "eval.chunk": 512,
-    "eval.max_uncertainty": 0.75,
     "eval.max_samples": 2048,
 }
 
@@ -182,12 +181,6 @@ def test_every_auto_field_is_inferred_and_logged(resolved):
     for word in ("contraction", "box", "step size", "grid", "hash grid"):
         assert any(line.startswith(f"{word} ") for line in lines), word
     assert f"a pixel covers {PIXEL:.4g}" in "".join(lines)
-
-
-def test_a_value_that_each_checkpoint_has_stays_auto(views):
-    config = changed(read_config(auto_config()), {"eval.max_uncertainty": AUTO})
-    config = resolve_for_device(resolve(config, views).config)[0]
-    assert config.eval.max_uncertainty == AUTO and not auto_fields(config)
 
 
 @pytest.mark.parametrize("contracted, weight", [(False, 0.01), (True, 0.001)])

@@ -12,14 +12,13 @@ import pytest
 import captures
 import jaxnerf
 from jaxnerf.core.scene import NEEDS, needs_of
-from jaxnerf.evaluation.evaluate import evaluate
 from jaxnerf.evaluation.restore import restore_with_grid
 from jaxnerf.fields.base import Field
 from jaxnerf.tools.exporters.base import export_run
 from jaxnerf.tools.viewer.frame_renderer import FrameCamera, FrameRenderer
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.step import ProgressData
-from runs import PACKED, smoke_config
+from runs import PACKED, evaluate, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")

@@ -12,6 +12,7 @@ from jaxnerf.options import read, values_of
 from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.exporters.options import ExportOptions
 from jaxnerf.tools.exporters.registration import EXPORTERS
+from jaxnerf.tools.uncertainty.cleaning import cleaned
 
 
 class ExportSource(NamedTuple):
@@ -53,7 +54,7 @@ def export_run(
         kind: the name of an exporter.
         step: of the checkpoint; the newest when None.
         data_dir: see `restore_run`.
-        max_uncertainty: a number or "auto", in place of the config's `eval.max_uncertainty`, unless it is None.
+        max_uncertainty: of the cells of the grid, see `cleaned`.
         name: of the folder; KIND-STEP when None.
         overwrite: whether an existing folder of that name is replaced.
         say: called with each line for the user.
@@ -70,8 +71,7 @@ def export_run(
     options.check()
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
-    rendered: dict[str, Any] = {} if max_uncertainty is None else {"max_uncertainty": max_uncertainty}
-    run = restore_run(workdir, data_dir=data_dir, settings=rendered)
+    run = restore_run(workdir, data_dir=data_dir)
     if exporter.check is not None:
         exporter.check(run)
     step = newest_step(run, workdir, step)
@@ -80,8 +80,8 @@ def export_run(
     if target.exists() and not overwrite:
         raise ValueError(f"{target}: exists already; give --overwrite to replace it, or another --name")
     if run.experiment.model.grid_schedule is None:  # whole rays through a dense network would take hours
-        run = restore_run(workdir, data_dir=data_dir, settings={**rendered, "bake_occupancy": True})
-    variables = run.variables(step)
+        run = restore_run(workdir, data_dir=data_dir, settings={"bake_occupancy": True})
+    variables = cleaned(run, workdir, max_uncertainty).variables(step)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
     target.parent.mkdir(exist_ok=True)
     with atomic_files.partial_folder(target) as partial:

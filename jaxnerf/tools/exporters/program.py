@@ -9,6 +9,7 @@ import sys
 
 from absl import flags
 
+from jaxnerf.evaluation import run_flags
 from jaxnerf.options import declarations
 from jaxnerf.runtime import cli
 from jaxnerf.tools.exporters.registration import EXPORTERS
@@ -19,11 +20,7 @@ _KIND = flags.DEFINE_string(
 )
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is exported.")
-_MAX_UNCERTAINTY = cli.define_number(
-    "max_uncertainty",
-    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
-    "allow; 1: off. It overrides config.eval.max_uncertainty.",
-)
+_MAX_UNCERTAINTY = cli.define_number("max_uncertainty", run_flags.MAX_UNCERTAINTY)
 _NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an existing folder of that name.")
 

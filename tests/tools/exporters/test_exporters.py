@@ -354,7 +354,7 @@ def test_a_run_that_cannot_be_exported_is_refused_before_its_grid_is_extracted(m
     monkeypatch.setitem(base.EXPORTERS._parts, "test", Exporter(lambda source, folder: None, check))
     with pytest.raises(ValueError, match="has no colours"):
         export_run(tmp_path, "test")
-    assert calls == [{}] and not list(tmp_path.iterdir())
+    assert calls == [None] and not list(tmp_path.iterdir())
     assert base.EXPORTERS.get("web").check is not None
 
 
