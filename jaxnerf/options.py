@@ -124,7 +124,7 @@ class Facts(NamedTuple):
         side: px, that of a square image with as many pixels as an image has, the mean over the images.
         footprint: world units that a pixel covers at the point that the cameras look at.
         footprint_spread: side of the largest pixels' footprint over that of the smallest, at what each view shows, for
-            all but the outermost twentieths of the views, and for all sizes that training draws from.
+            all but the outermost twentieths of the views.
         num_observations: of sparse points that at least two views show; 0 unless the run can use them.
         has_alpha: whether alpha bounds the scene.
         mean_alpha: of the pixels; 1 without alpha.

@@ -60,13 +60,6 @@ class DataOptions(Options):
         protocol=True,
     )
     width: int = option(800, "see `factor`", unit="px", range=at_least(1))
-    num_scales: int = option(
-        1,
-        "sizes of the images that training draws from: full, 1/2, 1/4, ..., each the area average of the full one. "
-        "The losses of a ray weigh as the side of its pixel. It pays with `hash_grid.prefilter`.",
-        range=at_least(1),
-        changes=Changes.TRAINING,
-    )
     size: int = option(100, "side of the embedded scene's images", unit="px", range=at_least(1))
     finish: str = option(
         "usual",

@@ -31,7 +31,6 @@ def dataset_facts(
     contracted: Any,
     lower: Any,
     upper: Any,
-    num_scales: int = 1,
 ) -> Facts:
     """Returns the facts about a dataset.
 
@@ -42,7 +41,6 @@ def dataset_facts(
         use_alpha: whether alpha may bound the scene.
         sampler: the name of the run's sampler.
         contracted, lower, upper: of the box where they are set; otherwise "auto".
-        num_scales: sizes of the images that training draws from, see `DataOptions`.
 
     Raises:
         ValueError: if the box is empty.
@@ -60,7 +58,7 @@ def dataset_facts(
         num_views=len(views.size),
         side=float(np.sqrt(np.prod(views.size, axis=1)).mean()),
         footprint=2 / float(np.max(views.size[:, 1])) if ndc else LookAt(views).footprint,
-        footprint_spread=footprint_spread(views) * 2.0 ** (num_scales - 1),
+        footprint_spread=footprint_spread(views),
         has_alpha=has_alpha,
         ndc=ndc,
         lower=lower,
@@ -138,18 +136,17 @@ def footprint_spread(views: Views) -> float:
     return float(largest / smallest) if smallest > 0 else 1.0
 
 
-def footprint_radii(views: Views, num_scales: int = 1) -> tuple[float, float]:
+def footprint_radii(views: Views) -> tuple[float, float]:
     """Returns the smallest and the largest radius of the pixels' cones, world units, at the `footprints`.
 
     Args:
         views: of the split "train".
-        num_scales: sizes of the images that training draws from, see `DataOptions`.
 
     Returns:
         The radii; the smallest is at least a thousandth of the largest, as a camera may stand at what all look at.
     """
     radii = 2 / math.sqrt(12) * footprints(views)
-    largest = float(radii.max()) * 2.0 ** (num_scales - 1)
+    largest = float(radii.max())
     return max(float(radii.min()), largest / 1000), largest
 
 

@@ -106,7 +106,7 @@ class HashGridOptions(Options):
     prefilter: bool = option(
         "auto",
         "Whether the features of cells that are smaller than a pixel's footprint are damped (arXiv:2304.06706, Eq. 6). "
-        "auto: where the footprints of the training images, those of `data.num_scales` included, differ by 4 or more.",
+        "auto: where the footprints of the training images differ by 4 or more.",
         auto=True,
     )
     compute_dtype: str = option(

@@ -143,7 +143,6 @@ def _facts(config, views):
         contracted=occupancy.contracted,
         lower=occupancy.lower,
         upper=occupancy.upper,
-        num_scales=config.data.num_scales,
     )
 
 

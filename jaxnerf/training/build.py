@@ -17,7 +17,6 @@ from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.facts import footprint_radii
 from jaxnerf.data.geometry.free_space import interpolated_depths
 from jaxnerf.data.observations import confident_observations
-from jaxnerf.data.scales import with_scales
 from jaxnerf.fields.base import Field, contract_field
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.models.occupancy import bake_occupancy, schedule_of
@@ -77,7 +76,6 @@ def build(config: Config) -> Experiment:
     """
     config = read_config(config)
     given, train = config.data, config.train
-    _check_scales(config)
     model = build_model(config)
     losses, cameras = build_losses(config.losses, model), build_cameras(config, model.needs)
     _filled(config.train, "train")
@@ -307,18 +305,6 @@ def _check_sampling(config):
         )
 
 
-def _check_scales(config):
-    """Raises a ValueError if images of several sizes do not fit the rest of the config."""
-    reasons = {
-        "data.ndc is True, and rays in normalised device coordinates depend on the size of all images": config.data.ndc,
-        "the section cameras has parameters of each training image": config.cameras.any,
-        "train.batching is 'single_image', which draws each size as often": config.train.batching != "all_images",
-    }
-    for reason, holds in reasons.items():
-        if config.data.num_scales > 1 and holds:
-            raise ValueError(f"data.num_scales is {config.data.num_scales}, expected 1, as {reason}")
-
-
 def _make_field(config, network) -> Field:
     """Makes the field of a network; that of "coarse" is always an MLP."""
     name = config.field if network == "fine" else "mlp"
@@ -369,9 +355,8 @@ def _prepare(config, model, extras, views):
             "dataset; do not set it"
         )
     cells = indices = None
-    drawn = views if config.data.num_scales == 1 else with_scales(views, config.data.num_scales)
     if model.grid_schedule is None:
-        active = unmasked_pixels(drawn)
+        active = unmasked_pixels(views)
     else:
         cells, active, indices = active_region(
             views,
@@ -381,7 +366,6 @@ def _prepare(config, model, extras, views):
             min_views=config.occupancy.min_views if views.time is None else 0,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
-            drawn=drawn,
         )
     seed = np.uint32(config.seed % 2**32)
     sparse = None
@@ -389,8 +373,6 @@ def _prepare(config, model, extras, views):
         sparse = confident_observations(views)
         if not config.data.ndc:
             depths = interpolated_depths(dataclasses.replace(views, sparse=sparse))
-            if drawn is not views:  # no depth is known in images of other sizes
-                depths = np.pad(depths, [(0, len(drawn.size) - len(views.size)), *[(0, 0)] * 3])
             sparse = dataclasses.replace(sparse, interpolated=depths)
     progress = None
     if "progress" in model.needs or config.train.rays_per_side > 1:
@@ -398,10 +380,10 @@ def _prepare(config, model, extras, views):
         progress = ProgressData(np.float32(config.train.lr_steps), np.float32(0))
     radii = None
     if model.grid_schedule is not None and "radius" in model.needs:
-        smallest, largest = footprint_radii(views, config.data.num_scales)
+        smallest, largest = footprint_radii(views)
         radii = np.float32([smallest / config.train.rays_per_side, largest])
     # The mask is part of the active pixels. Names, which no step reads, would be part of the compiled step.
-    drawn = dataclasses.replace(drawn, mask=None, sparse=sparse, names=())
+    drawn = dataclasses.replace(views, mask=None, sparse=sparse, names=())
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)
 
 

@@ -24,7 +24,9 @@ RENAMED: dict[str, str] = {"data.fingerprint": "fingerprint"}  # "section.option
 _DROP = "use the version that wrote it"
 _REFLECTIONS = Gone((False,), Changes.TRAINING | Changes.IMAGES, _DROP)
 _LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")
+_SCALES = "write the images at all sizes as experiments/multiscale does"
 GONE: dict[str, Gone] = {  # by "section.option"
+    "data.num_scales": Gone((1,), Changes.TRAINING, _SCALES),
     **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
     "train.beta1": Gone((0.9,), Changes.TRAINING, "Adam's first moment always decays by 0.9; leave it out"),

@@ -680,15 +680,13 @@ def test_sizes_of_lego(scenes_dir):
     build(resolve_for_device(slow)[0])
 
 
-@pytest.mark.parametrize(
-    ("spread", "num_scales", "expected"), [(1.7, 1, "off"), (1.7, 2, "off"), (1, 3, "on"), (6, 1, "on")]
-)
-def test_features_are_damped_where_footprints_differ(views, spread, num_scales, expected):
+@pytest.mark.parametrize(("spread", "expected"), [(1.7, "off"), (6, "on")])
+def test_features_are_damped_where_footprints_differ(views, spread, expected):
     away = np.linspace(1, spread, len(views.size))[:, None]
     focal = np.asarray(views.cameras.focal) / away
     views = dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, focal=focal.astype(np.float32)))
     config = auto_config()
-    config.data.num_scales, config.fine.prefilter, config.coarse.prefilter = num_scales, "auto", "auto"
+    config.fine.prefilter, config.coarse.prefilter = "auto", "auto"
     config.coarse.encode = False
     resolved = resolve(config, views)
     assert resolved.config.hash_grid.prefilter is resolved.config.fine.prefilter is (expected == "on")
@@ -709,6 +707,6 @@ def test_footprints_are_those_of_the_points_that_views_show(views):
     found = dataclasses.replace(views, sparse=sparse)
     assert footprint_spread(found) == pytest.approx(2, rel=1e-5)
     focal = float(views.cameras.focal[0, 0])
-    assert footprint_radii(found, num_scales=3) == pytest.approx(np.array([3, 4 * 6]) / focal / 3**0.5, rel=1e-5)
+    assert footprint_radii(found) == pytest.approx(np.array([3, 6]) / focal / 3**0.5, rel=1e-5)
     behind = dataclasses.replace(sparse, positions=pose[:, :, 3] + pose[:, :, 2])  # as wrong matches are: not counted
     assert footprint_radii(dataclasses.replace(views, sparse=behind)) == footprint_radii(views)
