@@ -60,7 +60,7 @@ def test_datasets_of_the_same_shapes_have_one_compiled_step_and_other_options_an
         captures.write_transforms(tmp_path / name, captures.noise(captures.orbit(6, height=8, width=8), seed=len(name)))
         config = config_of(**train)
         fields = {"lower": (-1.0,) * 3, "upper": (1.0,) * 3, "use_alpha": False, "contracted": False}
-        config.update_from_flattened_dict({f"occupancy.{name}": value for name, value in fields.items()})
+        config.update_from_flattened_dict({f"scene.{name}": value for name, value in fields.items()})
         config.data.format, config.data.dir, config.data.world = "transforms", str(tmp_path / name), "file"
         return config
 
