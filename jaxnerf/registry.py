@@ -122,7 +122,6 @@ LOSSES = Registry(
         "mse": "jaxnerf.training.losses:MSE",
         "distortion": "jaxnerf.training.losses:DISTORTION",
         "depth": "jaxnerf.training.losses:DEPTH",
-        "opaque": "jaxnerf.training.losses:OPAQUE",
         "total_variation": "jaxnerf.fields.hash_grid:TOTAL_VARIATION",
     },
 )

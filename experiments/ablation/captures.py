@@ -35,7 +35,6 @@ VARIANTS = {
     "distortion off": {"losses.distortion": 0.0},
     "distortion 0.003": {"losses.distortion": 0.003},
     "distortion 0.01": {"losses.distortion": 0.01},
-    "opaque 0.01": {"losses.opaque": 0.01},
     "total_variation 0.1": {"losses.total_variation": 0.1},
     "total_variation 1": {"losses.total_variation": 1.0},
     "cells that no view sees may be occupied": {"occupancy.min_views": 0},

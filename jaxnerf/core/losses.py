@@ -178,23 +178,6 @@ def _nearness(t, depth):
     return jnp.where(known, 2 * jnp.minimum(t, depth) / jnp.where(known, t + depth, 1), 0)
 
 
-def opaque_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
-    """Computes the squared transmittance of the last rendering's rays, times the pixel's alpha.
-
-    In a dataset without alpha every ray ends somewhere, so none should be transparent. With alpha, this holds for
-    the opaque pixels. The square leaves rays alone that are almost opaque; a logarithm of the opacity would have an
-    unbounded gradient where space is still empty.
-
-    Args:
-        outputs: Renderings [B].
-        batch: Batch [B] with alpha.
-
-    Returns:
-        [B] in [0, 1].
-    """
-    return jnp.asarray(batch.alpha) * (1 - outputs[-1].opacity) ** 2
-
-
 def _samples(function, rendering):
     """Returns a Rendering's samples; ValueError if it has none, or no weights for them."""
     samples = rendering.samples

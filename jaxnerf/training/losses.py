@@ -1,6 +1,6 @@
 """The built-in losses of renderings by name: their functions are in `core.losses`."""
 
-from jaxnerf.core.losses import depth_loss, distortion_loss, mse_loss, opaque_loss
+from jaxnerf.core.losses import depth_loss, distortion_loss, mse_loss
 from jaxnerf.registry import Loss
 
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
@@ -37,4 +37,3 @@ DEPTH = Loss(
     help="distance of the weights from the dataset's sparse points, and from depths interpolated between them (after "
     "arXiv:2107.02791); auto: at the start of training where space is contracted and there are such points",
 )
-OPAQUE = Loss(opaque_loss, needs=("alpha",), help="squared transmittance of rays where the image is opaque")

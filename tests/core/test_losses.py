@@ -14,7 +14,6 @@ from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compi
 from jaxnerf.core.losses import (
     depth_loss,
     mse_loss,
-    opaque_loss,
 )
 from jaxnerf.core.occupancy.grid import is_occupied
 from jaxnerf.core.types import without_samples
@@ -279,11 +278,11 @@ def packed_rendering(scene, rays, samples):
 
 @functools.partial(jax.jit, static_argnums=0)
 def losses_and_slope(render, rays, samples, batch):
-    """Returns three losses [3, RAYS] of a Gaussian ball, and the derivative of their sum by its density."""
+    """Returns two losses [2, RAYS] of a Gaussian ball, and the derivative of their sum by its density."""
 
     def total(scale):
         outputs = [render(lambda x, v: (scale * jnp.exp(-2 * (x**2).sum(axis=-1)), jax.nn.sigmoid(x)), rays, samples)]
-        losses = jnp.stack([loss(outputs, batch) for loss in (jaxnerf.distortion_loss, depth_loss, opaque_loss)])
+        losses = jnp.stack([loss(outputs, batch) for loss in (jaxnerf.distortion_loss, depth_loss)])
         return losses.sum(), losses
 
     (_, losses), slope = jax.value_and_grad(total, has_aux=True)(jnp.float32(4.0))
@@ -407,10 +406,3 @@ def test_a_depth_of_weight_0_has_no_loss_and_no_gradient():
     for depth, confidence in ((0.0, 0.0), (3.0, 0.0), (0.0, 1.0)):
         value, slope = jax.jit(jax.value_and_grad(depth_of))(*given, depth, confidence)
         assert value == confidence and not np.any(slope)
-
-
-def test_the_opaque_loss_is_the_squared_transmittance_of_opaque_pixels():
-    opacity = np.float32([0, 0.25, 1, 0.25])
-    rendering = dataclasses.replace(make_rendering(np.zeros((4, 1)), None, None), opacity=opacity)
-    batch = dataclasses.replace(make_batch(np.ones(4), 2.0), alpha=np.float32([1, 1, 1, 0]))
-    np.testing.assert_allclose(opaque_loss([rendering], batch), [1, 0.5625, 0, 0])

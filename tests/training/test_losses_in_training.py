@@ -98,7 +98,7 @@ def test_a_loss_of_weight_0_is_absent_from_the_step(packed):
         return jax.jit(step).lower(*given).as_text()
 
     alone = text({"mse": 1.0})
-    names = ("distortion", "depth", "opaque", "total_variation")
+    names = ("distortion", "depth", "total_variation")
     assert text({"mse": 1.0, **dict.fromkeys(names, 0.0)}) == alone
     assert len(text({"mse": 1.0, "distortion": 0.1})) > len(alone)
 
