@@ -34,7 +34,7 @@ def resolved(config):
     return resolve_for_device(replaced(resolved, data=data))[0]
 
 
-DATA = {"format": "blender", "factor": 1, "background": "none", "background_color": ()}
+DATA = {"format": "blender", "factor": 1, "background": "none"}
 DATA |= {"world": "file", "ndc": False}
 
 
@@ -160,7 +160,7 @@ def test_invalid_value_is_an_error(field, value, message):
 def test_unresolved_config_is_an_error():
     config = load("smoke")
     config.sampler, config.field = "occupancy", "hash_grid"
-    with pytest.raises(ValueError, match="occupancy.contracted is 'auto'; resolve the config"):
+    with pytest.raises(ValueError, match="is 'auto'; resolve the config"):
         build(config)
 
 

@@ -16,8 +16,6 @@ from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import SceneFn, Vector
 from jaxnerf.options import Facts
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
-
 _LEAST_SPREAD = 4.0  # of footprints: those of a hand-held capture differ by up to 1.7, those of four scales by 8
 _CACHE_ROW = 512  # float32 numbers, 2 KiB
 _FEW_RAYS = 16  # with fewer rays, padding by a whole ray costs too much

@@ -70,7 +70,7 @@ def stack_data(data: Sequence[Any], names: Sequence[str]) -> tuple[Any, list[boo
                 raise ValueError(
                     f"{name}: {jax.tree_util.keystr(path)} of its data has the shape {found}, expected {expected} as "
                     f"in {names[0]}: the runs of one program need as many images, of the same sizes, and grids with "
-                    "as many valid cells; set occupancy.use_alpha to False and occupancy.min_views to 0, which makes "
+                    "as many valid cells; set scene.use_alpha to False and occupancy.min_views to 0, which makes "
                     "all cells valid, or train the run alone"
                 )
     columns = list(zip(*map(jax.tree.leaves, data), strict=True))

@@ -7,7 +7,7 @@ import jax
 
 from jaxnerf.data.ray_batches import BATCHINGS
 from jaxnerf.models.base import ViewOptions
-from jaxnerf.options import Changes, Device, Facts, at_least, between, infer, is_auto, option
+from jaxnerf.options import Box, Changes, Device, Facts, at_least, between, infer, is_auto, option
 from jaxnerf.runtime import devices, processes
 from jaxnerf.training.dead_networks import CHECK_EVERY
 from jaxnerf.training.optimizer import OptimizerOptions
@@ -25,8 +25,8 @@ class TrainOptions(OptimizerOptions):
 
     batch_size: int = option(
         1024,
-        "Rays per step, over all devices. auto: `cpu_batch_size` on a CPU, twice as many for a large hash grid, and "
-        "`cpu_batch_size` with the sampler `hierarchical`; on an accelerator with the sampler `occupancy` as many as "
+        "Rays per step, over all devices. auto: as many as the sampler says, of which `cpu_batch_size` is the usual "
+        "number; the sampler `occupancy` takes twice as many for a large hash grid, and on an accelerator as many as "
         "keep it busy, in the same number of steps.",
         range=at_least(1),
         auto=True,
@@ -117,12 +117,8 @@ class TrainOptions(OptimizerOptions):
         A run is planned as a number of rays: steps of fewer rays than would be inferred are more steps. An
         accelerator takes more rays in the same number of steps.
         """
-        rays, why = self.cpu_batch_size, "train.cpu_batch_size"
-        if facts.sampler == "occupancy" and facts.large_field:
-            rays, why = 2 * rays, "twice train.cpu_batch_size, as the hash grid's table is large"
-        if facts.busy_rays is not None:
-            rays, why = facts.busy_rays, "they keep this device busy"
-        options, lines = infer(self, batch_size=(rays, f"batch         {rays:,} rays per step: {why}"))
+        rays = facts.rays_per_step
+        options, lines = infer(self, batch_size=(rays, f"batch         {rays:,} rays per step: {facts.rays_reason}"))
         batch, side = options.batch_size, facts.side
         planned = steps = max(round(_STEPS_PER_ROOT_PIXEL * side**0.5 * rays / batch), 1)
         why = f"{planned:,} steps of {batch:,} rays, for images of {side:.0f} x {side:.0f} px"
@@ -179,7 +175,7 @@ class TrainOptions(OptimizerOptions):
     def _rays_per_pixel(self):
         return 1 if is_auto(self.rays_per_side) else self.rays_per_side**2
 
-    def check(self) -> None:
+    def check(self, box: Box | None = None) -> None:
         for name in ("batch_size", "microbatch_size"):
             value = getattr(self, name)
             if not is_auto(value) and value % self._rays_per_pixel:
@@ -195,7 +191,7 @@ class TrainOptions(OptimizerOptions):
                     "set a time, or start another run with a number of steps"
                 )
 
-    def bytes_needed(self) -> dict[str, float]:
+    def bytes_needed(self, box: Box | None) -> dict[str, float]:
         """Returns those of the rays and colours of a step, at least."""
         return {} if is_auto(self.batch_size) else {"batch_size": 64 * self.batch_size}
 

@@ -5,6 +5,7 @@ import json
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxnerf import Rays
@@ -14,7 +15,7 @@ from jaxnerf.training.build import build_model
 from runs import smoke_config
 from studies import common, study
 
-ablation = study("ablation/ablation")
+ablation, reproducibility = study("ablation/ablation"), study("stability/reproducibility")
 COMPLETE, variants = ablation.COMPLETE, ablation.variants
 BASE = common.configuration("ablation")
 VARIANTS = variants(BASE, 100)
@@ -128,3 +129,48 @@ def test_a_finished_run_is_not_repeated_and_not_taken_for_another(tmp_path, monk
     config.train.lr_init = 1.0
     with pytest.raises(ValueError, match="finished run with config.train.lr_init 0.0005, expected 1.0"):
         common.run(config, tmp_path)
+
+
+def test_the_table_pairs_seeds_and_reports_what_they_agree_on():
+    def run(psnr):
+        return {"psnr": psnr, "ssim": 0.5, "parameters": 1234, "views": 8}
+
+    runs = {
+        COMPLETE: {"0": run(20.0), "1": run(21.0), "10": run(22.0)},
+        "no hierarchy": {"1": run(20.5), "0": run(19.0)},
+        "5 octaves": {"0": run(20.5), "1": run(20.9)},
+        "15 octaves": {"2": run(30.0)},
+    }
+    cost = {COMPLETE: {"flops": 2e6, "time": 1.0, "ms": 3.0}}
+    lines = ablation.report({"steps": 1000, "cost": cost, "scenes": {"lego": {"views": 100, "runs": runs}}})
+    assert "1,000 steps" in lines[0] and "seeds 0, 1, 2, 10" in lines[0]
+    assert "| complete | 21.00 +- 1.00 | - |  | 0.500 +- 0.000 | 1,234 | 2,000 | 1.00 |" in lines
+    assert "| no hierarchy | 19.75 +- 1.06 | -1.00, -0.50 | worse | 0.500 +- 0.000 | 1,234 | - | - |" in lines
+    assert "| +0.50, -0.10 | undecided |" in lines[6]
+    assert "| 30.00 | - | - | 0.500 |" in lines[7]
+    assert lines[-1].endswith("Here worse: no hierarchy; undecided: 5 octaves.")
+    verdicts = {(-1.0,): "worse (one seed)", (0.1, 0.2): "better", (0.0, 0.0): "undecided", (): "-"}
+    assert {differences: ablation.verdict(differences) for differences in verdicts} == verdicts
+
+
+@pytest.mark.parametrize(
+    "moved, four, same, where",
+    [
+        (0, 20.2, "all 200 parameters are equal, bit for bit", "within"),
+        (3, 25.0, "3 of 200 parameters differ, by up to 2.0e", "OUTSIDE"),
+    ],
+)
+def test_the_lines_on_reproducibility_report_the_differences(moved, four, same, where):
+    one, other = np.zeros(200, np.float32), np.zeros(200, np.float32)
+    other[:moved] = 2.0
+    again = reproducibility.difference(one, other)
+    drift = reproducibility.difference(one, np.linspace(0, 1, 200, dtype=np.float32))
+    smaller = reproducibility.difference(one, np.full(200, 3e-4, np.float32))
+    lines = reproducibility.report(
+        {0: 20.0, 1: 21.0}, again=again, four=four, drift=drift, paper_drift=smaller, steps=600
+    )
+    text = "\n".join(lines)
+    assert same in text and f"{where} the seeds' spread of 1.00 dB" in text
+    assert "20.50 +- 0.71 dB (20.00, 21.00)" in text
+    assert "more than 5.0e-01, one in a hundred by more than 9.9e-01, the worst by 1.0e+00; at the" in text
+    assert text.endswith("the worst by 3.0e-04.")

@@ -137,6 +137,12 @@ time.sleep(60)
     assert (tmp_path / "saved").exists()
 
 
+def test_the_list_has_every_job_and_the_time_of_all():
+    lines = run.listing({"lego_100": (15.0, 60.0), "fox_200": (105.0,)})
+    assert "| lego_100 | lego | lego_fast | data.format=blender data.factor=8 | blender | 1 | 15, 60 |" in lines
+    assert lines[-1].startswith("0.1 h of training")
+
+
 def scores_of_lego():
     return {
         "lego_100": [fake_score("lego_100", 15.0, 31.0, size=[50, 50])],
@@ -173,6 +179,13 @@ def test_the_headline_has_figures_of_the_same_views_only():
     (row,) = [line for line in tables.headline(scores_of_lego()) if "its full size" in line]
     assert "33.3 dB (600 s), 35.8 dB (2400 s) | 1.50 s | 3DGS: 35.9 dB (6 min); Zip-NeRF: 35.9 dB (5.3 h)" in row
     assert "TensoRF" not in row and "one CPU core" in tables.headline(scores_of_lego())[0]
+
+
+def test_options_of_a_try_are_in_the_table():
+    score = fake_score("lego_100", 5.0, 30.0)
+    score["overrides"]["data.factor"] = 16
+    assert tables.changes_of(score) == " with data.factor=16"
+    assert any(line.startswith("| lego_100 with data.factor=16 |") for line in tables.benchmark({"lego_100": [score]}))
 
 
 def test_the_page_is_made_and_its_tables_are_replaced(monkeypatch, tmp_path, capsys):

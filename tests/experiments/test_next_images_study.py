@@ -23,3 +23,10 @@ def test_the_farthest_view_is_chosen(monkeypatch):
 
 def test_the_area_is_a_mean_over_the_number_of_images():
     assert study.area({"10": 20.0, "15": 24.0, "20": 24.0}) == pytest.approx(23.0)
+
+
+def test_the_table_compares_with_random_seed_by_seed():
+    results = {"coverage": {0: {"10": 20.0, "20": 24.0}, 1: {"10": 20.0, "20": 22.0}}}
+    results["random"] = {0: {"10": 20.0, "20": 23.0}, 1: {"10": 20.0, "20": 23.0}}
+    rows = study.table("lego", results)
+    assert rows[2].endswith("| +0.00 (1 of 2) |") and "| 23.00 |" in rows[2]

@@ -1,7 +1,9 @@
 """The search for what a scene needs, on trials with invented scores."""
 
+import ast
 import importlib
 import json
+import pathlib
 
 import pytest
 
@@ -76,7 +78,7 @@ def test_each_part_can_be_reduced_a_few_times_and_every_change_differs(base):
     config.hash_grid.resolutions, config.occupancy.step_size = (16, 32, 64), 0.1
     config.hash_grid.width = config.hash_grid.view_width = 64
     config.hash_grid.view_depth = 2
-    config.occupancy.contracted = True
+    config.scene.contracted = True
     for name, part in scene_needs.PARTS.items():
         current = config
         for _ in range(8):
@@ -90,3 +92,11 @@ def test_each_part_can_be_reduced_a_few_times_and_every_change_differs(base):
         else:
             assert name == "samples", f"{name} never ends"
     assert scene_needs.background(lego_small.get_config(), alpha=True) == {}
+
+
+def test_the_docstring_of_every_part_describes_its_removal():
+    tree = ast.parse(pathlib.Path(scene_needs.__file__).read_text())
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    parts = {node.name for node in functions if [arg.arg for arg in node.args.args] == ["config", "alpha"]}
+    assert parts == set(scene_needs.PARTS)
+    assert all(part.__doc__ for part in scene_needs.PARTS.values())

@@ -62,7 +62,7 @@ class Tiny:
         views, test = (synthetic.load_synthetic(size=SIZE, split=split) for split in ("train", "test"))
         config = resolve_for_device(resolve(tiny_config(), views).config)[0]
         self.experiment = experiment = build(config)
-        self.field = from_options(config.hash_grid, (config.occupancy.lower, config.occupancy.upper))
+        self.field = from_options(config.hash_grid, (config.scene.lower, config.scene.upper))
         self.cells, data = experiment.prepare(views)
         self.data = jax.tree.map(jnp.asarray, data)
         self.train = jax.jit(self._train)
@@ -219,8 +219,8 @@ def toy():
     views = synthetic.load_synthetic(size=SIZE)
     experiment, field = build(resolve_for_device(resolve(config, views).config)[0]), toy_field()
     schedule = make_grid_schedule(
-        config.occupancy.lower,
-        config.occupancy.upper,
+        config.scene.lower,
+        config.scene.upper,
         resolution=8,
         step_size=0.5,
         field=field,

@@ -86,10 +86,10 @@ def network_of(run: TrainedRun) -> HashGrid:
         reason = f"the field asks for {', '.join(run.experiment.model.needs)}, expected position and direction"
     if reason:
         raise ValueError(f"web: {reason}; export such a run as --kind=splats or --kind=mesh")
-    options, occupancy = config.hash_grid, config.occupancy
+    options, scene = config.hash_grid, config.scene
     names = (*HashGrid.__dataclass_fields__,)
     values = {name: getattr(options, name) for name in names if hasattr(options, name) and name != "compute_dtype"}
-    return HashGrid(lower=occupancy.lower, upper=occupancy.upper, **values)
+    return HashGrid(lower=scene.lower, upper=scene.upper, **values)
 
 
 def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:

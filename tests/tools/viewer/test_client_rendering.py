@@ -23,7 +23,7 @@ LOWER, UPPER = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
 def hash_grid_run():
     """Returns the parts of a run of a small hash grid that a Viewer reads, its Views, and its variables."""
     run, views = ball_runs.solid_run()
-    box = {"occupancy.lower": LOWER, "occupancy.upper": UPPER}
+    box = {"scene.lower": LOWER, "scene.upper": UPPER}
     options = {f"hash_grid.{name}": value for name, value in SMALL.items()}
     config = changed(RunConfig(), {"field": "hash_grid", "sampler": "occupancy", "data.ndc": False, **box, **options})
     model = run.experiment.model._replace(grid_schedule=SimpleNamespace(step_size=0.1))
