@@ -35,6 +35,7 @@ class Field(NamedTuple):
         regularizers: by the name of a registered loss, the function (params) -> scalar; see `register_loss`.
         color_layers: keys of params: the first layers that serve colour alone; empty: not checked. A field is dead,
             too, if no gradient reaches these layers.
+        network: what has the parameters, for tools that write it in another form; None: they cannot.
     """
 
     init: Callable[[jax.Array], Any]
@@ -42,6 +43,7 @@ class Field(NamedTuple):
     input_layers: tuple[str, ...] = ()
     regularizers: Mapping[str, Callable[[Any], jax.Array]] = {}
     color_layers: tuple[str, ...] = ()
+    network: Any = None
 
 
 def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:

@@ -211,7 +211,7 @@ def hash_grid_field(**options: Any) -> Field:
     color_layers = ("view_0",) if network.view_depth else ("rgb",)
     regularizers = {"total_variation": functools.partial(total_variation, levels=network.levels())}
     scene = apply_to_cones if network.prefilter else apply_to_rays
-    return Field(init, scene, regularizers=regularizers, color_layers=color_layers)
+    return Field(init, scene, regularizers=regularizers, color_layers=color_layers, network=network)
 
 
 def from_options(options: HashGridOptions, box: Box | None) -> Field:
