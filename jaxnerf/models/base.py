@@ -92,8 +92,8 @@ class SamplerContext(NamedTuple):
 
     Attributes:
         options: of the sampler: an instance of its registered class, or the section of its name as a dict.
-        make_field: name of a network -> its Field, as the config describes it: that of FINAL_NETWORK, or one of the
-            networks that the sampler declares, see `Part`.
+        make_field: name of a network -> its Field, as the config describes it: "fine" is that of the final rendering,
+            "coarse" an MLP with the options of the section `coarse`.
         view: the options of images.
         background: [3] colour behind the scene; None: black.
         box: lower and upper corner of the scene, world units; None where the config has none yet.

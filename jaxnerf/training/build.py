@@ -24,7 +24,7 @@ from jaxnerf.models.occupancy import bake_occupancy, schedule_of
 from jaxnerf.options import Changes, Options, changing, is_auto, values_of
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.training.camera_parameters import CameraParameters
-from jaxnerf.training.config import Config, RunConfig, read_config
+from jaxnerf.training.config import Config, RunConfig, part_sections, read_config
 from jaxnerf.training.optimizer import make_optimizer
 from jaxnerf.training.pixel_rays import PixelRays
 from jaxnerf.training.step import ProgressData, StepLoss, TrainData
@@ -273,13 +273,14 @@ def load_split(config: Config, split: str | None = None) -> tuple[Views, str, di
 
 
 def _make_field(config, network) -> Field:
-    """Makes the field of a network: the one that the config names, or one of the sampler's own networks."""
-    sampler = SAMPLERS.get(config.sampler)
+    """Makes the field of a network: the one that the config names, or that of a section of the network's name."""
     if network == FINAL_NETWORK:
         part, options = FIELDS.get(config.field), config.options_of(FIELDS)
         section = part.section or config.field
+    elif network in config.parts:
+        part, options, section = part_sections()[network], getattr(config, network), network
     else:
-        part, options, section = sampler.networks[network], getattr(config, network), network
+        raise ValueError(f"make_field: no network {network!r}, expected one of {FINAL_NETWORK!r} and {[*config.parts]}")
     field = part.make(_filled(options, section), config.scene.box)
     # The paper's networks are not contracted; all other fields are defined in the box.
     declared = options if isinstance(options, Options) else Options()
