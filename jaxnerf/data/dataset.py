@@ -146,12 +146,14 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str], Capture | None]:
         data: the options.
 
     Returns:
-        The options; one line per inferred value with its reason; and the Capture if it had to be read.
+        The options; one line per inferred value with its reason; and the Capture, None if there is none or it is
+        unreadable and nothing was inferred from it.
 
     Raises:
         ValueError: if the folder does not exist or holds no dataset.
     """
     data, lines, capture = _resolve(data)
+    capture = capture or _readable(data)
     notes = [found["note"] for found in views_shared_with_training(data, capture).values()]
     return data, lines + [f"note          {note}" for note in dict.fromkeys(notes)], capture
 
