@@ -164,7 +164,7 @@ def find_active_pixels(
     if not runs.size:
         raise ValueError(
             f"no ray of {len(views.offset)} views hits a valid cell of the box {schedule.lower} to {schedule.upper}; "
-            "correct occupancy.lower and occupancy.upper"
+            "correct scene.lower and scene.upper"
         )
     return runs
 

@@ -19,9 +19,9 @@ from jaxnerf.core.loops import is_cpu
 from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector, check_shapes
-from jaxnerf.fields.base import Box, Field, apply_network, infer_prefilter
+from jaxnerf.fields.base import Field, apply_network, infer_prefilter
 from jaxnerf.fields.mlp import Dense
-from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
+from jaxnerf.options import POSITIVE, Box, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
 
 _glorot = linen.initializers.glorot_uniform()
@@ -147,7 +147,7 @@ class HashGridOptions(Options):
         line = f"precision     {dtype} in the layers of the hash grid's networks, for this device"
         return infer(self, compute_dtype=(dtype, line))
 
-    def bytes_needed(self) -> dict[str, float]:
+    def bytes_needed(self, box: Box | None) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
         table, width, view_width, view_depth = (
             1 if is_auto(value) else value for value in (self.table_size, self.width, self.view_width, self.view_depth)
@@ -211,14 +211,14 @@ def hash_grid_field(**options: Any) -> Field:
     color_layers = ("view_0",) if network.view_depth else ("rgb",)
     regularizers = {"total_variation": functools.partial(total_variation, levels=network.levels())}
     scene = apply_to_cones if network.prefilter else apply_to_rays
-    return Field(init, scene, regularizers=regularizers, color_layers=color_layers)
+    return Field(init, scene, regularizers=regularizers, color_layers=color_layers, network=network)
 
 
 def from_options(options: HashGridOptions, box: Box | None) -> Field:
     """Makes the field "hash_grid" from its options, in the scene's box."""
     if box is None:
         raise ValueError(
-            "the box of occupancy.lower and occupancy.upper is 'auto'; resolve the config against a dataset, or set it"
+            "scene.lower or scene.upper is 'auto', expected the scene's box; resolve the config, or set both"
         )
     values = {**dataclasses.asdict(options), "compute_dtype": _COMPUTE_DTYPES[options.compute_dtype]}
     return hash_grid_field(lower=box[0], upper=box[1], **values)
