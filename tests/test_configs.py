@@ -80,7 +80,6 @@ PAPER = {
     "train.lr_init": 5e-4,
     "train.lr_final": 5e-5,
     "train.lr_decay_power": 1.0,
-    "train.beta1": 0.9,
     "train.beta2": 0.999,
     "train.epsilon": 1e-7,
     "train.warmup_steps": 0,
@@ -186,7 +185,7 @@ def _render_jaxpr(experiment):
 
 
 def test_optimizer_is_adam_with_the_configured_values():
-    options = OptimizerOptions(lr_init=0.1, lr_final=0.1, beta1=0.5, beta2=0.75, epsilon=1e-3)
+    options = OptimizerOptions(lr_init=0.1, lr_final=0.1, beta2=0.75, epsilon=1e-3)
     optimizer, _ = make_optimizer(options)
     params, gradient = jax.numpy.array([1.0]), jax.numpy.array([0.01])
     update, _ = optimizer.update(gradient, optimizer.init(params), params)

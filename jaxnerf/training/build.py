@@ -346,8 +346,8 @@ def _prepare(config, model, extras, views):
     if model.grid_schedule is not None and "radius" in model.needs:
         smallest, largest = footprint_radii(views)
         radii = np.float32([smallest / config.train.rays_per_side, largest])
-    # The mask is part of the active pixels.
-    drawn = dataclasses.replace(views, mask=None, sparse=sparse)
+    # The mask is part of the active pixels. Names, which no step reads, would be part of the compiled step.
+    drawn = dataclasses.replace(views, mask=None, sparse=sparse, names=())
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)
 
 

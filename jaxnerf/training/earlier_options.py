@@ -48,6 +48,10 @@ GONE: dict[str, Gone] = {  # by "section.option"
     "data.num_scales": Gone((1,), Changes.TRAINING, _SCALES),
     **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
+    "train.beta1": Gone((0.9,), Changes.TRAINING, "Adam's first moment always decays by 0.9; leave it out"),
+    "train.max_nonfinite": Gone((20,), Changes.NOTHING, "a run fails after 20 such steps in a row; leave it out"),
+    "train.parallel": Gone(("auto",), Changes.SPEED, "CUDA_VISIBLE_DEVICES limits the devices; leave it out"),
+    "train.steps_per_dispatch": Gone(("auto",), Changes.SPEED, "the device determines it; leave it out"),
     "occupancy.cells_per_update": Gone((2**18,), Changes.TRAINING, _DROP),
     "occupancy.update_chunk": Gone((AUTO,), Changes.SPEED, "drop it"),
     "eval.max_uncertainty": Gone(

@@ -26,6 +26,7 @@ from jaxnerf.registry import FIELDS, Part
 from jaxnerf.training import workdir
 from jaxnerf.training.auto_config import device_fields, fill_from, resolve, resolve_for_device
 from jaxnerf.training.build import build
+from jaxnerf.training.compiled_step import steps_per_dispatch
 from jaxnerf.training.config import RunConfig, auto_fields, changed, flatten, read_config
 from jaxnerf.training.options import UNLIMITED_STEPS
 from test_configs import fields
@@ -58,7 +59,6 @@ AUTO_FIELDS = {
     "train.batch_size": 512,
     "train.rays_per_side": 2,
     "train.microbatch_size": 128,
-    "train.steps_per_dispatch": 8,
     "train.max_steps": 300,
     "train.lr_steps": 300,
     "eval.sample_multiplier": 3,
@@ -332,11 +332,11 @@ def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_pa
     assert not auto_fields(config) and len(lines) == len(DEVICE_FIELDS)
     assert config.eval.chunk == chunk
     # 10 divides the numbers of steps between which rows are logged, checkpoints saved and dead networks sought.
-    assert config.train.steps_per_dispatch == steps
+    assert steps_per_dispatch(config.train, backend) == steps
     assert config.hash_grid.compute_dtype == ("float32" if backend == "cpu" else "bfloat16")
     assert config.train.batch_size % config.train.microbatch_size == 0
     explicit = {"eval.chunk": 5, "eval.max_samples": 6, "train.microbatch_size": 64}
-    explicit |= {"train.steps_per_dispatch": 3, "hash_grid.compute_dtype": "float32"}
+    explicit |= {"hash_grid.compute_dtype": "float32"}
     config, lines = resolve_for_device(changed(read, explicit))
     assert {name: flatten(config.to_dict())[name] for name in explicit} == explicit and not lines
 

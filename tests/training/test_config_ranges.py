@@ -157,7 +157,7 @@ def test_defaults_are_of_their_types_and_in_their_ranges():
     assert found == replaced(RunConfig(), parts=found.parts) and found.parts.items() <= RunConfig().parts.items()
     for name, option, kind, value in declared(RunConfig()):
         assert option.help and not (option.range and kind not in (int, float)), name
-        assert option.auto or not is_auto(value) or name == "train.parallel", name
+        assert option.auto or not is_auto(value), name
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "jaxnerf" / "configs").glob("[!_]*.py")))

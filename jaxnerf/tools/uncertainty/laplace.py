@@ -25,11 +25,11 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxnerf.core import contraction
 from jaxnerf.core.types import Rays, Vector
 from jaxnerf.data.ray_batches import draw_batch
+from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.fields.base import Field
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource, fingerprint_of, folder_of
 
 RESOLUTION = 64  # cells of the deformation along each axis of the box
