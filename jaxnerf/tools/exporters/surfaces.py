@@ -13,6 +13,7 @@ from jaxtyping import Float, Num, UInt8
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.occupancy.grid import cell_inputs
+from jaxnerf.core.occupancy.seen_directions import spread_directions
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.rendering import points_on_rays
 from jaxnerf.core.safe_math import norm
@@ -228,16 +229,8 @@ def _around(poses, count):
     """Returns poses [N, 3, 4] on a sphere around what cameras look at, as far away as they are."""
     center, up = gaze_center(poses), up_of(np.float64(poses))
     radius = np.median(np.linalg.norm(poses[:, :, 3] - center, axis=1))
-    eyes = np.float32(center + radius * sphere_directions(count))
+    eyes = np.float32(center + radius * np.array(spread_directions(count)))
     return np.asarray(jax.vmap(look_at, in_axes=(0, None, None))(eyes, np.float32(center), np.float32(up)))
-
-
-def sphere_directions(count: int) -> np.ndarray:
-    """Returns unit vectors [N, 3] on a golden spiral over the sphere."""
-    steps = np.arange(count) + 0.5
-    height, angle = 1 - 2 * steps / count, np.pi * (1 + np.sqrt(5)) * steps
-    around = np.sqrt(1 - height**2)
-    return np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1)
 
 
 def _surface_function(source, posed):
