@@ -22,7 +22,7 @@ from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.data.geometry.world import points_in_run, poses_in_file
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.output_images import to_8_bits
-from jaxnerf.evaluation.paths.camera_path import CameraPath, path_pixels, posed_views, resize
+from jaxnerf.evaluation.paths.camera_path import path_pixels, posed_views, resize, through_first_lens
 from jaxnerf.runtime.stages import Progress
 from jaxnerf.tools.exporters.base import ExportSource
 
@@ -215,14 +215,10 @@ def _poses_of(source, size, all_around):
     bounded = not source.variables[1].contracted and not source.run.experiment.config.data.ndc
     if all_around and bounded and not look_one_way(poses):
         poses = np.concatenate([poses, _around(poses, max(len(poses) // 2, 1))])
-    height, width = (int(side) for side in views.size[0])
-    focal, center = (
-        np.tile(np.float64(each)[:1], (len(poses), 1)) for each in (views.cameras.focal, views.cameras.center)
-    )
-    path = CameraPath("export", "export", poses, focal, center, width, height)
+    path = through_first_lens("export", poses, views)
     if size is None:
         return path
-    return resize(path, width=size) if width >= height else resize(path, height=size)
+    return resize(path, width=size) if path.width >= path.height else resize(path, height=size)
 
 
 def _around(poses, count):
