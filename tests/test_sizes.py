@@ -15,7 +15,7 @@ MANY_PARAMETERS = {
     "core/occupancy/grid.py:grid_from_scene": CONTRACT,
     "data/ray_batches.py:draw_batch": CONTRACT,
     "options.py:option": "each names a property of a declaration, and most declarations have two or three",
-    "models/grid_schedule.py:make_grid_schedule": "each is an option of a sampler, and samplers of plug-ins pass them, too",
+    "models/grid_schedule.py:make_grid_schedule": "its keywords are options of samplers, those of plug-ins, too",
     "models/occupancy.py:render_with_grid": "it adds the grid's steps to what render_packed takes",
     "core/occupancy/from_scene.py:visible_grid": "it adds the box of a GridSchedule to what grid_from_scene takes",
     "data/geometry/seen_cells.py:_sees": "arrays of a compiled loop",
