@@ -37,6 +37,8 @@ class Field(NamedTuple):
         regularizers: by the name of a registered loss, the function (params) -> scalar; see `register_loss`.
         color_layers: keys of params: the first layers that serve colour alone; empty: not checked. A field is dead,
             too, if no gradient reaches these layers.
+        apply_in_fixed_order: `apply`, with a gradient whose sums have a fixed order on an accelerator, too; None: those
+            of `apply` have.
     """
 
     init: Callable[[jax.Array], Any]
@@ -44,6 +46,7 @@ class Field(NamedTuple):
     input_layers: tuple[str, ...] = ()
     regularizers: Mapping[str, Callable[[Any], jax.Array]] = {}
     color_layers: tuple[str, ...] = ()
+    apply_in_fixed_order: Callable[..., tuple[jax.Array, jax.Array]] | None = None
 
 
 def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
@@ -66,7 +69,7 @@ def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
                 options[name] = sizes * contraction.length_scale((x - center) / scale)
         return field.apply(params, center + scale * contraction.contract((x - center) / scale), viewdirs, **options)
 
-    return field._replace(apply=apply)
+    return field._replace(apply=apply, apply_in_fixed_order=None)
 
 
 def field_scene(field: Field, params: Mapping[str, Any], name: str = "fine", **options: Any) -> SceneFn:

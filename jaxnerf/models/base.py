@@ -105,6 +105,8 @@ class SamplerContext(NamedTuple):
         view: the options of images.
         background: [3] colour behind the scene; None: black.
         box: lower and upper corner of what the run renders, world units; None where the run has none.
+        fixed_order: whether the sums of training must have a fixed order on an accelerator, see `render_placed`; those
+            of the fields then have it.
     """
 
     options: Any
@@ -112,3 +114,4 @@ class SamplerContext(NamedTuple):
     view: ViewOptions
     background: Background | None
     box: Box | None
+    fixed_order: bool = False

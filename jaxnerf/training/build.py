@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxnerf.core.fixed_order import with_fixed_order
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
@@ -84,8 +83,9 @@ def build(config: Config) -> Experiment:
     optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
     if cameras is not None:
         model = cameras.added_to(model)
-    if train.deterministic:
-        model = _in_fixed_order(model, losses, cameras)
+    if train.deterministic and jax.default_backend() != "cpu":  # there all sums have a fixed order
+        _check_fixed_order(losses, cameras)
+        model = model._replace(render=build_model(config, fixed_order=True).render)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
     options = {"batching": train.batching, "extras": extras}
@@ -144,26 +144,26 @@ def _pixel_rays(train, cameras, extras):
     return PixelRays(train.rays_per_side, train.one_ray_fraction)
 
 
-def _in_fixed_order(model, losses, cameras):
-    """Returns a model whose sums have a fixed order."""
+def _check_fixed_order(losses, cameras):
+    """Raises a ValueError if the gradient of what is trained has no fixed order on an accelerator."""
     others = {"cameras.exposure or cameras.refine": cameras is not None}
     # The gradient of the depth loss depends on its own sums over rays; those of other losses do not.
     others["losses.depth"] = any(loss.name == "depth" for loss in losses)
     found = [name for name, is_on in others.items() if is_on]
-    if found and jax.default_backend() != "cpu":
+    if found:
         raise ValueError(
             f"train.deterministic is True, and {' and '.join(found)} is on, whose gradient has no fixed order on an "
             "accelerator; set it to False, or turn the other off"
         )
-    return model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view))
 
 
-def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) -> Model:
+def build_model(config: Config, wrap: Callable[[Field], Field] | None = None, *, fixed_order: bool = False) -> Model:
     """Builds the Model: the config's field under the config's sampler.
 
     Args:
         config: resolved.
         wrap: changes the field that images show; None: it is as the config says.
+        fixed_order: whether the sums of training have a fixed order on an accelerator, too.
     """
     config = read_config(config)
     part = SAMPLERS.get(config.sampler)
@@ -171,10 +171,11 @@ def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) ->
     return part.make(
         SamplerContext(
             options=_filled(config.options_of(part, config.sampler), part.section or config.sampler),
-            make_field=lambda network: _wrapped(wrap, network, _make_field(config, network)),
+            make_field=lambda network: _wrapped(wrap, network, _make_field(config, network, fixed_order)),
             view=config.eval,
             background=dataset.color_behind(config.data),
             box=_box(config),
+            fixed_order=fixed_order,
         )
     )
 
@@ -318,13 +319,15 @@ def _check_scales(config):
             raise ValueError(f"data.num_scales is {config.data.num_scales}, expected 1, as {reason}")
 
 
-def _make_field(config, network) -> Field:
+def _make_field(config, network, fixed_order) -> Field:
     """Makes the field of a network; that of "coarse" is always an MLP."""
     name = config.field if network == "fine" else "mlp"
     part, box = FIELDS.get(name), _box(config)
     section = network if name == "mlp" else name
     options = getattr(config, network) if name == "mlp" else config.options_of(part, name)
     field = part.make(_filled(options, section), box)
+    if fixed_order and field.apply_in_fixed_order is not None:
+        field = field._replace(apply=field.apply_in_fixed_order)
     # The paper's networks are not contracted; all other fields are defined in the box.
     in_box = config.sampler != "hierarchical" or name != "mlp"
     if in_box and config.occupancy.contracted is True:

@@ -26,6 +26,8 @@ _REFLECTIONS = Gone((False,), Changes.TRAINING | Changes.IMAGES, _DROP)
 _LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")
 GONE: dict[str, Gone] = {  # by "section.option"
     **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
+    "hash_grid.geometry_features": Gone((15,), Changes.TRAINING | Changes.IMAGES, _DROP),
+    "hash_grid.feature_scale": Gone((4.0,), Changes.TRAINING | Changes.IMAGES, _DROP),
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
 }
 

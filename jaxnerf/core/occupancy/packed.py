@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnerf.core import rendering, volume_rendering
-from jaxnerf.core.fixed_order import in_fixed_order, segment_sums
+from jaxnerf.core.fixed_order import segment_sums
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
 from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
@@ -111,6 +111,7 @@ def render_placed(
     *,
     longest: int,
     background: Background | None = None,
+    fixed_order: bool = False,
 ) -> Rendering:
     """Renders samples that are in a buffer already, such as those of `importance_samples`.
 
@@ -120,6 +121,8 @@ def render_placed(
         placed: PlacedSamples [K] of these rays, of the rule "segments".
         longest: upper bound of the number of samples of a ray.
         background: see render_samples.
+        fixed_order: whether the samples of a ray are summed in a fixed order, for accelerators, whose own sums over
+            rays have none.
 
     Returns:
         Rendering [B] without weights; `samples` is PackedSamples [K], K being 0 if there are no rays.
@@ -127,7 +130,7 @@ def render_placed(
     check_shapes("render_placed", near=(rays.near, "B"), t=(placed.t, "K"), delta=(placed.delta, "K"))
     shape, scene = rays.near.shape, _without_gradient_if_empty(scene, rays)
     rays = _at_least_one(jax.tree.map(jnp.asarray, rays))
-    options = {"rule": "segments", "longest": longest}
+    options = {"rule": "segments", "longest": longest, "fixed_order": fixed_order}
     sums, packed = _composite("render_placed", scene, rays, placed, **options)
     num_dropped = _at_least_one(placed.num_dropped)
     return _rendering(sums, num_dropped, rays.far, shape, background, packed)
@@ -398,7 +401,7 @@ def _packed_inputs(function, scene, sample_rays, t, used, delta: Callable[[], Ar
     return {name: jnp.where(used[None], value, jax.lax.stop_gradient(value)) for name, value in values.items()}
 
 
-def _composite(function, scene, rays, placed, *, rule, longest, median_depth=False):
+def _composite(function, scene, rays, placed, *, rule, longest, median_depth=False, fixed_order=False):
     """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
     t, ray = placed.t, placed.ray_index
     density, rgb = _evaluate(function, scene, rays, t, ray, placed.used, lambda: placed.delta)
@@ -409,7 +412,7 @@ def _composite(function, scene, rays, placed, *, rule, longest, median_depth=Fal
     colors = [rgb[:, channel] * weights for channel in range(rgb.shape[1])]
     moments = volume_rendering.multiply_or_zero(weights, t), volume_rendering.divide_or_zero(weights, t)
     parts = [optical_depth, *colors, *moments]
-    if in_fixed_order():
+    if fixed_order:
         sums = segment_sums(jnp.stack(parts, axis=-1), ray, starts, placed.used, rays.near.size, longest)
     else:
         sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)

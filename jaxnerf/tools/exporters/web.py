@@ -114,7 +114,7 @@ def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:
 def measure(source: ExportSource, scene: WebScene, views: Views) -> Score:
     """Scores the run, and the run with the features that the textures hold."""
     params, grid = source.variables
-    decoded = {**params, "fine": scene.decoded(params["fine"], network_of(source.run).feature_scale)}
+    decoded = {**params, "fine": scene.decoded(params["fine"])}
     squares = []
     count = min(_NUM_SCORED, len(views.size))
     for index in range(count):
