@@ -3,8 +3,11 @@
 `python -m jaxnerf.eval` is the same program. It writes DIR/eval/STEP/results.json, or DIR/results.json.
 """
 
+import functools
+
 from absl import flags
 
+from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
 
 
@@ -26,29 +29,13 @@ _CONFIG = cli.define_config(
     load_saved=_load_saved,
     option_names=_option_names,
 )
-_WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.")
-_DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
+_RUN = run_flags.define("scored", "uncertainty/NNN.tiff and compares it with the true errors")
 _SPLIT = flags.DEFINE_string("split", None, "The split of the dataset. It overrides config.eval.split.")
-_STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is scored.")
-_CHUNK = cli.define_count(
-    "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
-)
 _WATCH = flags.DEFINE_bool("watch", False, "Whether to score each new checkpoint until training ends.")
 _POLL = flags.DEFINE_float(
     "poll_seconds", 10.0, "The time between two searches for a checkpoint with --watch.", lower_bound=0.01
 )
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an earlier result.")
-_BAKE_OCCUPANCY = flags.DEFINE_bool(
-    "bake_occupancy",
-    None,
-    "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
-    "config.eval.bake_occupancy.",
-)
-_MAX_UNCERTAINTY = cli.define_number(
-    "max_uncertainty",
-    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
-    "allow; 1: off. It overrides config.eval.max_uncertainty.",
-)
 _ERROR_BUDGET = flags.DEFINE_float(
     "error_budget",
     None,
@@ -65,19 +52,6 @@ _SHARD = flags.DEFINE_string(
     "K/N scores each N-th view from view K on, where K counts from 0; auto takes K and N from srun or mpirun. "
     "Any number of processes may run at once; the last one to finish writes results.json.",
 )
-_UNCERTAINTY = flags.DEFINE_string(
-    "uncertainty",
-    None,
-    "An estimator of the error of each pixel: laplace, of one run, ensemble, of several, or a registered one. The "
-    "program writes uncertainty/NNN.tiff and compares it with the true errors.",
-)
-_MEMBERS = flags.DEFINE_list("members", None, "ensemble: workdirs of the other runs, which differ in seed.")
-_COVERAGE = flags.DEFINE_float(
-    "coverage",
-    0.9,
-    "The fraction of true errors that the intervals of --uncertainty are to hold. They are calibrated on the views "
-    "that config.data.hold_out has kept from training.",
-)
 
 
 def main(argv):
@@ -85,34 +59,25 @@ def main(argv):
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation import evaluate, external, quality_search
     from jaxnerf.runtime import shards
-    from jaxnerf.tools.uncertainty.predict import requested
 
     shard = shards.parse(_SHARD.value)
     _check_flags(is_sharded=shard != shards.WHOLE)
-    errors = {"step": _STEP.value, "members": _MEMBERS.value, "coverage": _COVERAGE.value}
-    predictor = requested(_UNCERTAINTY.value, _WORKDIR.value, **errors)
-    overrides = {
-        "bake_occupancy": _BAKE_OCCUPANCY.value,
-        "chunk": _CHUNK.value,
-        "max_uncertainty": _MAX_UNCERTAINTY.value,
-    }
-    options = {
-        "config": _CONFIG.value,
-        "split": _SPLIT.value,
-        "settings": {name: value for name, value in overrides.items() if value is not None},
-    }
+    predictor = _RUN.predictor()
+    workdir, split, overwrite = _RUN.workdir.value, _SPLIT.value, _OVERWRITE.value
+    restore = functools.partial(_RUN.restore, _CONFIG.value)
     if _PREDICTIONS.value:
-        results = external.score_folder(
-            _PREDICTIONS.value, config=_reference_config(), split=_SPLIT.value, overwrite=_OVERWRITE.value
-        )
+        folder = _PREDICTIONS.value
+        results = external.score_folder(folder, config=_reference_config(), split=split, overwrite=overwrite)
     elif _WATCH.value:
-        evaluate.watch(_WORKDIR.value, data_dir=_DATA_DIR.value, poll_seconds=_POLL.value, **options)
+        evaluate.watch(workdir, restore, poll_seconds=_POLL.value, split=split)
         return
     else:
-        options |= {"step": _STEP.value, "data_dir": _DATA_DIR.value, "overwrite": _OVERWRITE.value}
-        if _ERROR_BUDGET.value is not None:
-            options["settings"] |= quality_search.choose(_WORKDIR.value, _ERROR_BUDGET.value, **options)
-        results = evaluate.evaluate(_WORKDIR.value, shard=shard, predictor=predictor, **options)
+        target = {"split": split, "step": _RUN.step.value, "overwrite": overwrite}
+        budget, found = _ERROR_BUDGET.value, {}
+        if budget is not None:
+            found = quality_search.choose(workdir, restore, budget, **target)
+        run = restore(found)
+        results = evaluate.score_run(run, workdir, shard=shard, predictor=predictor and predictor(run), **target)
     if results is None:
         print(f"shard {_SHARD.value} is done; views of other shards are missing")
         return
@@ -120,21 +85,21 @@ def main(argv):
 
 
 def _check_flags(is_sharded):
-    if not (_WORKDIR.value or _PREDICTIONS.value):
+    if not (_RUN.workdir.value or _PREDICTIONS.value):
         raise ValueError("there is nothing to score; give --workdir=DIR of a run, or --predictions=DIR of images")
     for name, value in (("predictions", _PREDICTIONS.value), ("watch", _WATCH.value)):
         if is_sharded and value:
             raise ValueError(f"--shard splits the views of one checkpoint, not --{name}; drop one of them")
     # What --predictions and --watch cannot use.
     of_one_checkpoint = {
-        "step": _STEP.value,
+        "step": _RUN.step.value,
         "error_budget": _ERROR_BUDGET.value,
-        "uncertainty": _UNCERTAINTY.value,
+        "uncertainty": _RUN.uncertainty.value,
     }
     of_a_run = of_one_checkpoint | {
-        "chunk": _CHUNK.value,
-        "bake_occupancy": _BAKE_OCCUPANCY.value,
-        "max_uncertainty": _MAX_UNCERTAINTY.value,
+        "chunk": _RUN.chunk.value,
+        "bake_occupancy": _RUN.bake_occupancy.value,
+        "max_uncertainty": _RUN.max_uncertainty.value,
     }
     unused = {
         "predictions": (_PREDICTIONS.value, of_a_run | {"watch": _WATCH.value or None}),
@@ -154,20 +119,20 @@ def _reference_config():
     from jaxnerf.training.config import read_config
     from jaxnerf.training.workdir import load_config
 
-    if _CONFIG.value is None and not _WORKDIR.value:
-        if not _DATA_DIR.value:
+    if _CONFIG.value is None and not _RUN.workdir.value:
+        if not _RUN.data_dir.value:
             return None
         from jaxnerf.configs import default
 
-        return read_config(cli.use_data(default.get_config(), _DATA_DIR.value))
-    config = load_config(_WORKDIR.value) if _CONFIG.value is None else read_config(_CONFIG.value)
-    return dataset_at(config, _DATA_DIR.value)
+        return read_config(cli.use_data(default.get_config(), _RUN.data_dir.value))
+    config = load_config(_RUN.workdir.value) if _CONFIG.value is None else read_config(_CONFIG.value)
+    return dataset_at(config, _RUN.data_dir.value)
 
 
 def run():
     """Runs the program."""
-    cli.use_saved_config(only_for_fields=True)
-    cli.run(main, stopped="between two views; the same command continues from there")
+    prepare = functools.partial(cli.with_saved_config, only_for_fields=True)
+    cli.run(main, prepare=prepare, stopped="between two views; the same command continues from there")
 
 
 if __name__ == "__main__":

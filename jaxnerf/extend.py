@@ -9,7 +9,7 @@ import typing
 
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import without_samples
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.options import (
@@ -28,10 +28,12 @@ from jaxnerf.options import (
 
 if typing.TYPE_CHECKING:
     from jaxnerf.tools.exporters.base import ExportSource
+    from jaxnerf.tools.exporters.options import ExportOptions
     from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource
 
 _ON_DEMAND = {
     "ExportSource": "jaxnerf.tools.exporters.base",
+    "ExportOptions": "jaxnerf.tools.exporters.options",
     "Estimate": "jaxnerf.tools.uncertainty.base",
     "UncertaintySource": "jaxnerf.tools.uncertainty.base",
 }
@@ -48,7 +50,7 @@ __all__ = [
     # fields and samplers
     "Field", "Model", "SamplerContext", "field_scene", "needs_of_fields", "split_key", "without_samples",
     # readers and exporters
-    "Capture", "Frame", "ExportSource",
+    "Capture", "Frame", "CameraFiles", "ExportSource", "ExportOptions",
     # estimators of uncertainty
     "Estimate", "UncertaintySource",
     # options

@@ -73,7 +73,6 @@ class Option(NamedTuple):
     range: Range | None
     choices: tuple[str, ...]
     auto: bool
-    late: bool
     changes: Changes | None
     check: Callable[[Any], str | None] | None
     protocol: bool
@@ -88,7 +87,6 @@ def option(
     range: Range | None = None,
     choices: tuple[str, ...] = (),
     auto: bool = False,
-    late: bool = False,
     changes: Changes | None = None,
     check: Callable[[Any], str | None] | None = None,
     protocol: bool = False,
@@ -105,13 +103,12 @@ def option(
         range: of a number.
         choices: all values of a text; empty: any.
         auto: whether the value may be "auto", which `Options.resolve` or `Options.resolve_for_device` replaces.
-        late: whether "auto" stays in the config instead, as the value is inferred for each checkpoint.
         changes: what depends on the value; None: as the class says in `Options.changes`.
         check: value -> what is expected in place of it, or None where the value is right. For tuples.
         protocol: whether an evaluation records the value, as it determines which images are compared.
         max_int: the largest whole number.
     """
-    declared = Option(help, unit, range, tuple(choices), auto, late, changes, check, protocol, max_int)
+    declared = Option(help, unit, range, tuple(choices), auto, changes, check, protocol, max_int)
     return dataclasses.field(default=default, metadata={"option": declared})
 
 
@@ -316,7 +313,7 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
     Args:
         kind: the part's class of options.
         values: of all options, by name; lists become tuples.
-        prefix: of the names in messages, such as "train.".
+        prefix: of the flags in messages, such as "config.train.".
 
     Raises:
         ValueError: names the option, its value and what is expected, or the option that is missing or unknown.
@@ -324,18 +321,18 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
     known = declarations(kind)
     missing, unknown = [name for name in known if name not in values], sorted(set(values) - set(known))
     if missing:
-        raise ValueError(f"--config.{prefix}{missing[0]} is missing; restore the config, or set it")
+        raise ValueError(f"--{prefix}{missing[0]} is missing; restore the config, or set it")
     if unknown:
-        raise ValueError(f"--config.{prefix}{unknown[0]} is no field, expected one of {sorted(known)}")
+        raise ValueError(f"--{prefix}{unknown[0]} is no field, expected one of {sorted(known)}")
     return kind(**{name: read_value(*known[name], values[name], f"{prefix}{name}") for name in known})
 
 
-def read_value(declared: Option, kind: Any, value: Any, name: str) -> Any:
-    """Returns the value of one option, with tuples in place of lists; ValueError where it is none."""
+def read_value(declared: Option, kind: Any, value: Any, flag: str) -> Any:
+    """Returns the value of one option, with tuples in place of lists; ValueError, with its flag, where it is none."""
     value = as_tuples(value)
 
     def refuse(expected):
-        raise ValueError(f"--config.{name} is {short_repr(value)}, expected {expected}; correct it")
+        raise ValueError(f"--{flag} is {short_repr(value)}, expected {expected}; correct it")
 
     if is_auto(value) and (declared.auto or AUTO in declared.choices):
         return value

@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from jaxnerf.options import Facts, Options, Schedule
+from jaxnerf.options import Facts, Options, Schedule, is_auto
 
 
 class Part(NamedTuple):
@@ -49,12 +49,14 @@ class Reader(NamedTuple):
     """A reader of one dataset format.
 
     Attributes:
-        read: folder -> Capture.
+        read: folder -> Capture, see `register_reader`.
         detect: folder -> whether the folder holds this format.
+        views: (DataOptions, split) -> Views, of a dataset without a folder; `read` is not called then.
     """
 
     read: Callable[..., Any]
     detect: Callable[..., bool]
+    views: Callable[..., Any] | None = None
 
 
 class Registry:
@@ -127,8 +129,17 @@ READERS = Registry(
         "transforms": "jaxnerf.data.readers.transforms:READER",
         "colmap": "jaxnerf.data.readers.colmap:READER",
         "llff": "jaxnerf.data.readers.llff:READER",
+        "synthetic": "jaxnerf.data.synthetic:READER",
     },
 )
+
+
+def checked_options(function: str, options: type[Options] | None) -> type[Options] | None:
+    """Returns the class of options of a part; ValueError, with the name of the register function, if it is none."""
+    is_class = isinstance(options, type) and issubclass(options, Options) and "__dataclass_fields__" in vars(options)
+    if options is not None and not is_class:
+        raise ValueError(f"{function}: options is {options!r}, expected a frozen dataclass that inherits from Options")
+    return options
 
 
 def register_field(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
@@ -144,7 +155,7 @@ def register_field(name: str, make: Callable[..., Any], *, options: type[Options
     Raises:
         ValueError: if another field has that name, or if `options` is no such class.
     """
-    FIELDS.add(name, Part(make, _checked_options("register_field", options)))
+    FIELDS.add(name, Part(make, checked_options("register_field", options)))
 
 
 def register_sampler(name: str, make: Callable[..., Any], *, options: type[Options] | None = None) -> None:
@@ -158,7 +169,7 @@ def register_sampler(name: str, make: Callable[..., Any], *, options: type[Optio
     Raises:
         ValueError: if another sampler has that name, or if `options` is no such class.
     """
-    SAMPLERS.add(name, Part(make, _checked_options("register_sampler", options)))
+    SAMPLERS.add(name, Part(make, checked_options("register_sampler", options)))
 
 
 def register_loss(
@@ -199,7 +210,8 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
 
     Args:
         name: of the format.
-        read: (folder: Path) -> Capture, see `jaxnerf.extend.Capture`.
+        read: (folder: Path) -> Capture, see `jaxnerf.extend.Capture`. If each split has a file of its own, `read` may
+            ask for `split` by name: the Capture then needs the frames of that split only; None: those of all.
         detect: (folder: Path) -> whether the folder holds this format, for `data.format` "auto"; None: never.
 
     Raises:
@@ -208,12 +220,9 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
     READERS.add(name, Reader(read, detect or _never))
 
 
-def _checked_options(function, options):
-    """Returns the class of options of a part; ValueError if it is none."""
-    is_class = isinstance(options, type) and issubclass(options, Options) and "__dataclass_fields__" in vars(options)
-    if options is not None and not is_class:
-        raise ValueError(f"{function}: options is {options!r}, expected a frozen dataclass that inherits from Options")
-    return options
+def needs_folder(format: str) -> bool:
+    """Returns whether datasets of a format, or of "auto", lie in a folder, unlike the embedded scene."""
+    return is_auto(format) or READERS.get(format).views is None
 
 
 def _never(folder):

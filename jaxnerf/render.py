@@ -7,25 +7,12 @@ import sys
 
 from absl import flags
 
+from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
 
 _SIDE = {"lower_bound": 1, "upper_bound": 16384}
-_WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
-_DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
-_STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is rendered.")
-_CHUNK = cli.define_count(
-    "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
-)
-_BAKE_OCCUPANCY = flags.DEFINE_bool(
-    "bake_occupancy",
-    None,
-    "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
-    "config.eval.bake_occupancy.",
-)
-_MAX_UNCERTAINTY = cli.define_number(
-    "max_uncertainty",
-    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
-    "allow; 1: off. It overrides config.eval.max_uncertainty.",
+_RUN = run_flags.define(
+    "rendered", "uncertainty/0000.tiff, in units of colour, an image of it, and a video", required=True
 )
 _PATH = flags.DEFINE_string(
     "path",
@@ -71,16 +58,6 @@ _VIDEO = flags.DEFINE_string(
 )
 _DEPTH = flags.DEFINE_bool("depth", False, "Whether to make a video of the depth, too.")
 _RGBA = flags.DEFINE_bool("rgba", False, "Whether to write rgba/0000.png, too: straight alpha, no background.")
-_UNCERTAINTY = flags.DEFINE_string(
-    "uncertainty",
-    None,
-    "An estimator of the error of each pixel: laplace, of one run, ensemble, of several, or a registered one. The "
-    "program writes uncertainty/0000.tiff, in units of colour, an image of it, and a video.",
-)
-_MEMBERS = flags.DEFINE_list("members", None, "ensemble: workdirs of the other runs, which differ in seed.")
-_COVERAGE = flags.DEFINE_float(
-    "coverage", 0.9, "The fraction of true errors that the intervals of a calibration are to hold, see jaxnerf-eval."
-)
 _NAME = flags.DEFINE_string("name", None, "The name of the folder and the video. It overrides the path's.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to delete the frames of an earlier call first.")
 _SHARD = flags.DEFINE_string(
@@ -94,37 +71,30 @@ _SHARD = flags.DEFINE_string(
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.evaluation.paths.render_path import render_path
+    from jaxnerf.evaluation.paths.render_path import Frames, Output, render_path
     from jaxnerf.runtime import shards
-    from jaxnerf.tools.uncertainty.predict import requested
 
-    errors = {"step": _STEP.value, "members": _MEMBERS.value, "coverage": _COVERAGE.value}
-
-    overrides = {
-        "bake_occupancy": _BAKE_OCCUPANCY.value,
-        "chunk": _CHUNK.value,
-        "max_uncertainty": _MAX_UNCERTAINTY.value,
-    }
-    written = render_path(
-        _WORKDIR.value,
+    predictor = _RUN.predictor()
+    frames = Frames(
         path=_PATH.value,
-        step=_STEP.value,
-        data_dir=_DATA_DIR.value,
-        settings={name: value for name, value in overrides.items() if value is not None},
-        size=(_WIDTH.value, _HEIGHT.value),
         num_frames=_FRAMES.value,
         closed=_CLOSED.value,
         up=_UP.value,
-        fps=_FPS.value,
+        width=_WIDTH.value,
+        height=_HEIGHT.value,
+        max_rays_per_pixel=_MAX_RAYS.value,
+    )
+    output = Output(
         name=_NAME.value,
         rgba=_RGBA.value,
         depth=_DEPTH.value,
-        predictor=requested(_UNCERTAINTY.value, _WORKDIR.value, **errors),
-        kind=_VIDEO.value,
+        video=_VIDEO.value,
+        fps=_FPS.value,
         overwrite=_OVERWRITE.value,
         shard=shards.parse(_SHARD.value),
-        max_rays_per_pixel=_MAX_RAYS.value,
     )
+    run, workdir = _RUN.restore(), _RUN.workdir.value
+    written = render_path(run, workdir, frames, output, step=_RUN.step.value, predictor=predictor)
     print(*written, sep="\n")
     if _VIDEO.value == "auto" and written[-1].suffix == ".gif":
         print("the video is a GIF, as imageio finds no ffmpeg; pip install imageio-ffmpeg for MP4", file=sys.stderr)

@@ -143,8 +143,8 @@ def _viewer(is_first):
 
 def run():
     """Runs the program."""
-    cli.use_saved_config()
-    cli.run(main, stopped="before it could save; the same command resumes from the last checkpoint, if there is one")
+    stopped = "before it could save; the same command resumes from the last checkpoint, if there is one"
+    cli.run(main, prepare=cli.with_saved_config, stopped=stopped)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,9 @@ from jaxnerf.core.poses import look_at
 from jaxnerf.core.types import Camera, Rays
 from jaxnerf.core.views import Views
 from jaxnerf.data import synthetic
+from jaxnerf.data.geometry import bounds
+from jaxnerf.data.images.load_images import load_capture
+from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
 
 WHITE = (1.0, 1.0, 1.0)
@@ -258,6 +261,13 @@ def write_blender(folder, shots, *, split="train"):
     angle = 2 * math.atan(0.5 * camera.width / float(camera.focal[0]))
     content = {"camera_angle_x": angle, "frames": frames}
     (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def load_blender(folder, *, split="train", factor=1, near=0.0, far=0.0, background=WHITE, select=None):
+    """Returns the Views of a split of a Blender dataset; near and far are 2 and 6 unless they are given."""
+    capture = bounds.with_bounds(blender.read_capture(folder, split=split))
+    capture = bounds.override_bounds(capture, near, far, np.eye(4))
+    return load_capture(capture, split=split, factor=factor, background=background, select=select)
 
 
 def write_colmap(folder, shots, *, points=None, **images):

@@ -1,5 +1,6 @@
 """A run of a closed-form scene for tests of exporters: nothing is trained or read."""
 
+import dataclasses
 import functools
 from types import SimpleNamespace
 
@@ -11,13 +12,19 @@ from jaxnerf import Camera, Views, create_grid, look_at, mask_scene, render_rays
 from jaxnerf.data import ray_batches
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.fields.base import Field
-from jaxnerf.tools.exporters.base import ExportSettings, ExportSource
+from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.options import MeshOptions, SplatsOptions, WebOptions
 from jaxnerf.training.config import RunConfig, changed
 
 RADIUS, SIZE = 0.5, 48
 # A rotation by 90 degrees about z, twice the size, moved: the world of the dataset's files.
 TO_FILE = np.float32([[0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
 CENTER = TO_FILE[:3, 3]
+
+
+@dataclasses.dataclass(frozen=True)
+class AllOptions(MeshOptions, SplatsOptions, WebOptions):
+    """The options of all exporters."""
 
 
 def ball(x, viewdirs):
@@ -84,4 +91,4 @@ def source_of(scene=ball, *, say=lambda line: None, background=None, count=14, n
         model_with=model_with,
     )
     settings = {"resolution": 32, "size": SIZE, **settings}
-    return ExportSource(run, 7, (None, grid), views, ExportSettings(**settings), say)
+    return ExportSource(run, 7, (None, grid), views, AllOptions(**settings), say)

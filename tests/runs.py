@@ -1,5 +1,6 @@
 """A run of seconds that tests share, and programs as processes."""
 
+import dataclasses
 import functools
 import json
 import os
@@ -50,6 +51,25 @@ PACKED = {
 def as_flags(fields):
     """Returns the flags that set fields of a config."""
     return [f"--config.{name}={value}" for name, value in fields.items()]
+
+
+def evaluate(folder, *, settings=None, predictor=None, **options):
+    """Restores the run in a folder and scores it, as jaxnerf-eval does; predictor: TrainedRun -> Predictor."""
+    from jaxnerf.evaluation.evaluate import score_run
+    from jaxnerf.evaluation.restore import restore_run
+
+    run = restore_run(folder, settings=settings)
+    return score_run(run, folder, predictor=predictor and predictor(run), **options)
+
+
+def render_path(folder, *, settings=None, predictor=None, **options):
+    """Restores the run in a folder and renders it, as jaxnerf-render does; options: of `Frames` and of `Output`."""
+    from jaxnerf.evaluation.paths.render_path import Frames, Output, render_path
+    from jaxnerf.evaluation.restore import restore_run
+
+    frames = {field.name: options.pop(field.name) for field in dataclasses.fields(Frames) if field.name in options}
+    run = restore_run(folder, settings=settings)
+    return render_path(run, folder, Frames(**frames), Output(**options), predictor=predictor)
 
 
 # The folders of the programs below jaxnerf/tools.

@@ -72,7 +72,7 @@ SURFACE = {
     "register_sampler": "name make | options=None",
     "register_loss": "name function | on='renderings' needs=() weight=0.0 help=''",
     "register_reader": "name read | detect=None",
-    "register_exporter": "name export | check=None",
+    "register_exporter": "name export | check=None options=None",
     "register_estimator": "name estimate |",
 }
 TYPES = ["Rays", "Samples", "PackedSamples", "Rendering", "Camera", "Views", "Batch", "OccupancyGrid", "SceneFn"]

@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from jaxnerf.evaluation import output_images
-from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.metric_log import read_rows
-from runs import SMOKE_FLAGS, run_forked, smoke_config
+from runs import SMOKE_FLAGS, evaluate, run_forked, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")

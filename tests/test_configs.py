@@ -35,7 +35,7 @@ def resolved(config):
 
 
 DATA = {"format": "blender", "factor": 1, "background": "none", "background_color": ()}
-DATA |= {"world": "file", "ndc": False, "fingerprint": ""}
+DATA |= {"world": "file", "ndc": False}
 
 
 def fields(config):

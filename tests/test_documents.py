@@ -9,6 +9,7 @@ from ml_collections import ConfigDict
 import jaxnerf
 from jaxnerf import registry
 from jaxnerf.configs import default
+from jaxnerf.options import declarations
 from jaxnerf.tools.exporters.registration import EXPORTERS
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from runs import ROOT, run_forked
@@ -109,6 +110,9 @@ def defined_flags(files):
 PROGRAMS = dict(re.findall(r"^    (jaxnerf-\w+) = ([\w.]+):run$", (ROOT / "setup.cfg").read_text(), re.MULTILINE))
 COMMON = {"help", "config", "plugins", "verbosity", "page"}  # of absl, jaxnerf/runtime/cli.py, experiments/common.py
 FLAGS = {name: COMMON | defined_flags([ROOT / f"{module.replace('.', '/')}.py"]) for name, module in PROGRAMS.items()}
+FLAGS["jaxnerf-export"] |= {name for kind in EXPORTERS.names() for name in declarations(EXPORTERS.get(kind).options)}
+for name in ("jaxnerf-eval", "jaxnerf-render"):
+    FLAGS[name] |= defined_flags([ROOT / "jaxnerf" / "evaluation" / "run_flags.py"])
 ALL_FLAGS = set.union(*FLAGS.values(), defined_flags((ROOT / "experiments").rglob("*.py")))
 
 

@@ -11,9 +11,7 @@ from PIL import EpsImagePlugin, Image
 
 from jaxnerf.data.images import image_files
 from jaxnerf.data.readers import colmap_model, ply, validation
-from jaxnerf.evaluation.evaluate import evaluate
 from jaxnerf.evaluation.paths.camera_path import read_path_file
-from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime import shards
 from jaxnerf.tools.capture_check import camera_plot
@@ -23,7 +21,7 @@ from jaxnerf.tools.structure_from_motion.estimate import estimate_cameras
 from jaxnerf.tools.structure_from_motion.images import is_rotated_jpeg
 from jaxnerf.training.metric_log import MetricLog, read_rows
 from jaxnerf.training.workdir import load_config, workdir_lock
-from runs import ROOT
+from runs import ROOT, evaluate, render_path
 from test_scenes.synthetic_capture import GROUND_TRUTH, read_ground_truth
 
 pytest_plugins = ["run_fixtures"]

@@ -31,15 +31,14 @@ ALLOWED = {
     ("tools.capture_check", "tools.next_images"),
     ("tools.viewer", "tools.exporters"),
     ("tools.viewer", "tools.uncertainty"),
+    ("tools.exporters", "tools.uncertainty"),
 }
 # Where the method hands over to a tool, in a lazy import.
 HANDS_OVER = {
     ("jaxnerf.train", "tools.viewer"),
-    ("jaxnerf.eval", "tools.uncertainty"),
-    ("jaxnerf.render", "tools.uncertainty"),
+    ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
     ("jaxnerf.extend", "tools.uncertainty"),
-    ("jaxnerf.evaluation.restore", "tools.uncertainty"),
 }
 FORBIDDEN = {("fields", "runtime"), ("models", "runtime")}
 SHARED = ("jaxnerf.registry", "jaxnerf.options")

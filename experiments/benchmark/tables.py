@@ -38,8 +38,8 @@ Beside it stand published figures, and programs that were run on the same images
 ## Beside others
 
 Hardware and time are those of the source. Only figures of the same images compare. Where the images of lego and mic
-have no number of views, they are all 200 test views; published figures of the 25 views are {shift[0]:+.2f} to
-{shift[1]:+.2f} dB from those of all.
+have no number of views, they are all 200 test views, where no figure of the 25 is known; published figures of
+the 25 views are {shift[0]:+.2f} to {shift[1]:+.2f} dB from those of all.
 
 <!-- beside -->
 <!-- end of beside -->
@@ -159,11 +159,15 @@ def others_of(job: jobs.Job, runs: Sequence[Mapping[str, Any]], *, all_views: bo
     Args:
         job: of the runs.
         runs: its scores.
-        all_views: whether figures of a whole test split, of which the runs have a part, are among them.
+        all_views: whether figures of a whole test split are among them, where none of the part of the runs is known.
     """
     kinds, sizes = job.beside if all_views else job.beside[:1], {images_of(score) for score in runs}
     kinds = [kind for kind in kinds if any(size in kind for size in sizes)]
-    return [entry for entry in (*published.BENCHMARK, *published.TRAINING) if entry["what"] in kinds]
+    entries = [entry for entry in (*published.BENCHMARK, *published.TRAINING) if entry["what"] in kinds]
+    parts = {
+        (entry["what"].removesuffix(", 25 test views"), entry["name"]) for entry in entries if "25" in entry["what"]
+    }
+    return [entry for entry in entries if (entry["what"], entry["name"]) not in parts]
 
 
 def images_of(score: Mapping[str, Any]) -> str:

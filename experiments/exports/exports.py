@@ -29,7 +29,7 @@ import common
 from jaxnerf.fields.still_life import BODIES
 from jaxnerf.runtime import cli
 from jaxnerf.tools.exporters import mesh as mesh_exporter
-from jaxnerf.tools.exporters.base import ExportSettings, export_run
+from jaxnerf.tools.exporters.base import export_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run on the embedded scene.", required=True)
 _RESOLUTION = flags.DEFINE_integer("resolution", 256, "Voxels along the longest side.")
@@ -70,18 +70,20 @@ _opaque, _glass = functools.partial(distance_to, opaque=True), functools.partial
 def main(argv: list[str]) -> None:
     """Exports and measures."""
     del argv
-    settings = ExportSettings(resolution=_RESOLUTION.value, num_points=_NUM_POINTS.value)
     rows, measured, profiles, spent = [], [], [], timed_stages()
     for name in common.chosen("--exports", _EXPORTS.value, _KINDS):
-        kind, options = _KINDS[name]
+        kind, settings = _KINDS[name]
+        if _NUM_POINTS.value and kind != "mesh":
+            settings = {**settings, "num_points": _NUM_POINTS.value}
         said, started, cpu = [], time.perf_counter(), time.process_time()
         folder = export_run(
             _WORKDIR.value,
             kind,
-            settings=settings._replace(**options),
             name=f"study-{name}",
             overwrite=True,
             say=said.append,
+            resolution=_RESOLUTION.value,
+            **settings,
         )
         size = sum(path.stat().st_size for path in folder.rglob("*.*")) / 1e6
         seconds = time.perf_counter() - started, time.process_time() - cpu

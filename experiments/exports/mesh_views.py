@@ -30,7 +30,7 @@ from jaxnerf.core.metrics import psnr
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import cli
-from jaxnerf.tools.exporters.base import ExportSettings, export_run
+from jaxnerf.tools.exporters.base import export_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run.", required=True)
 _OUT = flags.DEFINE_string("out", None, "Folder for three.js and the picture.", required=True)
@@ -60,10 +60,8 @@ def main(argv: list[str]) -> None:
         page.wait_for_function("() => window.draw !== undefined")
         for name in common.chosen("--meshes", _MESHES.value, MESHES):
             said, started, cpu = [], time.perf_counter(), time.process_time()
-            settings = ExportSettings(format="glb", up="+z", **MESHES[name])
-            folder = export_run(
-                _WORKDIR.value, "mesh", settings=settings, name=f"views-{name}", overwrite=True, say=said.append
-            )
+            options = {"name": f"views-{name}", "overwrite": True, "say": said.append}
+            folder = export_run(_WORKDIR.value, "mesh", **options, format="glb", up="+z", **MESHES[name])
             seconds = time.perf_counter() - started, time.process_time() - cpu
             content = (folder / "mesh.glb").read_bytes()
             (out / f"{name}.glb").write_bytes(content)

@@ -10,7 +10,8 @@ import shutil
 
 from absl import flags
 
-from jaxnerf.evaluation.evaluate import evaluate, summary
+from jaxnerf.evaluation.evaluate import score_run, summary
+from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.options import replaced, values_of
 from jaxnerf.runtime import cli
 from jaxnerf.training import workdir
@@ -19,7 +20,7 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of the run to score.", r
 _LIKE = flags.DEFINE_string("like", None, "Folder of the run whose images are the reference.", required=True)
 _OUT = flags.DEFINE_string("out", None, "Folder of the scored copy, missing.", required=True)
 
-_MAY_DIFFER = ("dir", "factor", "fingerprint", "width")
+_MAY_DIFFER = ("dir", "factor", "width")
 
 
 def main(argv: list[str]) -> None:
@@ -28,18 +29,18 @@ def main(argv: list[str]) -> None:
     out, config = pathlib.Path(_OUT.value), workdir.load_config(_WORKDIR.value)
     if out.exists():
         raise ValueError(f"{out}: exists, expected a missing folder; remove it, or give another --out")
-    like = workdir.load_config(_LIKE.value).data
+    like = workdir.load_config(_LIKE.value)
     own = values_of(config.data)
     # Another split of the images could put training images of RUN among those that are scored.
-    for name, value in values_of(like).items():
+    for name, value in values_of(like.data).items():
         if name not in _MAY_DIFFER and value != own[name]:
             raise ValueError(
                 f"{_LIKE.value}: data.{name} is {value!r}, in {_WORKDIR.value} it is {own[name]!r}; "
                 f"expected runs that differ in {', '.join(_MAY_DIFFER)} only"
             )
-    config = replaced(config, data=like)
+    config = replaced(config, data=like.data, fingerprint=like.fingerprint)
     shutil.copytree(_WORKDIR.value, out, ignore=shutil.ignore_patterns("eval", "renders"))
-    print(summary(evaluate(out, config=config)))
+    print(summary(score_run(restore_run(out, config), out)))
 
 
 if __name__ == "__main__":

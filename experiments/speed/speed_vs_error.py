@@ -7,9 +7,7 @@ Writes DIR/<part>.json and prints the tables. What DIR holds already is kept: th
 interruption. With --page the tables replace what lies between <!-- speed --> and <!-- end of speed --> in that file.
 """
 
-import math
 import pathlib
-import statistics
 import sys
 
 from absl import flags
@@ -21,7 +19,6 @@ from speed import published, step_parts, training
 from jaxnerf.runtime import cli
 
 PARTS = ("training", "parts")
-BARS = (29.0, 30.0, 31.0, 32.0, 32.5, 33.5)
 _OUT = flags.DEFINE_string("out", None, "Folder of the measurements.", required=True)
 _PARTS = flags.DEFINE_list("parts", list(PARTS), f"Parts to measure, of {PARTS}; 'report' alone measures nothing.")
 _CURVES = flags.DEFINE_list("curves", None, "Names of training curves; all when not given.")
@@ -74,8 +71,8 @@ def report(measured: dict[str, dict]) -> list[str]:
 
 
 def _training(kept):
-    """Returns the lines of the curves, and of the times to fixed scores."""
-    rows, reached = [], []
+    """Returns the lines of the curves."""
+    rows = []
     for name, curve in kept["curves"].items():
         if not any(curve["runs"].values()):
             continue
@@ -94,18 +91,12 @@ def _training(kept):
                     f"{point['seconds_per_frame']:.2f}",
                 )
             )
-        reached.append((name, *(_reached(curve["runs"], bar) for bar in BARS)))
     heads = ("curve", "s", "comparable s", "PSNR", "SSIM", "rays", "compiling s", "set-up s", "s a frame")
     return [
         f"Training, scored on the test views; medians of the seeds. {kept['machine']}. Comparable seconds: seconds "
         f"times the GFLOP/s of a matrix product just before and after the run, over {common.REFERENCE_GFLOPS:.0f}.",
         "",
         *common.markdown(heads, rows),
-        "",
-        "Shortest training, in seconds (comparable seconds), whose PSNR reached the bar; only the times above were "
-        "tried:",
-        "",
-        *common.markdown(("curve", *(f"{bar:g} dB" for bar in BARS)), reached),
     ]
 
 
@@ -139,19 +130,6 @@ def _others(heads, entries, **formats):
         "",
         *common.markdown(heads, rows),
     ]
-
-
-def _reached(runs, bar):
-    times = [
-        statistics.median_high(first_reached(points, bar, key) for points in runs.values())
-        for key in ("seconds", "comparable")
-    ]
-    return "-" if math.isinf(times[0]) else "{:.0f} ({:.0f})".format(*times)
-
-
-def first_reached(points: list[dict], bar: float, key: str = "seconds") -> float:
-    """Returns the time of the first of a run's points that scores at least `bar` dB, or infinity."""
-    return min((point[key] for point in points if point["psnr"] >= bar), default=math.inf)
 
 
 if __name__ == "__main__":

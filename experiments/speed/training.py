@@ -8,7 +8,8 @@ from typing import Any
 
 import common
 
-from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.evaluation.evaluate import score_run, train_and_evaluate
+from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import metric_log, workdir
 
 
@@ -130,7 +131,7 @@ def run_to(time_limit: float, config, where: pathlib.Path) -> dict[str, Any] | N
         return None
     wall = time.perf_counter() - started
     speed.append(common.matrix_gflops())
-    result = evaluate(where, overwrite=True)
+    result = score_run(restore_run(where), where, overwrite=True)
     trained, compiling = result["training_seconds"], result["compile_seconds"]
     return {
         "time_limit": time_limit,

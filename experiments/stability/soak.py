@@ -23,7 +23,8 @@ import jax
 import numpy as np
 
 from jaxnerf.configs import smoke
-from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.evaluation.evaluate import score_run, train_and_evaluate
+from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime.user_cache import private_folder
 
 # Column -> what it may grow by from the first half of the cycles to the second: a fraction, and an absolute number.
@@ -60,7 +61,7 @@ def _cycle(folder):
             config.train.max_steps = steps
             assert train_and_evaluate(config, folder)
         for step in (20, 40, 40):
-            evaluate(folder, step=step, overwrite=True)
+            score_run(restore_run(folder), folder, step=step, overwrite=True)
     jax.clear_caches()  # JAX keeps every compiled program of a process
 
 

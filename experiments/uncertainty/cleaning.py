@@ -1,4 +1,4 @@
-"""Measures what cleaning does: PSNR near the training views and far from them against `eval.max_uncertainty`.
+"""Measures what cleaning does: PSNR near the training views and far from them against --max_uncertainty.
 
     JAXNERF_SCENES=... python experiments/uncertainty/cleaning.py [--folder=runs/uncertainty] \
         [--scenes=room20,room70,lego8,can,demo] [--limits=1,0.95,0.9,0.8,0.7,0.5,auto] [--views=12] \
@@ -26,6 +26,7 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import cli
+from jaxnerf.tools.uncertainty.cleaning import cleaned
 
 _NEAR_AND_FAR = {"val": "near", "test": "far"}
 SCENES = {
@@ -40,7 +41,7 @@ HEADS = ("scene", "limit", "cells removed, %", "PSNR near, dB", "change", "PSNR 
 _FOLDER = flags.DEFINE_string("folder", "runs/uncertainty", "Of the runs, which are kept.")
 _SCENES = flags.DEFINE_list("scenes", list(SCENES), f"Of {', '.join(SCENES)}.")
 _LIMITS = flags.DEFINE_list(
-    "limits", ["1", "0.95", "0.9", "0.8", "0.7", "0.5", "auto"], "Of eval.max_uncertainty; the first one is 1."
+    "limits", ["1", "0.95", "0.9", "0.8", "0.7", "0.5", "auto"], "Of --max_uncertainty; the first one is 1."
 )
 _VIEWS = flags.DEFINE_integer("views", 12, "Views of each split, spread evenly over all.", lower_bound=1)
 
@@ -68,10 +69,10 @@ def measure(workdir: pathlib.Path, limit: float | str, places: dict[str, str]) -
 
     Args:
         workdir: of the run.
-        limit: `eval.max_uncertainty`.
+        limit: --max_uncertainty.
         places: by split, where its views are.
     """
-    run = restore_run(workdir, settings={"max_uncertainty": limit})
+    run = cleaned(restore_run(workdir), workdir, limit)
     variables, experiment, found, seconds = run.variables(newest_step(run, workdir)), run.experiment, {}, []
     for split, place in places.items():
         views, scores = refined_views(run, experiment.load_split(split), split, variables[0]), []

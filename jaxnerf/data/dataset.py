@@ -3,25 +3,22 @@
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Int
 
-from jaxnerf.core.types import SparsePoints
 from jaxnerf.core.views import Views
-from jaxnerf.data import synthetic
 from jaxnerf.data.facts import LookAt, mean_color
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.geometry.poses import AXES, axis_of
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
-from jaxnerf.data.readers import base, blender
-from jaxnerf.data.readers.base import Capture, fingerprint
+from jaxnerf.data.readers import base
+from jaxnerf.data.readers.base import Capture
 from jaxnerf.data.shared_views import line_of, shared_views
+from jaxnerf.data.view_selection import select_views, selection
 from jaxnerf.fields import still_life
-from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, is_auto, option, replaced, values_of
+from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, infer, is_auto, option, replaced, values_of
+from jaxnerf.registry import READERS, needs_folder
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 WORLDS = {
@@ -29,9 +26,8 @@ WORLDS = {
     "forward": "all cameras look in one direction, which becomes -z",
     "around": "the point that the cameras look at becomes the origin, their distance 1",
 }
-_SYNTHETIC = {"fingerprint": "", "factor": 1, "background": "white", "world": "file", "ndc": False}
+_NO_FOLDER = {"factor": 1, "background": "white", "world": "file", "ndc": False}  # of a dataset that is rendered
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
-_HELD_OUT_OFFSET = 3  # not 0, as the first views of a dataset often differ from the others
 
 
 def _wrong_color(color):
@@ -56,12 +52,6 @@ class DataOptions(Options):
         protocol=True,
     )
     dir: str = option("", "the dataset's folder: a path, or a name below $JAXNERF_SCENES", changes=Changes.NOTHING)
-    fingerprint: str = option(
-        AUTO,
-        "Identifies the images and cameras that a run is trained on. It is empty for formats that store each split "
-        "in files of its own.",
-        auto=True,
-    )
     factor: int = option(
         1,
         "images are shrunk by this whole number (area average); auto: the one whose images are nearest to `width`",
@@ -166,7 +156,7 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
     return load_split(replaced(inferred, **{"dir": str(dir)} | options), split)
 
 
-def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
+def resolve(data: DataOptions) -> tuple[DataOptions, list[str], Capture | None]:
     """Resolves the options of a dataset against its folder.
 
     `near` and `background_color` stay "auto", see `resolve_for_scene`.
@@ -175,74 +165,93 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str]]:
         data: the options.
 
     Returns:
-        The options, and one line per inferred value with its reason.
+        The options; one line per inferred value with its reason; and the Capture if it had to be read.
 
     Raises:
         ValueError: if the folder does not exist or holds no dataset.
     """
     data, lines, capture = _resolve(data)
-    if capture is not None or data.format == "blender":
-        notes = [found["note"] for found in views_shared_with_training(data, capture).values()]
-        lines += [f"note          {note}" for note in dict.fromkeys(notes)]
-    return data, lines
+    notes = [found["note"] for found in views_shared_with_training(data, capture).values()]
+    return data, lines + [f"note          {note}" for note in dict.fromkeys(notes)], capture
 
 
 def _resolve(data):
-    """Returns what `resolve` does, without what concerns test views, and the Capture if it had to be read."""
+    """Returns what `resolve` does, without what concerns test views."""
+    if not needs_folder(data.format):
+        return infer(data, **{name: (value, "") for name, value in _NO_FOLDER.items()})[0], [], None
     lines, capture = [], None
-
-    def infer(name, value, line=None):
-        nonlocal data
-        if is_auto(getattr(data, name)):
-            data = replaced(data, **{name: value})
-            if line:
-                lines.append(line)
-
-    if data.format == "synthetic":
-        for name, value in _SYNTHETIC.items():
-            infer(name, value)
-        return data, lines, None
     folder = dataset_folder(data.dir)
     if pathlib.Path(data.dir).is_dir():  # a name below $JAXNERF_SCENES stays a name
         data = replaced(data, dir=str(folder.absolute()))
     if is_auto(data.format):
         found = base.detect_formats(folder)
         others = f", of {', '.join(found)}: --format selects another" if len(found) > 1 else ""
-        infer("format", found[0], f"format        {found[0]}{others}")
-    if data.format == "blender":
-        # Each split has a file of its own, and the world of the cameras is already normalised.
-        infer("fingerprint", "")
-        infer("world", "file")
-        near, far = bounds.blender_range(blender.training_poses(folder))
-        if (near, far) != bounds.BLENDER_RANGE and not (data.near and not is_auto(data.near) and data.far):
-            lines.append(f"near, far     {near:.4g} and {far:.4g}, as the cameras look at a point {2 * near:.4g} away")
+        lines.append(f"format        {found[0]}{others}")
+        data = replaced(data, format=found[0])
     # Reading the cameras takes a while, so they are only read to infer something from them.
-    if any(map(is_auto, (data.factor, data.world, data.background, data.fingerprint))):
+    if any(map(is_auto, (data.factor, data.world, data.background))):
         capture = base.read_capture(folder, data.format)
-        lines += [f"read          {choice}" for choice in capture.choices]
-        lines += [f"note          {note}" for note in capture.notes]
-        masks = [frame.mask for frame in capture.frames if frame.mask is not None]
-        if masks:
-            where = f"{len(masks)} of {len(capture.frames)} images have one, such as {masks[0]}"
-            lines.append(f"masks         {where}: dark pixels are ignored in training and metrics")
-        if is_auto(data.factor):
-            factor, width = downscaled_copies.factor_for(capture, data.width)
-            infer("factor", factor, f"factor        {factor}, of images {width} px wide")
-        if is_auto(data.world):
-            forward = data.ndc is True or world.looks_forward(capture)
-            why, unsuited = "", forward and data.ndc is not True and bounds.unsuited_to_ndc(capture)
-            if unsuited:
-                why = f"; the cameras look one way, but {unsuited}"
-            kind = "forward" if forward and not unsuited else "around"
-            infer("world", kind, f"world         {kind}: {WORLDS[kind]}{why}")
-        if is_auto(data.background):
-            color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
-            infer("background", color, f"background    {color}")
-        infer("fingerprint", fingerprint(capture))
+        data, more = infer(data, **_of_capture(data, capture))
+        lines += [*_facts_of(data, capture), *more]
     if data.up:
         lines.append(f"up            {data.up} of the dataset's files, as data.up says")
-    infer("ndc", data.world == "forward", f"NDC           {'on' if data.world == 'forward' else 'off'}")
-    return data, lines, capture
+    ndc = data.world == "forward"
+    data, more = infer(data, ndc=(ndc, f"NDC           {'on' if ndc else 'off'}"))
+    return data, lines + more, capture
+
+
+def _facts_of(data, capture):
+    """Returns lines about what the reader has chosen and skipped."""
+    lines = [f"read          {choice}" for choice in capture.choices]
+    lines += [f"note          {note}" for note in capture.notes]
+    masks = [frame.mask for frame in capture.frames if frame.mask is not None]
+    if masks:
+        where = f"{len(masks)} of {len(capture.frames)} images have one, such as {masks[0]}"
+        lines.append(f"masks         {where}: dark pixels are ignored in training and metrics")
+    if capture.bounds_reason and not (data.near and not is_auto(data.near) and data.far):
+        near, far = capture.bounds
+        lines.append(f"near, far     {near:.4g} and {far:.4g}, {capture.bounds_reason}")
+    return lines
+
+
+def _of_capture(data, capture):
+    """Returns {name: (value, line)} of the options that are inferred from a Capture."""
+    found = {}
+    if is_auto(data.factor):
+        factor, width = downscaled_copies.factor_for(capture, data.width)
+        found["factor"] = factor, f"factor        {factor}, of images {width} px wide"
+    if is_auto(data.world):
+        found["world"] = _world_of(data, capture)
+    if is_auto(data.background):
+        color = "white" if image_files.has_alpha(capture.frames[0].image) else "none"
+        found["background"] = color, f"background    {color}"
+    return found
+
+
+def _world_of(data, capture):
+    """Returns the world of a Capture, and the line that reports it."""
+    if capture.normalised:
+        return "file", ""
+    forward = data.ndc is True or world.looks_forward(capture)
+    unsuited = forward and data.ndc is not True and bounds.unsuited_to_ndc(capture)
+    why = f"; the cameras look one way, but {unsuited}" if unsuited else ""
+    kind = "forward" if forward and not unsuited else "around"
+    return kind, f"world         {kind}: {WORLDS[kind]}{why}"
+
+
+def fingerprint(data: DataOptions, capture: Capture | None = None) -> str:
+    """Returns a line that changes whenever the dataset's cameras, images' names, masks or splits do.
+
+    It is empty for formats that store each split in a file of its own, whose images do not depend on the others', and
+    for the embedded scene.
+
+    Args:
+        data: the options, resolved.
+        capture: of the dataset; None: it is read where it is needed.
+    """
+    if not needs_folder(data.format) or base.has_split_files(data.format):
+        return ""
+    return base.fingerprint(capture or base.read_capture(dataset_folder(data.dir), data.format))
 
 
 def views_shared_with_training(data: DataOptions, capture: Capture | None = None) -> dict[str, dict[str, Any]]:
@@ -252,17 +261,26 @@ def views_shared_with_training(data: DataOptions, capture: Capture | None = None
         data: the options, resolved.
         capture: of the dataset; None: it is read. If it cannot be read, nothing is known and {} is returned.
     """
+    capture = capture or _readable(data)
+    if capture is None:
+        return {}
     try:
-        if capture is None:
-            capture = base.read_capture(dataset_folder(data.dir), data.format)
-        train, select = load_images.split_indices(capture, "train"), _selection(data, "train")
+        train, select = load_images.split_indices(capture, "train"), selection(data, "train")
         train = train if select is None else train[select(len(train))]
         found = {split: _shared_with(capture, split, train) for split in load_images.scored_splits(capture)}
-    except (ValueError, OSError):  # reported by whoever reads the images
+    except (ValueError, OSError):
         return {}
     if len(found) == 1:  # the one that is defined stands for the other
         found |= dict.fromkeys(("test", "val"), *found.values())
     return {split: shared for split, shared in found.items() if shared}
+
+
+def _readable(data):
+    """Returns the Capture; None if it cannot be read, which whoever reads the images reports, or if there is none."""
+    try:
+        return base.read_capture(dataset_folder(data.dir), data.format) if needs_folder(data.format) else None
+    except (ValueError, OSError):
+        return None
 
 
 def _shared_with(capture, split, train):
@@ -313,7 +331,14 @@ def resolve_for_scene(data: DataOptions, views: Views, *, fills_space: bool) -> 
     return data, dataclasses.replace(views, near=np.full_like(views.near, near)), lines
 
 
-def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -> Views:
+def load_split(
+    data: DataOptions,
+    split: str,
+    *,
+    max_views: int | None = None,
+    capture: Capture | None = None,
+    fingerprint: str = "",
+) -> Views:
     """Reads the Views of a split of the dataset that options describe.
 
     With `hold_out`, some views of "train" form the split "held_out" instead. With `num_views`, "train" has only
@@ -323,53 +348,55 @@ def load_split(data: DataOptions, split: str, *, max_views: int | None = None) -
         data: the options.
         split: of the dataset.
         max_views: read at most so many of its views, spread evenly; None: all.
+        capture: of the dataset, as `resolve` returns it; None: it is read.
+        fingerprint: that the dataset has to have, see `fingerprint`; "": any.
 
     Raises:
         ValueError: names the field or file, what was found, what is expected and what to do.
     """
-    select = _selection(data, split)
-    if max_views is not None:
-        select = _at_most(max_views, select)
+    select = selection(data, split, max_views)
     source = "train" if split == "held_out" and data.hold_out else split
-    if data.format == "synthetic":
-        views = synthetic.load_synthetic(split=source, size=data.size, finish=data.finish)
+    if not needs_folder(data.format):
+        views = READERS.get(data.format).views(data, source)
         return views if select is None else select_views(views, select(len(views.offset)))
-    data, *_ = _resolve(data)
-    _check_world(data)
-    near = 0.0 if is_auto(data.near) else data.near  # it is resolved later, against the views
-    folder = dataset_folder(data.dir)
-    reading = {"split": source, "factor": data.factor, "background": background_of(data), "select": select}
-    if data.format == "blender":
-        usual = bounds.blender_range(blender.training_poses(folder))
-        near, far = near or usual[0], data.far or usual[1]
-        return blender.load_blender(folder, near=near, far=far, **reading)
-    capture = base.read_capture(folder, data.format)
-    if data.fingerprint not in ("", found := fingerprint(capture)):
+    data, _, found = _resolve(data)
+    capture, folder = capture or found, dataset_folder(data.dir)
+    if capture is None or base.has_split_files(data.format):
+        capture = base.read_capture(folder, data.format, split=source)
+    _check_world(data, capture)
+    if fingerprint and (found := base.fingerprint(capture)) != fingerprint:
         raise ValueError(
-            f"{folder}: holds {found}, expected {data.fingerprint} as in training: other images would be in each "
+            f"{folder}: holds {found}, expected {fingerprint} as in training: other images would be in each "
             "split, and the world would differ; restore the dataset, or train again in another --workdir"
         )
     known = bounds.known_bounds(capture)
-    capture = bounds.with_bounds(capture)
-    to_file = np.eye(4)
+    capture, to_file = _in_world(data, bounds.with_bounds(capture))
+    nearest = {frame.name: frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)}
+    near = 0.0 if is_auto(data.near) else data.near  # it is resolved later, against the views
+    capture = bounds.override_bounds(capture, near, data.far, to_file)
+    background = background_of(data)
+    views = load_images.load_capture(capture, split=source, factor=data.factor, background=background, select=select)
+    return dataclasses.replace(
+        views,
+        to_file=None if capture.normalised else np.float32(to_file),
+        file_origin=(0.0, 0.0, 0.0) if capture.origin is None else tuple(map(float, capture.origin)),
+        box=None if capture.box is None else np.float32(capture.box),
+        free_depth=np.float32([nearest[name] for name in views.names]) if any(known) else None,
+    )
+
+
+def _in_world(data, capture):
+    """Returns a Capture with bounds in every frame in the world of resolved options, and [4, 4] back to the file's."""
     if data.world == "forward":
         if data.ndc and not world.looks_forward(capture, cosine=0.5):
             raise ValueError(
-                f"{folder}: data.ndc is True and the cameras look in all directions, expected one direction; set "
-                "data.ndc to False"
+                f"{dataset_folder(data.dir)}: data.ndc is True and the cameras look in all directions, expected one "
+                "direction; set data.ndc to False"
             )
-        capture, to_file = world.recenter(capture)
-    elif data.world == "around":
-        capture, to_file = world.center(capture, up=axis_of(data.up) if data.up else None)
-    nearest = [frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)]
-    free_depth = dict(zip((frame.name for frame in capture.frames), nearest, strict=True))
-    capture = bounds.override_bounds(capture, near, data.far, to_file)
-    box = None if capture.box is None else np.float32(capture.box)
-    views = load_images.load_capture(capture, **reading)
-    free_depth = np.float32([free_depth[name] for name in views.names])
-    origin = (0.0, 0.0, 0.0) if capture.origin is None else tuple(map(float, capture.origin))
-    found = {"to_file": np.float32(to_file), "file_origin": origin, "box": box, "free_depth": free_depth}
-    return dataclasses.replace(views, **found)
+        return world.recenter(capture)
+    if data.world == "around":
+        return world.center(capture, up=axis_of(data.up) if data.up else None)
+    return capture, np.eye(4)
 
 
 def dataset_folder(name: str) -> pathlib.Path:
@@ -407,117 +434,26 @@ def color_behind(data: DataOptions) -> tuple[float, ...] | None:
     return tuple(color)
 
 
-def conventions(data: DataOptions) -> dict[str, Any]:
-    """Returns the options of a dataset that an evaluation protocol records, and its test views that are trained on."""
+def conventions(data: DataOptions, capture: Capture | None = None) -> dict[str, Any]:
+    """Returns what an evaluation protocol records about how views are read.
+
+    Args:
+        data: the options, resolved.
+        capture: of the dataset; None: it is read.
+
+    Returns:
+        The values of options; "test_split", in words which views are tested; and the test views that are trained on.
+    """
     found = {name: getattr(data, name) for name, (each, _) in declarations(DataOptions).items() if each.protocol}
     found = {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}  # as in JSON
-    shared = {} if data.format == "synthetic" else views_shared_with_training(data)
+    if capture := capture or _readable(data):
+        found["test_split"] = load_images.split_rule(capture)
+    shared = views_shared_with_training(data, capture)
     return found | ({"shared_with_training": shared} if shared else {})
 
 
-def held_out(count: int, every: int) -> Int[np.ndarray, " N"]:
-    """Returns the indices of the held-out views among count, one in each `every`, in ascending order."""
-    return np.arange(min(_HELD_OUT_OFFSET, every - 1), count, every)
-
-
-def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -> Views:
-    """Returns the Views of the given indices, in their order; pixels are copied."""
-    indices = np.asarray(indices)
-    size, first = np.asarray(views.size)[indices], np.asarray(views.offset)[indices]
-    counts = size.prod(axis=1)
-
-    def pick(values):
-        return np.concatenate([values[start : start + count] for start, count in zip(first, counts, strict=True)])
-
-    def take(leaf):
-        return np.asarray(leaf)[indices]
-
-    return dataclasses.replace(
-        views,
-        pixels=pick(views.pixels),
-        offset=np.append(0, np.cumsum(counts)[:-1]).astype(np.int32),
-        size=size,
-        cameras=jax.tree.map(take, views.cameras),
-        near=take(views.near),
-        far=take(views.far),
-        mask=None if views.mask is None else pick(views.mask),
-        free_depth=None if views.free_depth is None else take(views.free_depth),
-        time=None if views.time is None else take(views.time),
-        image_index=None if views.image_index is None else take(views.image_index),
-        loss_weight=None if views.loss_weight is None else take(views.loss_weight),
-        names=tuple(views.names[index] for index in indices) if views.names else (),
-        sparse=None if views.sparse is None else _select_observations(views.sparse, indices),
-    )
-
-
-def _select_observations(sparse: SparsePoints, indices: np.ndarray) -> SparsePoints:
-    """Returns all points with their observations in the views of the given indices, in their order."""
-    first, ends = (np.searchsorted(sparse.view, indices, side=side) for side in ("left", "right"))
-    kept = np.concatenate([np.arange(*bounds) for bounds in zip(first, ends, strict=True)]).astype(int)
-    return dataclasses.replace(
-        sparse,
-        view=np.repeat(np.arange(len(indices), dtype=np.int32), ends - first),
-        point=np.asarray(sparse.point)[kept],
-        pixel=np.asarray(sparse.pixel)[kept],
-        confidence=None if sparse.confidence is None else np.asarray(sparse.confidence)[kept],
-    )
-
-
-def _selection(data: DataOptions, split: str) -> Callable[[int], np.ndarray] | None:
-    """Returns a function from the number of views to the indices of those that a split has; None: all."""
-    every = data.hold_out if split in ("train", "held_out") else 0
-    number = data.num_views if split == "train" else 0
-    named = list(data.view_indices) if split == "train" else []
-    if named and number:
-        raise ValueError(
-            f"data.num_views is {number} and data.view_indices {data.view_indices}, expected only one of them; set "
-            "data.num_views to 0 or data.view_indices to ()"
-        )
-    if not every and not number and not named:
-        return None
-
-    def select(count):
-        indices = np.arange(count)
-        if every:
-            if not 2 <= every <= count:
-                raise ValueError(
-                    f"data.hold_out is {every} of {count} views, expected 2 to {count}, or 0 for none; correct it"
-                )
-            held = held_out(count, every)
-            indices = held if split == "held_out" else np.setdiff1d(indices, held)
-            count = len(indices)
-        if named:
-            missing = sorted(set(named) - set(indices.tolist()))
-            if missing:
-                raise ValueError(
-                    f"data.view_indices has {missing[0]}, expected indices of training views that are not held out "
-                    f"(data.hold_out {every}), below {indices[-1] + 1}; correct it"
-                )
-            indices = np.array(named)
-        if number:
-            if not 1 <= number <= count:
-                raise ValueError(
-                    f"data.num_views is {number} of {count} views, expected 1 to {count}, or 0 for all; correct it"
-                )
-            indices = indices[np.arange(number) * count // number]
-        return indices
-
-    return select
-
-
-def _at_most(number, select):
-    """Returns the selection of at most that many of the views that another one selects."""
-
-    def select_some(count):
-        indices = np.arange(count) if select is None else select(count)
-        kept = min(number, len(indices))
-        return indices[np.arange(kept) * len(indices) // kept]
-
-    return select_some
-
-
-def _check_world(data):
-    worlds = ("file",) if data.format == "blender" else tuple(WORLDS)
+def _check_world(data, capture):
+    worlds = ("file",) if capture.normalised else tuple(WORLDS)
     if data.world not in worlds:
         raise ValueError(
             f"data.world is {data.world!r}, expected one of {', '.join(worlds)} or auto for the format "

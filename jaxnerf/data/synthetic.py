@@ -19,6 +19,7 @@ from jaxnerf.data.images.pixel_cache import num_workers
 from jaxnerf.fields import portable_math, still_life
 from jaxnerf.fields.portable_math import exp
 from jaxnerf.fields.still_life import BODIES, FINISHES, WIDTH
+from jaxnerf.registry import Reader
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
@@ -308,3 +309,14 @@ def _inside_box(body, rays, width, count) -> Int[np.ndarray, " P"]:
     number = np.maximum(end - first, 0)
     offset = np.arange(size) * count + first - (np.cumsum(number) - number)
     return np.arange(number.sum()) + np.repeat(offset, number)
+
+
+def _no_folder(folder):
+    raise ValueError(f"{folder}: the embedded scene is in no folder; give another format than 'synthetic'")
+
+
+READER = Reader(
+    _no_folder,
+    detect=lambda folder: False,
+    views=lambda data, split: load_synthetic(split=split, size=data.size, finish=data.finish),
+)

@@ -17,7 +17,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images, protocol
-from jaxnerf.evaluation.restore import TrainedRun, render_settings
+from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.training import metric_log
 
@@ -150,7 +150,7 @@ def _results(run, workdir, views, variables, finished, provenance):
         "training_seconds": trained[-1]["seconds"] if trained else None,
         "compile_seconds": trained[-1].get("compile_seconds") if trained else None,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(variables[0])),
-        "settings": render_settings(run),
+        "settings": dict(run.settings),
         "exposure": run.experiment.cameras is not None and run.experiment.cameras.exposure,
         **protocol.of_views(conventions, views, split=provenance["split"]),
         "images": rows,

@@ -22,7 +22,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.evaluation import aggregate, output_images
 from jaxnerf.evaluation.metrics import image_metrics, object_mask, pixel_mask
 from jaxnerf.evaluation.previews import Previews
-from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, render_settings, restore_run
+from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime import atomic_files, memory, processes, shards, stages
 from jaxnerf.runtime.fingerprint import fingerprint
@@ -123,43 +123,6 @@ def _score_newest(workdir, restore=None):
         score_run(run, workdir, shard=(jax.process_index(), jax.process_count()))
 
 
-def evaluate(
-    workdir: str | os.PathLike,
-    *,
-    config: Config | None = None,
-    data_dir: str | None = None,
-    split: str | None = None,
-    step: int | None = None,
-    settings: dict[str, Any] | None = None,
-    overwrite: bool = False,
-    shard: tuple[int, int] = shards.WHOLE,
-    predictor: Callable[[TrainedRun], Any] | None = None,
-) -> dict[str, Any] | None:
-    """Scores one checkpoint and writes <workdir>/eval/<step>/.
-
-    Args:
-        workdir: the folder that training wrote.
-        config, data_dir, settings: see `restore_run`.
-        split: of the dataset; the config's eval.split when None. The results of any other split are written
-            to eval/<step>-<split>/.
-        step: of the checkpoint; the newest when None.
-        overwrite: whether an earlier result of the same step and split is replaced.
-        shard: (index, count): only every count-th view, from view `index` on.
-        predictor: TrainedRun -> `uncertainty.predict.Predictor`; its predicted errors are written to
-            uncertainty/NNN.tiff, and compared with the true ones. None: no error is predicted.
-
-    Returns:
-        What results.json holds; None while views of other shards are missing.
-
-    Raises:
-        ValueError: if there is no such run, checkpoint or split, the result exists, or its finished views were
-            scored with other settings.
-    """
-    run = restore_run(workdir, config, data_dir=data_dir, settings=settings)
-    options = {"overwrite": overwrite, "shard": shard, "predictor": predictor and predictor(run)}
-    return score_run(run, workdir, split=split, step=step, **options)
-
-
 def score_run(
     run: TrainedRun,
     workdir: str | os.PathLike,
@@ -171,7 +134,27 @@ def score_run(
     shard: tuple[int, int] = shards.WHOLE,
     predictor: Any = None,
 ) -> dict[str, Any] | None:
-    """Scores a checkpoint as `evaluate` does, for a restored run, with views if they have been read already."""
+    """Scores one checkpoint and writes <workdir>/eval/<step>/.
+
+    Args:
+        run: restored from the workdir.
+        workdir: the folder that training wrote.
+        split: of the dataset; the config's eval.split when None. The results of any other split are written
+            to eval/<step>-<split>/.
+        step: of the checkpoint; the newest when None.
+        overwrite: whether an earlier result of the same step and split is replaced.
+        views: of the split, if they have been read already.
+        shard: (index, count): only every count-th view, from view `index` on.
+        predictor: `uncertainty.predict.Predictor`; its predicted errors are written to uncertainty/NNN.tiff, and
+            compared with the true ones. None: no error is predicted.
+
+    Returns:
+        What results.json holds; None while views of other shards are missing.
+
+    Raises:
+        ValueError: if there is no such checkpoint or split, the result exists, or its finished views were scored with
+            other settings.
+    """
     step = newest_step(run, workdir, step)
     target = result_folder(run, workdir, split=split, step=step, overwrite=overwrite, shard=shard)
     split = split or run.experiment.config.eval.split
@@ -230,7 +213,7 @@ def _provenance(run, variables, views, split, step):
     return {
         "split": split,
         "step": step,
-        **render_settings(run),
+        **run.settings,
         "config": fingerprint(run.identity),
         "parameters": fingerprint(variables[0]),
         "cameras": fingerprint(views.cameras, views.near, views.far, *views.names),
@@ -293,27 +276,26 @@ def _score_views(run, render, views, folder, shard, predictor):
 
 def watch(
     workdir: str | os.PathLike,
+    restore: Callable[[], TrainedRun],
     *,
     poll_seconds: float = 10.0,
-    config: Config | None = None,
-    data_dir: str | None = None,
     split: str | None = None,
-    settings: dict[str, Any] | None = None,
 ) -> None:
     """Scores every new checkpoint of a training run until the last one, and prints a line when it waits.
 
     Args:
         workdir: the folder that training writes; it may not exist yet.
+        restore: restores the run once there is one.
         poll_seconds: time between searches for a new checkpoint.
-        config, data_dir, split, settings: see `evaluate`.
+        split: see `score_run`.
 
     Raises:
-        ValueError: as `evaluate`.
+        ValueError: as `score_run`.
     """
     workdir, said = pathlib.Path(workdir), None
     while not (workdir / "config.json").exists():
         said = _wait(f"{workdir}: no run yet", said, poll_seconds)
-    run = restore_run(workdir, config, data_dir=data_dir, settings=settings)
+    run = restore()
     split = split or run.experiment.config.eval.split
     suffix = "" if split == run.experiment.config.eval.split else f"-{split}"
     views = run.experiment.load_split(split)

@@ -28,7 +28,6 @@ from jaxnerf.training.workdir import load_config
 _MAX_VIEWS = 8  # of a split that the summary scores
 # What may go wrong with an image must not end a run: files, and the memory of a device that is full of training.
 _FAILURES = (ValueError, OSError, memory.OutOfMemory, jax.errors.JaxRuntimeError)
-_SETTINGS = {"bake_occupancy": False, "max_uncertainty": 1.0}  # of evaluation, replaced by those that take no time
 _MAX_RAYS = 2**16  # of an image; of larger ones only every n-th row and column is rendered
 
 
@@ -80,15 +79,14 @@ class Previews:
 
     def evaluated_run(self) -> TrainedRun:
         """Returns the run as evaluation restores it: the one of the previews, whose program is compiled and whose
-        checkpoint is read once, unless its images are those of other settings.
+        checkpoint is read once, unless evaluation bakes a grid.
         """
-        options = load_config(self._workdir).eval
-        same = all(getattr(options, name) == value for name, value in _SETTINGS.items())
-        return self._run if same else restore_run(self._workdir)
+        baked = load_config(self._workdir).eval.bake_occupancy
+        return restore_run(self._workdir) if baked else self._run
 
     @functools.cached_property
     def _run(self):
-        run = restore_run(self._workdir, settings=_SETTINGS)
+        run = restore_run(self._workdir, settings={"bake_occupancy": False})  # baking takes time
         return run._replace(variables=functools.lru_cache(maxsize=1)(run.variables))
 
     @functools.cached_property

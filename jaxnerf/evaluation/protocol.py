@@ -24,15 +24,6 @@ METRICS = {
     "pixels": "all; PSNR excludes masked pixels, and SSIM sees the dataset's image there",
     "mean": "over the images",
 }
-# How a reader chooses the split "test".
-_TEST_SPLITS = {
-    "synthetic": "all that the embedded scene has",
-    "blender": "all that transforms_test.json lists",
-    "colmap": "every 8th by name, from the first",
-    "llff": "every 8th by name, from the first",
-}
-_OTHER_TEST_SPLIT = "all that the dataset's own lists name, else every 8th by name, from the first"
-
 # Published tables: the protocol of their images, the metric of ours that corresponds, their pixel_offset.
 _BLENDER = {"format": "blender", "split": "test", "factor": 1, "size": [800, 800], "views": 200}
 _BLENDER["background"] = "white"
@@ -60,10 +51,11 @@ def of_views(conventions: Mapping[str, Any], views: Views, *, split: str) -> dic
         views: Views, all of the split.
         split: its name.
     """
-    rule = _TEST_SPLITS.get(conventions["format"], _OTHER_TEST_SPLIT) if split == "test" else f"all of {split!r}"
+    conventions = dict(conventions)
+    of_test = conventions.pop("test_split", "all that the dataset has")
+    rule = of_test if split == "test" else f"all of {split!r}"
     if split == "held_out":
         rule = f"one in {conventions['hold_out']} of the training views"
-    conventions = dict(conventions)
     if shared := conventions.pop("shared_with_training", {}).get(split):
         conventions["shared_with_training"] = shared
     step = _number_step(views.names)

@@ -3,15 +3,15 @@
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.evaluate import result_folder
-from jaxnerf.evaluation.restore import newest_step, restore_run
-from jaxnerf.training.config import Config
+from jaxnerf.evaluation.restore import newest_step
+from jaxnerf.evaluation.trained_run import TrainedRun
 
 # What the error is measured against.
 _EXACT = {"sample_multiplier": 4.0, "early_stop_eps": 0.0, "bake_occupancy": False}
@@ -35,20 +35,17 @@ class Candidate(NamedTuple):
 
 def choose(
     workdir: str | os.PathLike,
+    restore: Callable[..., TrainedRun],
     error_budget: float,
     *,
-    config: Config | None = None,
-    data_dir: str | None = None,
     split: str | None = None,
     step: int | None = None,
-    settings: dict[str, Any] | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Returns the settings of `cheapest_settings` for `evaluate`, and prints all candidates."""
+    """Returns the settings of `cheapest_settings` for evaluation, and prints all candidates."""
     # The search takes a while, so errors that would end the later evaluation are raised first.
-    result_folder(restore_run(workdir, config, data_dir=data_dir), workdir, split=split, step=step, overwrite=overwrite)
-    options = {"config": config, "data_dir": data_dir, "split": split, "step": step, "settings": settings}
-    best, candidates = cheapest_settings(workdir, error_budget, **options)
+    result_folder(restore(), workdir, split=split, step=step, overwrite=overwrite)
+    best, candidates = cheapest_settings(workdir, restore, error_budget, split=split, step=step)
     for candidate in candidates:
         tried = ", ".join(f"{name} {value}" for name, value in candidate.settings.items())
         line = f"RMS error {candidate.error:.5f} in {candidate.seconds:.3f} s: {tried}"
@@ -58,13 +55,11 @@ def choose(
 
 def cheapest_settings(
     workdir: str | os.PathLike,
+    restore: Callable[..., TrainedRun],
     error_budget: float,
     *,
-    config: Config | None = None,
-    data_dir: str | None = None,
     split: str | None = None,
     step: int | None = None,
-    settings: dict[str, Any] | None = None,
     num_rays: int = 4096,
     sample_multipliers: Sequence[float] | None = None,
     early_stop_eps: Sequence[float] = _EARLY_STOP_EPS,
@@ -77,12 +72,11 @@ def cheapest_settings(
 
     Args:
         workdir: the folder that training wrote.
+        restore: () -> the run; given settings of the config's section `eval` by name, with these. The exact rendering
+            takes smaller chunks than its `chunk`, as it has more samples.
         error_budget: in units of colour, in [0, 1].
-        config, data_dir: see `restore_run`.
         split: of views; the config's eval.split when None.
         step: of the checkpoint; the newest when None.
-        settings: other fields of the config's section `eval` to replace, by name. The exact rendering takes
-            smaller chunks than `chunk` says, as it has more samples.
         num_rays: to render.
         sample_multipliers, early_stop_eps: values of the settings to try, in this order; the first are the most
             exact. None: fractions of the run's own eval.sample_multiplier, from 1 down to a quarter.
@@ -94,9 +88,9 @@ def cheapest_settings(
         ValueError: if none is within the budget; says how close the best comes.
     """
     if sample_multipliers is None:
-        options = restore_run(workdir, config, data_dir=data_dir, settings=settings).experiment.config.eval
-        sample_multipliers = [options.sample_multiplier * fraction for fraction in _FRACTIONS]
-    exact = restore_run(workdir, config, data_dir=data_dir, settings={**(settings or {}), **_EXACT})
+        multiplier = restore().experiment.config.eval.sample_multiplier
+        sample_multipliers = [multiplier * fraction for fraction in _FRACTIONS]
+    exact = restore(_EXACT)
     experiment = exact.experiment
     views = experiment.load_split(split or experiment.config.eval.split)
     rays = random_rays(views, num_rays, experiment.view_rays, pixel_offset=experiment.config.data.pixel_offset)
@@ -108,7 +102,7 @@ def cheapest_settings(
 
     def is_within(multiplier, eps, bake):
         tried = {"sample_multiplier": multiplier, "early_stop_eps": eps, "bake_occupancy": bake}
-        run = restore_run(workdir, config, data_dir=data_dir, settings={**(settings or {}), **tried})
+        run = restore(tried)
         if bake not in variables:  # the other settings do not change them
             variables[bake] = run.variables(step)
         rgb, seconds = _render(run, variables[bake], rays)

@@ -12,9 +12,9 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.trained_run import TrainedRun
-from jaxnerf.options import Changes, changing, is_auto, replaced
+from jaxnerf.options import AUTO, Changes, changing, is_auto, replaced
+from jaxnerf.registry import needs_folder
 from jaxnerf.runtime.memory import image_renderer
-from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
@@ -109,7 +109,8 @@ def _restore(workdir, config, data_dir, settings, *, crop):
     def render_image(variables, rays, chunk=None, median_depth=False):
         return renderer(**{"median_depth": True} if median_depth else {})(variables, rays, chunk)
 
-    run = TrainedRun(
+    options = config.eval
+    return TrainedRun(
         experiment,
         checkpoints.steps,
         variables,
@@ -118,26 +119,20 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         render_image,
         variables_of,
         model_with,
+        {name: getattr(options, name) for name in changing(options, Changes.IMAGES)},
     )
-    return cleaned(run, workdir)
 
 
 def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:
     """Returns the config with another folder of the dataset; None: its own."""
     if not folder:
         return config
-    synthetic = config.data.format == "synthetic"  # it has no folder, so the format is detected
-    return changed(config, {"data.dir": folder, **({"data.format": "auto"} if synthetic else {})})
+    format = config.data.format if needs_folder(config.data.format) else AUTO
+    return changed(config, {"data.dir": folder, "data.format": format})
 
 
 def _with_settings(config, settings):
     return changed(config, {f"eval.{name}": value for name, value in settings.items()}) if settings else config
-
-
-def render_settings(run: TrainedRun) -> dict[str, Any]:
-    """Returns the settings of the config's section `eval` that change what a run renders, by name."""
-    options = run.experiment.config.eval
-    return {name: getattr(options, name) for name in changing(options, Changes.IMAGES)}
 
 
 def refined_views(run: TrainedRun, views: Views, split: str, params: Any) -> Views:

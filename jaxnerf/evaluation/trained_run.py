@@ -1,6 +1,6 @@
 """A restored run: the functions that read and render its checkpoints."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxnerf.core.types import Rays, Rendering
@@ -22,6 +22,8 @@ class TrainedRun(NamedTuple):
         variables_of: (`image_params`, grid) of a state of training -> (params, grid) as `variables` returns them.
         model_with: (settings of the section `eval`, by name; wrap=None) -> the Model that renders with these in place
             of the run's own, and whose field is wrapped as `build_model` does. It takes the same variables.
+        settings: what the images of the same variables depend on: the options of the section `eval` that change them,
+            by name, and what a tool has changed about the run.
     """
 
     experiment: build.Experiment
@@ -32,3 +34,4 @@ class TrainedRun(NamedTuple):
     render_image: Callable[..., Rendering]
     variables_of: Callable[[Any, Any], tuple]
     model_with: Callable[..., Model]
+    settings: Mapping[str, Any] = {}

@@ -9,7 +9,7 @@ import jax
 from jaxnerf.core.types import Background, Rendering, SceneFn
 from jaxnerf.fields.base import Box, Field
 from jaxnerf.models.grid_schedule import GridSchedule
-from jaxnerf.options import BELOW_ONE, FRACTION, POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
+from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
 
 _SAMPLE_MULTIPLIER = 1.5  # samples of images over those of training: no jitter averages over a step in rendering
 
@@ -33,16 +33,6 @@ class ViewOptions(Options):
     )
     early_stop_eps: float = option(
         1e-3, "with a grid: the transmittance below which a ray is terminated", range=BELOW_ONE, changes=Changes.IMAGES
-    )
-    max_uncertainty: float = option(
-        1.0,
-        "with a grid: cells that are more uncertain are empty, so that floaters go. The uncertainty of a cell is how "
-        "far the training images let it be displaced, over how far it could be without them. auto: as low as training "
-        "rays allow, see docs/guides/uncertainty.md; 1: off",
-        range=FRACTION,
-        auto=True,
-        late=True,
-        changes=Changes.IMAGES,
     )
     max_samples: int = option(
         "auto", "with a grid: size of the sample buffer", range=at_least(1), auto=True, changes=Changes.SPEED

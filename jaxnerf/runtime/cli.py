@@ -20,7 +20,8 @@ from typing import Any
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from jaxnerf.registry import READERS
+from jaxnerf.options import Option, at_least, is_auto, is_tuple
+from jaxnerf.registry import READERS, needs_folder
 from jaxnerf.runtime import signals, stages
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
@@ -32,6 +33,7 @@ def run(
     main: Callable[[list[str]], Any],
     *,
     positional: bool = False,
+    prepare: Callable[[list[str]], list[str]] = list,
     stopped: str = "before anything was saved; the same command starts again",
 ) -> None:
     """Parses the flags, imports the plugins and calls main(argv).
@@ -42,6 +44,8 @@ def run(
     Args:
         main: the program. Its module's docstring opens the help.
         positional: whether arguments that are not flags are accepted, as argv[1:].
+        prepare: called with the command line once the plugins are imported, before flags are parsed: it may define
+            flags, and returns the command line that is parsed.
         stopped: completes the message "stopped ..." after a signal: what was saved, and how to continue.
     """
     signals.keep_streams()
@@ -75,8 +79,8 @@ def run(
 
     try:
         # Before the flags are parsed, as the options of registered parts are flags, too.
-        _import_plugins(_given_flag("plugins").split(","))
-        app.run(program, flags_parser=lambda argv: _parse(argv, main.__module__))
+        _import_plugins(given_flag("plugins", sys.argv).split(","))
+        app.run(program, argv=prepare(sys.argv), flags_parser=lambda argv: _parse(argv, main.__module__))
     except ValueError as error:
         _leave(1, error)
     except KeyboardInterrupt as interrupt:
@@ -127,22 +131,25 @@ def define_config(
     return config
 
 
-def use_saved_config(*, only_for_fields: bool = False) -> None:
-    """Adds --config=<workdir>/config.json to the command line if it has --workdir and no --config.
+def with_saved_config(argv: Sequence[str], *, only_for_fields: bool = False) -> list[str]:
+    """Returns a command line with --config=<workdir>/config.json if it has --workdir and no --config.
 
     Args:
+        argv: the program and its arguments.
         only_for_fields: whether to do so only if the command line sets a field, by --config.SECTION.FIELD=VALUE.
     """
-    path = pathlib.Path(_given_flag("workdir")) / "config.json"
-    if only_for_fields and not any(re.match(r"--?(no)?config\.", argument) for argument in sys.argv[1:]):
-        return
-    if not _given_flag("config") and _given_flag("workdir") and path.exists():
-        sys.argv.insert(1, f"--config={path}")  # before the flags that set its fields
+    program, *arguments = argv
+    path = pathlib.Path(given_flag("workdir", argv)) / "config.json"
+    sets_fields = any(re.match(r"--?(no)?config\.", argument) for argument in arguments)
+    if given_flag("config", argv) or not given_flag("workdir", argv) or not path.exists():
+        return [*argv]
+    # Before the flags that set its fields.
+    return [*argv] if only_for_fields and not sets_fields else [program, f"--config={path}", *arguments]
 
 
-def _given_flag(name: str) -> str:
-    """Returns the value of a flag in the command line or --flagfile before it is parsed; "" where it is not given."""
-    arguments, value = sys.argv[1:], ""
+def given_flag(name: str, argv: Sequence[str]) -> str:
+    """Returns the value of a flag in a command line or its --flagfile before it is parsed; "" where it is not given."""
+    arguments, value = list(argv[1:]), ""
     with contextlib.suppress(flags.Error):  # absl reports it
         arguments = flags.FLAGS.read_flags_from_files(arguments)
     for index, argument in enumerate(arguments):
@@ -154,12 +161,19 @@ def _given_flag(name: str) -> str:
 
 def define_count(name: str, help: str) -> flags.FlagHolder:
     """Defines a flag that is "auto" or an integer of at least 1; None when it is not given."""
-    return flags.DEFINE(_Count(), name, None, help)
+    return flags.DEFINE(_Value(int, auto=True, range=at_least(1)), name, None, help)
 
 
 def define_number(name: str, help: str) -> flags.FlagHolder:
     """Defines a flag that is "auto" or a number; None when it is not given."""
-    return flags.DEFINE(_Number(), name, None, help)
+    return flags.DEFINE(_Value(float, auto=True), name, None, help)
+
+
+def define_option(name: str, declared: Option, kind: Any, help: str) -> flags.FlagHolder:
+    """Defines the flag of an option from its declaration and its type; None when it is not given."""
+    if kind is bool:
+        return flags.DEFINE_bool(name, None, help)
+    return flags.DEFINE(_Value(kind, auto=declared.auto, range=declared.range), name, None, help)
 
 
 def use_data(config, data_dir: str | None, format: str | None = None):
@@ -172,7 +186,7 @@ def use_data(config, data_dir: str | None, format: str | None = None):
         READERS.get(format)
     if data_dir:
         config.data.dir = data_dir
-        if config.data.format == "synthetic":  # the embedded scene has no folder
+        if not needs_folder(config.data.format):
             config.data.format = "auto"
     if format:
         config.data.format = format
@@ -211,27 +225,24 @@ def _list_configs():
     sys.exit(0)
 
 
-class _Count(flags.ArgumentParser):
-    syntactic_help = "auto, or an integer of at least 1"
+class _Value(flags.ArgumentParser):
+    """Parses a text, a number in a range, or numbers that commas separate; or "auto"."""
+
+    def __init__(self, kind, *, auto=False, range=None):
+        self._kind, self._auto, self._range = kind, auto, range
+        name = {int: "an integer", float: "a number", str: "a text"}.get(kind, "numbers that commas separate")
+        self.syntactic_help = f"{'auto, or ' * auto}{name}{f' ({range.text})' if range else ''}"
 
     def parse(self, argument):
-        if argument == "auto":
-            return argument
-        if not str(argument).isdecimal() or int(argument) < 1:
-            raise ValueError(f"expected {self.syntactic_help}")
-        return int(argument)
-
-
-class _Number(flags.ArgumentParser):
-    syntactic_help = "auto, or a number"
-
-    def parse(self, argument):
-        if argument == "auto":
+        if self._kind is str or (self._auto and is_auto(argument)):
             return argument
         try:
-            return float(argument)
+            value = tuple(map(float, argument.split(","))) if is_tuple(self._kind) else self._kind(argument)
         except ValueError:
-            raise ValueError(f"expected {self.syntactic_help}") from None
+            value = None
+        if value is None or self._range and not self._range.holds(value):
+            raise ValueError(f"expected {self.syntactic_help}")
+        return value
 
 
 def _keep_memory():

@@ -55,9 +55,10 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     """
     config = read_config(config)
     device = Device(platform or jax.default_backend(), jax.process_count())
-    data, lines = dataset.resolve(config.data)
-    views = dataset.load_split(data, "train") if views is None else views
-    config = replaced(config, data=data)
+    data, lines, capture = dataset.resolve(config.data)
+    if views is None:
+        views = dataset.load_split(data, "train", capture=capture, fingerprint=config.fingerprint)
+    config = replaced(config, data=data, fingerprint=config.fingerprint or dataset.fingerprint(data, capture))
     facts = _facts(config, views)
     samplers = [SAMPLERS.get(name).section or name for name in SAMPLERS.names()]
     others = [name for name in config.sections() if name not in (*samplers, "data", "train")]
@@ -119,13 +120,13 @@ def device_fields(config: RunConfig) -> list[str]:
 
 def fill_from(config: Config, resolved: Config) -> RunConfig:
     """Returns a config whose "auto" values are those of a resolved one; options of Changes.SPEED stay "auto"."""
-    config = read_config(config)
-    values, device = flatten(read_config(resolved).to_dict()), device_fields(config)
+    config, resolved = read_config(config), read_config(resolved)
+    values, device = flatten(resolved.to_dict()), device_fields(config)
     names = [name for name in auto_fields(config) if name not in device]
     missing = [name for name in names if name not in values]
     if missing:
         raise ValueError(f"{missing[0]} is 'auto', and the config of the workdir has no such field; set a value")
-    return changed(config, {name: values[name] for name in names})
+    return replaced(changed(config, {name: values[name] for name in names}), fingerprint=resolved.fingerprint)
 
 
 def _facts(config, views):

@@ -119,7 +119,7 @@ def build(config: Config) -> Experiment:
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,
-        load_split=functools.partial(_load_views, given, model.needs),
+        load_split=functools.partial(_load_views, config, model.needs),
         draw=draw,
         pixel_ids=pixel_ids,
         view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc, needs=model.needs)),
@@ -268,8 +268,9 @@ def load_split(config: Config, split: str | None = None) -> tuple[Views, str, di
         Views; the split's name, which is eval.split where none is given; and the conventions.
     """
     config = read_config(config)
-    data, split = dataset.resolve(config.data)[0], split or config.eval.split
-    return dataset.load_split(data, split), split, dataset.conventions(data)
+    (data, _, capture), split = dataset.resolve(config.data), split or config.eval.split
+    views = dataset.load_split(data, split, capture=capture, fingerprint=config.fingerprint)
+    return views, split, dataset.conventions(data, capture)
 
 
 def check_released(config: RunConfig, origin: str) -> None:
@@ -407,9 +408,9 @@ def _prepare(config, model, extras, views):
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)
 
 
-def _load_views(data, needs, split, **options):
+def _load_views(config, needs, split, **options):
     """Returns the Views of a split; a scene that asks for the image_index gets 0 for views that are not trained on."""
-    views = dataset.load_split(data, split, **options)
+    views = dataset.load_split(config.data, split, fingerprint=config.fingerprint, **options)
     if split == "train" or "image_index" not in needs:
         return views
     return dataclasses.replace(views, image_index=np.zeros(len(views.size), np.int32))

@@ -44,6 +44,7 @@ class RunConfig(Options):
     Attributes:
         coarse: the network that guides the fine samples; sampler "hierarchical" only.
         fine: the network of the final rendering, if the field is "mlp".
+        fingerprint: no option but a record: that of the dataset that the run is trained on, see `dataset.fingerprint`.
         losses: the weight of each loss, by its registered name; 0: off.
         plugins: the options of registered fields and samplers, by name; of a config that has been read, only of those
             that it uses. A part without a class of options has a dict.
@@ -54,6 +55,7 @@ class RunConfig(Options):
         "mlp", "the field of the final rendering: `mlp` (section `fine`), `hash_grid`, or a registered one"
     )
     sampler: str = option("hierarchical", "`hierarchical` (section `sampling`), `occupancy`, or a registered one")
+    fingerprint: str = ""
     data: DataOptions = dataclasses.field(default_factory=DataOptions)
     coarse: MlpOptions = dataclasses.field(default_factory=MlpOptions)
     fine: MlpOptions = dataclasses.field(default_factory=MlpOptions)
@@ -88,7 +90,8 @@ class RunConfig(Options):
         """Returns {section: {option: value}}, and the values of the options that are in no section."""
         sections = {name: values_of(part) for name, part in self.sections().items()}
         plain = {name: dict(part) for name, part in self.plugins.items() if name not in sections}
-        return {**values_of(self), **sections, **plain, "losses": dict(self.losses)}
+        record = {"fingerprint": self.fingerprint} if self.fingerprint else {}
+        return {**record, **values_of(self), **sections, **plain, "losses": dict(self.losses)}
 
     def to_json(self) -> str:
         """Returns `to_dict` as JSON."""
@@ -133,12 +136,14 @@ def read_config(config: Config) -> RunConfig:
         return config
     content, left = in_todays_names(config.to_dict() if isinstance(config, ConfigDict) else config)
     refuse(left, "--config.")
+    record = content.pop("fingerprint", "")
     kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
-    top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "")
-    parts = {name: read(kind, _section(content, name), f"{name}.") for name, kind in kinds.items()}
+    top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "config.")
+    parts = {name: read(kind, _section(content, name), f"config.{name}.") for name, kind in kinds.items()}
     losses = {name: _read_weight(name, weight) for name, weight in _section(content, "losses").items()}
     plugins = {name: _read_plugin(name, section) for name, section in {**top.plugins, **content}.items()}
-    config = dataclasses.replace(top, **parts, losses=losses, plugins=plugins)
+    fingerprint = "" if is_auto(record) else record  # a run that was converted without its dataset has "auto"
+    config = dataclasses.replace(top, **parts, losses=losses, plugins=plugins, fingerprint=fingerprint)
     used, known = used_sections(config), {*kinds, "losses", *FIELDS.names(), *SAMPLERS.names()}
     unknown = sorted(name for name in plugins if name not in known | used)
     if unknown:
@@ -153,7 +158,7 @@ def read_config(config: Config) -> RunConfig:
 
 def to_config_dict(config: RunConfig) -> ConfigDict:
     """Returns a config as a ConfigDict, whose fields have the types of the options, for flags and config files."""
-    content = config.to_dict()
+    content = replaced(config, fingerprint="").to_dict()
     for name, declaration, kind, value in declared(config):
         section, dot, field = name.rpartition(".")
         (content[section] if dot else content)[field] = typed(value, kind, auto=declaration.auto)
@@ -163,11 +168,7 @@ def to_config_dict(config: RunConfig) -> ConfigDict:
 def auto_fields(config: Config) -> list[str]:
     """Returns the dotted names of the options that are still "auto"; for some "auto" is a value like any other."""
     config = read_config(config)
-    values = {
-        name
-        for name, option_, _, _ in declared(config)
-        if option_.late or not (option_.auto or name.startswith("losses."))
-    }
+    values = {name for name, option_, _, _ in declared(config) if not (option_.auto or name.startswith("losses."))}
     return [name for name, value in flatten(config.to_dict()).items() if is_auto(value) and name not in values]
 
 
@@ -230,7 +231,7 @@ def identity(config: RunConfig) -> str:
 
 def _read_weight(name, weight):
     declaration = weight_option(name)._replace(auto=is_auto(weight))  # a loss that is not registered may have "auto"
-    return read_value(declaration, Schedule, weight, f"losses.{name}")
+    return read_value(declaration, Schedule, weight, f"config.losses.{name}")
 
 
 def _is_section(kind):
@@ -255,7 +256,7 @@ def _read_plugin(name, section):
         raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
     if part is None or part.options is None:
         return {field: as_tuples(value) for field, value in section.items()}
-    return read(part.options, {**values_of(part.options()), **section}, f"{name}.")
+    return read(part.options, {**values_of(part.options()), **section}, f"config.{name}.")
 
 
 def _check(config):

@@ -20,7 +20,7 @@ class Gone(NamedTuple):
     instead: str
 
 
-RENAMED: dict[str, str] = {}  # "section.option" -> its name now
+RENAMED: dict[str, str] = {"data.fingerprint": "fingerprint"}  # "section.option" -> its name now
 _DROP = "use the version that wrote it"
 _REFLECTIONS = Gone((False,), Changes.TRAINING | Changes.IMAGES, _DROP)
 _LOSS = Gone((0, "auto"), Changes.TRAINING, f"set it to 0, or {_DROP}")
@@ -29,6 +29,11 @@ GONE: dict[str, Gone] = {  # by "section.option"
     "hash_grid.geometry_features": Gone((15,), Changes.TRAINING | Changes.IMAGES, _DROP),
     "hash_grid.feature_scale": Gone((4.0,), Changes.TRAINING | Changes.IMAGES, _DROP),
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay")},
+    "eval.max_uncertainty": Gone(
+        (1.0,),
+        Changes.IMAGES,
+        "set it to 1 in config.json, and give --max_uncertainty to jaxnerf-eval, jaxnerf-render and jaxnerf-export",
+    ),
 }
 
 

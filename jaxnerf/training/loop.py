@@ -147,7 +147,7 @@ def _check_alike(first, config, folder):
     """Raises a ValueError if a run has another program than the first one."""
     mine = {name: value for name, _, _, value in declared(config)}
     for name, option, _, value in declared(first):
-        free = option.changes == Changes.NOTHING or name in ("seed", "data.dir", "data.fingerprint")
+        free = option.changes == Changes.NOTHING or name in ("seed", "data.dir")
         if not free and mine.get(name) != value:
             raise ValueError(
                 f"{folder}: {name} is {mine.get(name)!r}, expected {value!r} as in the first run: runs of one program "

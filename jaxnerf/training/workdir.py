@@ -53,6 +53,11 @@ def _check_same_run(workdir, config):
     old, new = (_as_saved(each) for each in (read_config(content), config))
     free = {name for name, option, _, _ in declared(config) if not option.changes & Changes.TRAINING}
     fixed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key) and key not in free]
+    if "fingerprint" in fixed:
+        raise ValueError(
+            f"{workdir}: the dataset holds {config.fingerprint or 'other images'}, expected {old.get('fingerprint')} "
+            "that the run was trained on; restore the dataset, or give another --workdir"
+        )
     if fixed:
         shown = ", ".join(f"{key} {old.get(key)!r} -> {new.get(key)!r}" for key in fixed[:3])
         more = f" and {len(fixed) - 3} more" if len(fixed) > 3 else ""

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import skimage.metrics
 
+import captures
 import oracle
 from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import mse, psnr, round_to_8_bits, ssim
 from jaxnerf.core.metrics import align_colors
-from jaxnerf.data.readers import blender
 
 
 def pair(seed, noise, shape=(17, 20, 3)):
@@ -83,7 +83,7 @@ def test_random_images_have_the_scores_of_scikit_image_and_dm_pix():
 @pytest.mark.scenes("lego")
 def test_images_of_scenes_have_the_scores_of_scikit_image_and_dm_pix(scenes_dir):
     """200 x 200 px, mostly white; a pair, and one beside itself with noise of 40 dB in 8 bits."""
-    views = blender.load_blender(scenes_dir / "lego", split="test", factor=4)
+    views = captures.load_blender(scenes_dir / "lego", split="test", factor=4)
     a, b = (np.asarray(views.image(index)) for index in (0, 1))
     noise = np.random.default_rng(9).normal(scale=0.01, size=a.shape).astype(np.float32)
     for other in (b, np.asarray(round_to_8_bits(a + noise))):

@@ -10,8 +10,9 @@ import captures
 from jaxnerf import Camera, SparsePoints, Views, load_dataset
 from jaxnerf.configs import capture
 from jaxnerf.data import dataset
-from jaxnerf.data.dataset import DataOptions, held_out, load_split, select_views
+from jaxnerf.data.dataset import DataOptions, load_split
 from jaxnerf.data.readers import transforms
+from jaxnerf.data.view_selection import held_out, select_views
 from jaxnerf.options import replaced
 from jaxnerf.registry import READERS, Reader
 from jaxnerf.training.config import read_config
@@ -213,7 +214,9 @@ def test_load_dataset_infers_everything_from_the_folder(tmp_path, name):
     write(tmp_path, shots)
     views = load_dataset(tmp_path)
     data = capture_data(dir=str(tmp_path), factor=1)
-    resolved, _ = dataset.resolve(data)
+    resolved, *_ = dataset.resolve(data)
+    rule = "all that the dataset's own lists name" if name == "blender" else "every 8th by name, from the first"
+    assert dataset.conventions(resolved)["test_split"] == rule
     assert resolved.format == name and resolved.world == dict(blender="file", llff="forward").get(name, "around")
     assert (len(views.offset), views.size.tolist()[0]) == (8 if name == "blender" else 7, [24, 32])
     assert (views.pixels.shape[-1] == 4) == (name == "blender") == (views.background is not None)
@@ -253,8 +256,8 @@ def test_a_registered_format_is_detected_resolved_and_split(tmp_path, monkeypatc
     monkeypatch.setattr(READERS, "_parts", dict(READERS._parts))
     READERS.add("renamed", reader)
     data = capture_data(dir=str(tmp_path), hold_out=3)
-    resolved, lines = dataset.resolve(data)
-    assert resolved.format == "renamed" and resolved.fingerprint.startswith("8 images, ")
+    resolved, lines, capture = dataset.resolve(data)
+    assert resolved.format == "renamed" and dataset.fingerprint(resolved, capture).startswith("8 images, ")
     assert "format        renamed" in lines
     splits = {split: load_split(resolved, split).names for split in ("train", "held_out", "test")}
     assert splits == {"train": ("001", "002", "004", "005", "007"), "held_out": ("003", "006"), "test": ("000",)}

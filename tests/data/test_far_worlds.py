@@ -16,7 +16,7 @@ from jaxnerf.data.geometry.bounds import unsuited_to_ndc
 from jaxnerf.data.readers.base import Capture, Frame, origin_near, read_capture
 from jaxnerf.evaluation.paths.camera_path import make_path
 from jaxnerf.tools.capture_check import report
-from jaxnerf.tools.exporters.base import ExportSettings, relative_to
+from jaxnerf.tools.exporters.options import ExportOptions
 from jaxnerf.tools.viewer.frame_renderer import FrameCamera
 from jaxnerf.tools.viewer.keyframes import save_path
 
@@ -93,9 +93,9 @@ def test_single_cameras_without_a_position_do_not_keep_a_far_origin():
 
 
 def test_the_box_of_an_export_is_in_the_files_own_coordinates():
-    given = ExportSettings(box=(499_999.0, 4_999_998.0, 117.0, 500_001.0, 5_000_002.0, 123.0))
-    assert relative_to(given, SHIFTS["UTM"]).box == (-1, -2, -3, 1, 2, 3)
-    assert relative_to(ExportSettings(), SHIFTS["UTM"]).box is None
+    given = ExportOptions(box=(499_999.0, 4_999_998.0, 117.0, 500_001.0, 5_000_002.0, 123.0))
+    assert given.relative_to(SHIFTS["UTM"]).box == (-1, -2, -3, 1, 2, 3)
+    assert ExportOptions().relative_to(SHIFTS["UTM"]).corners is None
 
 
 def test_the_check_finds_the_same(images, tmp_path):
@@ -193,10 +193,10 @@ def flight(relief, *, apart=30.0, height=20.0, size=24):
 def test_a_flight_over_hills_is_trained_around(tmp_path, writer, relief, shift):
     shots, points = flight(relief)
     WRITERS[writer](tmp_path, moved(shots, shift), points=points._replace(xyz=points.xyz + shift))
-    data, lines = dataset.resolve(dataset.DataOptions(format="auto", dir=str(tmp_path), world="auto", ndc="auto"))
+    data, lines, _ = dataset.resolve(dataset.DataOptions(format="auto", dir=str(tmp_path), world="auto", ndc="auto"))
     assert (data.world, data.ndc) == ("around", False)
     assert any("a layer that is thin" in line for line in lines)
-    forward, _ = dataset.resolve(dataset.replaced(data, world="auto", ndc=True))
+    forward, *_ = dataset.resolve(dataset.replaced(data, world="auto", ndc=True))
     assert forward.world == "forward"  # what is asked for stays
 
 

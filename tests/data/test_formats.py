@@ -102,7 +102,7 @@ def test_transforms(tmp_path, name):
     cameras, images, tolerance = FEATURES[name]
     shots = captures.shoot(captures.orbit(8, **cameras))
     captures.write_transforms(tmp_path, shots, **images)
-    data, lines = dataset.resolve(a_data(tmp_path))
+    data, lines, _ = dataset.resolve(a_data(tmp_path))
     assert data.format == "transforms" and data.world == "around" and data.ndc is False
     assert any(line.startswith("format        transforms") for line in lines)
     views = dataset.load_split(data, "train")
@@ -143,7 +143,7 @@ def test_alpha_is_composited_over_the_background(tmp_path):
 def test_splits_of_the_file_are_used(tmp_path):
     splits = {"train": [0, 1, 2, 3], "val": [4], "test": [5, 6, 7]}
     captures.write_transforms(tmp_path, captures.shoot(captures.orbit(8)), splits=splits)
-    data, _ = dataset.resolve(a_data(tmp_path))
+    data, *_ = dataset.resolve(a_data(tmp_path))
     for split, indices in splits.items():
         assert dataset.load_split(data, split).names == tuple(f"{index:03d}" for index in indices)
 
@@ -152,7 +152,7 @@ def test_splits_of_the_file_are_used(tmp_path):
 def test_colmap(tmp_path, lens):
     shots = captures.shoot(captures.orbit(8, lens=lens))
     points = captures.write_colmap(tmp_path, shots)
-    data, _ = dataset.resolve(a_data(tmp_path))
+    data, *_ = dataset.resolve(a_data(tmp_path))
     assert data.format == "colmap" and data.world == "around"
     views = dataset.load_split(data, "train")
     assert_shows_the_scene(views)
@@ -166,16 +166,16 @@ def test_colmap_precedes_llff_and_format_overrides(tmp_path):
     shots = captures.shoot(captures.front(8))
     points = captures.write_colmap(tmp_path, shots)
     captures.write_llff(tmp_path, shots, points=points)
-    data, lines = dataset.resolve(a_data(tmp_path))
+    data, lines, _ = dataset.resolve(a_data(tmp_path))
     assert data.format == "colmap" and "colmap, llff" in lines[0]
-    data, lines = dataset.resolve(a_data(tmp_path, format="llff"))
+    data, lines, _ = dataset.resolve(a_data(tmp_path, format="llff"))
     assert data.format == "llff" and not any(line.startswith("format") for line in lines)
 
 
 def test_without_any_depth_forward_facing_datasets_are_trained_around(tmp_path):
     """In NDC nothing is in front of near, which would be a guess."""
     captures.write_transforms(tmp_path, captures.noise(captures.front(9)))
-    data, lines = dataset.resolve(a_data(tmp_path))
+    data, lines, _ = dataset.resolve(a_data(tmp_path))
     assert (data.world, data.ndc) == ("around", False) and "nothing tells how far" in "".join(lines)
 
 
@@ -183,7 +183,7 @@ def test_without_any_depth_forward_facing_datasets_are_trained_around(tmp_path):
 def test_forward_facing_datasets(tmp_path, write):
     shots = captures.shoot(captures.front(9))
     write(tmp_path, shots)
-    data, _ = dataset.resolve(a_data(tmp_path))
+    data, *_ = dataset.resolve(a_data(tmp_path))
     assert data.world == "forward" and data.ndc is True
     views = dataset.load_split(data, "train")
     assert_shows_the_scene(views)
@@ -193,7 +193,7 @@ def test_forward_facing_datasets(tmp_path, write):
 
 def test_llff_all_around(tmp_path):
     captures.write_llff(tmp_path, captures.shoot(captures.orbit(8)))
-    data, _ = dataset.resolve(a_data(tmp_path))
+    data, *_ = dataset.resolve(a_data(tmp_path))
     assert data.format == "llff" and data.world == "around" and data.ndc is False
     assert_shows_the_scene(dataset.load_split(data, "train"))
 
@@ -226,17 +226,17 @@ def test_an_unbounded_dataset_with_a_declared_box(tmp_path):
 
 def test_the_factor_is_inferred_from_the_width(tmp_path):
     captures.write_transforms(tmp_path, captures.shoot(captures.orbit(8)))
-    data, lines = dataset.resolve(a_data(tmp_path, factor="auto", width=15))
+    data, lines, _ = dataset.resolve(a_data(tmp_path, factor="auto", width=15))
     assert data.factor == 2 and any(line.startswith("factor        2") for line in lines)
     assert dataset.load_split(data, "train").size.tolist() == [[12, 16]] * 7
 
 
 def test_resolving_again_changes_nothing(tmp_path):
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    data, _ = dataset.resolve(a_data(tmp_path))
-    again, lines = dataset.resolve(data)
+    data, *_ = dataset.resolve(a_data(tmp_path))
+    again, lines, _ = dataset.resolve(data)
     assert again == data and not lines
-    synthetic, lines = dataset.resolve(DataOptions())
+    synthetic, lines, _ = dataset.resolve(DataOptions())
     for resolved in (again, synthetic):  # the rest depends on the sampler and on the images
         left = {name for name, value in values_of(resolved).items() if value == "auto"}
         assert not lines and left == {"near", "background_color"}
@@ -249,8 +249,10 @@ def test_a_missing_folder_is_an_error():
 
 def test_a_dataset_that_changed_since_training_is_an_error(tmp_path):
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
-    data, _ = dataset.resolve(a_data(tmp_path))
-    assert data.fingerprint.startswith("8 images, ") and len(dataset.load_split(data, "train").offset) == 7
+    data, _, read = dataset.resolve(a_data(tmp_path))
+    fingerprint = dataset.fingerprint(data, read)
+    assert fingerprint.startswith("8 images, ") and fingerprint == dataset.fingerprint(data)
+    assert len(dataset.load_split(data, "train", fingerprint=fingerprint).offset) == 7
     file = tmp_path / "transforms.json"
     whole = json.loads(file.read_text())
     moved = json.loads(file.read_text())
@@ -259,14 +261,14 @@ def test_a_dataset_that_changed_since_training_is_an_error(tmp_path):
         file.write_text(json.dumps(content))
         for split in ("train", "test"):
             with pytest.raises(ValueError, match=f"holds {found} images, .* expected 8 images"):
-                dataset.load_split(data, split)
-        workdir.save_config(tmp_path / "run", to_config(data))
-        with pytest.raises(ValueError, match="data.fingerprint '8 images"):
-            workdir.save_config(tmp_path / "run", to_config(dataset.resolve(a_data(tmp_path))[0]))
+                dataset.load_split(data, split, fingerprint=fingerprint)
+        workdir.save_config(tmp_path / "run", to_config(data, fingerprint))
+        with pytest.raises(ValueError, match=f"the dataset holds {found} images, .*, expected 8 images, .* trained on"):
+            workdir.save_config(tmp_path / "run", to_config(data, dataset.fingerprint(data)))
 
 
-def to_config(data):
-    return replaced(read_config(capture.get_config()), data=data)
+def to_config(data, fingerprint):
+    return replaced(read_config(capture.get_config()), data=data, fingerprint=fingerprint)
 
 
 def test_ndc_require_cameras_that_look_in_one_direction(tmp_path):
@@ -280,7 +282,7 @@ def test_ndc_require_cameras_that_look_in_one_direction(tmp_path):
 def test_the_background_is_inferred_from_alpha(tmp_path):
     for name, rgba, expected in (("a", True, "white"), ("b", False, "none")):
         captures.write_transforms(tmp_path / name, captures.noise(captures.orbit(8)), rgba=rgba)
-        data, lines = dataset.resolve(a_data(tmp_path / name))
+        data, lines, _ = dataset.resolve(a_data(tmp_path / name))
         assert data.background == expected and f"background    {expected}" in lines
         assert (dataset.load_split(data, "train").background is None) == (not rgba)
 
@@ -318,7 +320,7 @@ def test_errors_of_the_data_section(tmp_path):
     ],
 )
 def test_the_real_datasets(scenes_dir, name, format, world, ndc):
-    data, lines = dataset.resolve(a_data(scenes_dir / name, factor="auto", width=200))
+    data, lines, _ = dataset.resolve(a_data(scenes_dir / name, factor="auto", width=200))
     assert (data.format, data.world, data.ndc) == (format, world, ndc)
     assert data.factor == {"fern": 20, "fox": 5, "can": 4, "lego": 4}[name]
     skipped = [line for line in lines if line.startswith("note")]

@@ -14,8 +14,8 @@ from jaxnerf import Camera, Views
 from jaxnerf.core.cameras import pixel_radius
 from jaxnerf.core.types import Batch
 from jaxnerf.data import ray_batches
-from jaxnerf.data.dataset import select_views
 from jaxnerf.data.scales import shrink_views, with_scales
+from jaxnerf.data.view_selection import select_views
 from jaxnerf.training import build
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step

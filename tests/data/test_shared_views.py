@@ -33,7 +33,7 @@ def options(folder, **changes):
 def test_a_list_of_names_within_the_training_views(tmp_path, shots):
     captures.write_transforms(tmp_path, shots, splits={"train": range(8), "test": [0, 4]})
     assert found(tmp_path) == [("000", "000", "the same file"), ("004", "004", "the same file")]
-    data, lines = dataset.resolve(options(tmp_path))
+    data, lines, _ = dataset.resolve(options(tmp_path))
     expected = (
         "2 of 2 views of the split 'test' are training views, too (000 is the same file): their scores are not those "
         "of held-out views"
@@ -50,7 +50,7 @@ def test_a_test_file_that_equals_the_training_file(tmp_path, shots):
         content["frames"] = content["frames"][:count]
         (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
     # All that would be inferred is set, so that the images' sizes are not needed.
-    data, lines = dataset.resolve(options(tmp_path, format="blender", background="white"))
+    data, lines, _ = dataset.resolve(options(tmp_path, format="blender", background="white"))
     notes = [line for line in lines if "are training views, too" in line]
     assert [note.split()[1:4] for note in notes] == [["8", "of", "8"], ["3", "of", "3"]]
     recorded = dataset.conventions(data)["shared_with_training"]
@@ -111,7 +111,7 @@ def test_datasets_without_shared_views_read_no_image(tmp_path, shots, monkeypatc
     captures.write_blender(tmp_path / "b", shots[6:], split="test")
     monkeypatch.setattr(shared_views, "read_image", None)
     for folder in (tmp_path / "a", tmp_path / "b"):
-        data, lines = dataset.resolve(options(folder))
+        data, lines, _ = dataset.resolve(options(folder))
         assert found(folder) == [] and not any("training views" in line for line in lines)
         assert "shared_with_training" not in dataset.conventions(data)
 
@@ -124,16 +124,16 @@ def test_a_copy_under_another_name_in_a_capture_without_splits(tmp_path, shots):
 
 def test_training_views_that_are_not_used_do_not_count(tmp_path, shots):
     captures.write_transforms(tmp_path, shots, splits={"train": range(8), "test": [0, 4]})
-    data, _ = dataset.resolve(options(tmp_path, num_views=2))  # 000 and 004
+    data, *_ = dataset.resolve(options(tmp_path, num_views=2))  # 000 and 004
     assert dataset.views_shared_with_training(data)["test"]["names"] == ["000", "004"]
-    data, _ = dataset.resolve(options(tmp_path, num_views=1))
+    data, *_ = dataset.resolve(options(tmp_path, num_views=1))
     assert dataset.views_shared_with_training(data)["test"]["names"] == ["000"]
 
 
 def test_test_images_alone_can_be_read(tmp_path, shots):
     """As on a computer that only evaluates."""
     split_in_two(tmp_path, shots)
-    data, _ = dataset.resolve(options(tmp_path))
+    data, *_ = dataset.resolve(options(tmp_path))
     shutil.rmtree(tmp_path / "train")
     assert len(dataset.load_split(data, "test").names) == 3
     assert dataset.conventions(data)["format"] == "blender"
@@ -141,7 +141,7 @@ def test_test_images_alone_can_be_read(tmp_path, shots):
 
 def test_results_record_the_views_of_their_split_only(tmp_path, shots):
     captures.write_transforms(tmp_path, shots, splits={"train": range(6), "test": [0, 4], "val": [7]})
-    data, _ = dataset.resolve(options(tmp_path))
+    data, *_ = dataset.resolve(options(tmp_path))
     conventions = dataset.conventions(data)
     for split, count in (("test", 2), ("val", 0), ("train", 0)):
         views = dataset.load_split(data, split)

@@ -1,5 +1,6 @@
 """Evaluation: the files that it writes, their content, and that nothing is overwritten."""
 
+import functools
 import json
 import os
 import shutil
@@ -14,12 +15,12 @@ import captures
 import oracle
 from jaxnerf import load_dataset, load_scene, pixel_grid, render_image
 from jaxnerf.evaluation import external
-from jaxnerf.evaluation.evaluate import evaluate, score_run, summary, watch
+from jaxnerf.evaluation.evaluate import score_run, summary, watch
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import build
 from jaxnerf.training.checkpoint import Checkpoints
-from runs import run_forked, smoke_config, start
+from runs import evaluate, run_forked, smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -247,7 +248,7 @@ def test_watching_scores_a_last_checkpoint_that_comes_during_its_search(trained,
     monkeypatch.setattr(Checkpoints, "steps", steps_and_then_the_last)
     monkeypatch.setattr("jaxnerf.evaluation.evaluate.score_run", score)
     monkeypatch.setattr("jaxnerf.evaluation.evaluate.summary", str)
-    watch(folder, poll_seconds=0.01)
+    watch(folder, lambda: restore_run(folder), poll_seconds=0.01)
     assert scored == [20]
 
 
@@ -259,7 +260,8 @@ def test_watching_ends_where_training_ended_by_max_seconds(trained, tmp_path):
     )
     for step in (10, 15, 20):
         (folder / "eval" / str(step)).mkdir(parents=True)
-    thread = threading.Thread(target=watch, args=[folder], kwargs={"poll_seconds": 0.05}, daemon=True)
+    restore = functools.partial(restore_run, folder)
+    thread = threading.Thread(target=watch, args=[folder, restore], kwargs={"poll_seconds": 0.05}, daemon=True)
     thread.start()
     thread.join(timeout=5)
     assert not thread.is_alive()

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from jaxnerf.evaluation import output_images
-from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import build, loop, metric_log
 from jaxnerf.training.state import TrainState
-from runs import smoke_config
+from runs import evaluate, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")

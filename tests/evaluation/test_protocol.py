@@ -77,14 +77,12 @@ def test_images_of_an_unknown_source_are_comparable_with_no_table():
 
 def test_the_conventions_say_which_views_were_scored_and_how():
     of = lambda *args, **options: protocol_of(*args, **options)["conventions"]  # noqa: E731
-    every_8th = of(3, (9, 9), names=("r_0", "r_8", "r_16"))["selection"]
-    assert every_8th == "all that transforms_test.json lists; the numbers in the names go up by 8"
-    assert of(3, (9, 9), names=("a", "b", "c"), format="llff")["selection"] == "every 8th by name, from the first"
+    every_8th = of(3, (9, 9), names=("r_0", "r_8", "r_16"), test_split="all that a list names")
+    assert every_8th["selection"] == "all that a list names; the numbers in the names go up by 8"
+    assert "test_split" not in every_8th
     assert of(2, (9, 9), split="held_out", hold_out=8)["selection"].startswith("one in 8 of the training views")
     assert of(2, (9, 9), split="val")["selection"].startswith("all of 'val'")
-    assert of(3, (9, 9), names=("a", "b", "c"), format="registered")["selection"].startswith(
-        "all that the dataset's own"
-    )
+    assert of(3, (9, 9), names=("a", "b", "c"))["selection"] == "all that the dataset has"
     views = views_of(np.int32([[9, 12], [12, 9], [9, 12]]), ())
     mixed = protocol.of_views(READ, views, split="test")["conventions"]
     assert (mixed["views"], mixed["size"]) == (3, [[9, 12], [12, 9]])

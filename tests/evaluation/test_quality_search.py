@@ -18,8 +18,11 @@ pytestmark = pytest.mark.usefixtures("unoptimized")
 
 @pytest.mark.slow
 def test_the_fastest_candidate_within_the_budget_is_chosen(trained):
+    def restore(settings=None):
+        return restore_run(trained, settings=settings)
+
     options = {"num_rays": 256, "sample_multipliers": (1.0, 0.5), "early_stop_eps": (1e-3,)}
-    best, candidates = quality_search.cheapest_settings(trained, 0.5, **options)
+    best, candidates = quality_search.cheapest_settings(trained, restore, 0.5, **options)
     assert best in candidates and best.seconds == min(candidate.seconds for candidate in candidates)
     assert {candidate.settings["bake_occupancy"] for candidate in candidates} == {True, False}
     dense = [candidate.error for candidate in candidates if not candidate.settings["bake_occupancy"]]
@@ -75,4 +78,4 @@ def test_an_existing_result_is_reported_before_the_search(trained, tmp_path, mon
     (folder / "eval" / str(restore_run(folder).steps()[-1])).mkdir(parents=True)
     monkeypatch.setattr(quality_search, "cheapest_settings", lambda *_, **__: pytest.fail("searched"))
     with pytest.raises(ValueError, match="exists already; give --overwrite"):
-        quality_search.choose(folder, 0.5)
+        quality_search.choose(folder, lambda: restore_run(folder), 0.5)

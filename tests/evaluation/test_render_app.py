@@ -14,9 +14,8 @@ from jaxnerf import Camera, load_scene, rays_from_pixels, render_image
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import render_path as render_path_module
-from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.runtime import memory
-from runs import run_forked
+from runs import render_path, run_forked
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -42,7 +41,7 @@ def path_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def rendered(run, path_file):
     """What a call wrote: colour, depth and RGBA."""
-    return render_path(run, path=str(path_file), rgba=True, depth=True, kind="gif", settings={"chunk": 100})
+    return render_path(run, path=str(path_file), rgba=True, depth=True, video="gif", settings={"chunk": 100})
 
 
 def test_frames_videos_and_the_path_are_written_where_the_docstring_says(rendered, run):
@@ -64,7 +63,7 @@ def test_predicted_errors_are_written_with_one_range_for_the_path(run, path_file
     def predictor(restored):
         return SimpleNamespace(identity="fixed", error=lambda rays: 0.1 * np.abs(np.asarray(rays.viewdirs)[..., 0]))
 
-    options = {"path": str(path_file), "name": "errors", "kind": "gif", "settings": {"chunk": 100}}
+    options = {"path": str(path_file), "name": "errors", "video": "gif", "settings": {"chunk": 100}}
     folder, *videos = render_path(run, predictor=predictor, **options)
     assert [file.name for file in videos] == ["errors-20.gif", "errors-20-uncertainty.gif"]
     errors, shown = (
@@ -97,7 +96,7 @@ def test_frames_show_the_model_and_its_depth_through_the_lens_of_the_path_file(r
 
 
 def test_the_time_left_is_estimated_after_the_first_frame(run, path_file, capsys):
-    render_path(run, path=str(path_file), name="timed", kind="none", settings={"chunk": 100})
+    render_path(run, path=str(path_file), name="timed", video="none", settings={"chunk": 100})
     first, second = (line for line in capsys.readouterr().err.splitlines() if "frames of" in line)
     assert first.startswith("1/2") and " left" not in first
     assert second.startswith("2/2") and second.endswith("timed-20, 0:00 left")
@@ -116,7 +115,7 @@ def test_rgba_over_the_background_color_is_the_color(trained, path_file, tmp_pat
     content = json.loads((run / "config.json").read_text())
     content["data"] |= {"background": "none", "background_color": [0.2, 0.5, 1.0]}
     (run / "config.json").write_text(json.dumps(content))
-    (folder,) = render_path(run, path=str(path_file), rgba=True, kind="none", settings={"chunk": 100})
+    (folder,) = render_path(run, path=str(path_file), rgba=True, video="none", settings={"chunk": 100})
     color, rgba = (iio.imread(folder / name / "0000.png") / 255 for name in ("color", "rgba"))
     behind = (1 - rgba[..., 3:]) * [0.2, 0.5, 1.0]
     assert behind.max() > 0.1, "some rays are transparent"
@@ -132,7 +131,7 @@ def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch,
     calls = []
     render_image = memory.render_image
     monkeypatch.setattr(memory, "render_image", lambda *a, **k: calls.append(1) or render_image(*a, **k))
-    options = {"path": str(path_file), "rgba": True, "kind": "none", "settings": {"chunk": 100}}
+    options = {"path": str(path_file), "rgba": True, "video": "none", "settings": {"chunk": 100}}
     assert render_path(run, **options) == [folder]
     assert len(calls) == 1 and (folder / "color" / "0001.png").read_bytes() == pixels
     assert not list(folder.rglob("*.tmp"))
@@ -150,25 +149,24 @@ def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch,
 def test_frames_of_other_settings_are_not_mixed(rendered, run, path_file, tmp_path):
     kept = (rendered[0] / "color" / "0000.png").read_bytes()
     with pytest.raises(ValueError, match="mine-20: holds frames rendered with width 25, not 50; give --over"):
-        render_path(run, path=str(path_file), size=(50, 17), kind="none")
+        render_path(run, path=str(path_file), width=50, height=17, video="none")
     other = tmp_path / "mine.json"
     other.write_text(path_file.read_text() + "\n")
     with pytest.raises(ValueError, match="rendered with path '.*, or another --name"):
-        render_path(run, path=str(other), kind="none")
+        render_path(run, path=str(other), video="none")
     assert (rendered[0] / "color" / "0000.png").read_bytes() == kept
-    (folder,) = render_path(run, path=str(other), size=(6, 4), name="other", kind="none", settings={"chunk": 100})
+    options = {"path": str(other), "name": "other", "video": "none", "settings": {"chunk": 100}}
+    (folder,) = render_path(run, width=6, height=4, **options)
     assert folder.name == "other-20" and iio.imread(folder / "color" / "0000.png").shape == (4, 6, 3)
-    (folder,) = render_path(
-        run, path=str(other), size=(4, 6), name="other", kind="none", settings={"chunk": 100}, overwrite=True
-    )
+    (folder,) = render_path(run, width=4, height=6, overwrite=True, **options)
     assert iio.imread(folder / "color" / "0001.png").shape == (6, 4, 3)
     provenance = json.loads((folder / "path.json").read_text())
     (folder / "path.json").write_text(json.dumps(provenance | {"parameters": "of a run that was trained again"}))
     with pytest.raises(ValueError, match="rendered with parameters"):
-        render_path(run, path=str(other), size=(4, 6), name="other", kind="none")
+        render_path(run, width=4, height=6, **options)
     (folder / "path.json").write_text("{")
     with pytest.raises(ValueError, match="path.json: cannot be read"):
-        render_path(run, path=str(other), size=(4, 6), name="other", kind="none")
+        render_path(run, width=4, height=6, **options)
 
 
 def test_wrong_arguments_are_errors(run, monkeypatch):
@@ -176,7 +174,7 @@ def test_wrong_arguments_are_errors(run, monkeypatch):
         with pytest.raises(ValueError, match="expected a plain file name"):
             render_path(run, name=name)
     with pytest.raises(ValueError, match="video is 'avi', expected one of auto, mp4"):
-        render_path(run, kind="avi")
+        render_path(run, video="avi")
     monkeypatch.setattr(render_path_module.importlib.util, "find_spec", lambda name: None)
     assert render_path_module.video_suffix("auto") == ".gif"
     with pytest.raises(ValueError, match="no ffmpeg; pip install imageio-ffmpeg"):

@@ -40,17 +40,6 @@ def test_a_run_finds_a_dataset_of_a_relative_path_from_any_current_folder(scene,
     assert len(restore_run(tmp_path / "run").experiment.load_split("train").offset) == 7
 
 
-def test_runs_of_versions_without_a_background_color_have_black_behind_the_scene(scene, tmp_path, monkeypatch):
-    monkeypatch.chdir(scene)
-    start_run(tmp_path / "run")
-    file = tmp_path / "run" / "config.json"
-    content = json.loads(file.read_text())
-    assert content["data"].pop("background_color") == []
-    content["data"]["background"] = "none"
-    file.write_text(json.dumps(content))
-    assert restore_run(tmp_path / "run").experiment.background is None
-
-
 def test_a_name_below_jaxnerf_scenes_stays_a_name(scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAXNERF_SCENES", str(scene))

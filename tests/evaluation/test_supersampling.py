@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from jaxnerf.core.types import Rays
-from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.evaluation.supersampling import Footprint, render_pixels, trained_footprint
+from runs import render_path
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -57,8 +57,8 @@ def test_a_small_frame_is_the_mean_of_a_large_one(trained, tmp_path, capsys):
     file.write_text(json.dumps({"frames": [{"transform_matrix": matrix.tolist()}]}))
     images = {}
     for name, scale, most in (("whole", 1, 16), ("small", 4, 16), ("point", 4, 1)):
-        options = {"size": (int(width) // scale, int(height) // scale), "max_rays_per_pixel": most, "overwrite": True}
-        folder, *_ = render_path(workdir, path=str(file), name=name, kind="none", **options)
+        options = {"width": int(width) // scale, "height": int(height) // scale, "max_rays_per_pixel": most}
+        folder, *_ = render_path(workdir, path=str(file), name=name, video="none", overwrite=True, **options)
         images[name] = iio.imread(folder / "color" / "0000.png") / 255
         text = capsys.readouterr().err
         assert ("rays: 16 per pixel, as dense as those of training" in text) == (name == "small")

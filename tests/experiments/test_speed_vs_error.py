@@ -1,7 +1,5 @@
 """The study of speed against error: what it computes from its measurements."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import pytest
@@ -21,12 +19,6 @@ step_parts = study("speed/step_parts")
 def test_comparable_seconds_are_those_of_the_reference_machine():
     assert common.comparable(10.0, common.REFERENCE_GFLOPS) == 10.0
     assert common.comparable(10.0, 2 * common.REFERENCE_GFLOPS) == 20.0  # twice as fast, so twice the work
-
-
-def test_a_bar_is_reached_at_the_first_score_of_at_least_that():
-    points = [{"seconds": 2.0, "psnr": 30.0}, {"seconds": 1.0, "psnr": 28.0}, {"seconds": 3.0, "psnr": 29.9}]
-    assert speed.first_reached(points, 29.0) == 2.0
-    assert math.isinf(speed.first_reached(points, 31.0))
 
 
 def test_a_curve_has_medians_where_all_seeds_were_scored():

@@ -1,6 +1,7 @@
 """The examples of this folder: each adds a part from one file outside the package, and trains with it by name."""
 
 import dataclasses
+import functools
 import os
 import pathlib
 import shutil
@@ -31,7 +32,7 @@ from jaxnerf.tools.uncertainty.base import UncertaintySource
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from jaxnerf.training import auto_config
 from jaxnerf.training.metric_log import read_rows
-from runs import ROOT, SMOKE_FLAGS, smoke_config, start
+from runs import ROOT, SMOKE_FLAGS, run_forked, smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -132,11 +133,24 @@ def test_a_wrong_line_is_named(tum_folder, tmp_path):
 
 def test_an_exporter(tmp_path):
     assert EXPORTERS.get("density").export is density_exporter.export_density
-    density_exporter.export_density(export_sources.source_of(resolution=16), tmp_path)
+    source = export_sources.source_of()._replace(settings=density_exporter.DensityOptions(num_cells=16))
+    density_exporter.export_density(source, tmp_path)
     content = np.load(tmp_path / "density.npz")
     center = (content["upper"] + content["lower"]) / 2
     assert content["density"].shape == (16, 16, 16) and content["density"][8, 8, 8] > 100
     assert content["density"][0, 0, 0] < 1 and (center == 0).all()
+
+
+def test_an_exporter_has_flags_help_and_checks(trained, tmp_path, monkeypatch):
+    workdir = shutil.copytree(trained, tmp_path / "run")
+    monkeypatch.setenv("PYTHONPATH", str(pathlib.Path(__file__).parent))
+    call = functools.partial(run_forked, "export", "--plugins=density_exporter", f"--workdir={workdir}")
+    help = " ".join(call("--help")[1].split())
+    assert "--num_cells: density: cells along each side of the box. Default: 128." in help
+    code, _, err = call("--kind=density", "--num_cells=0")
+    assert code == 2 and "flag --num_cells=0: expected an integer (from 1 to 1,024)" in err
+    code, out, err = call("--kind=density", "--num_cells=8", "--name=cells")
+    assert code == 0 and np.load(out.strip())["density"].shape == (8, 8, 8), err
 
 
 def test_an_estimator(tmp_path):
@@ -221,9 +235,8 @@ def test_a_number_of_type_float_takes_fractions_whatever_its_default():
     assert config.number == 2.5
 
 
-def test_plugins_in_a_file_of_flags_are_imported(tmp_path, monkeypatch):
+def test_plugins_in_a_file_of_flags_are_imported(tmp_path):
     (tmp_path / "flags.txt").write_text("--plugins=uniform_sampler,mask_loss\n")
-    monkeypatch.setattr(sys, "argv", ["train", f"--flagfile={tmp_path / 'flags.txt'}", "--workdir=run"])
-    assert cli._given_flag("plugins") == "uniform_sampler,mask_loss" and cli._given_flag("workdir") == "run"
-    monkeypatch.setattr(sys, "argv", ["train", "--flagfile=missing.txt", "--workdir=run"])
-    assert cli._given_flag("workdir") == "run"
+    argv = ["train", f"--flagfile={tmp_path / 'flags.txt'}", "--workdir=run"]
+    assert cli.given_flag("plugins", argv) == "uniform_sampler,mask_loss" and cli.given_flag("workdir", argv) == "run"
+    assert cli.given_flag("workdir", ["train", "--flagfile=missing.txt", "--workdir=run"]) == "run"

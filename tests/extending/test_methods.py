@@ -7,10 +7,9 @@ import proposal_sampler  # noqa: F401
 import pytest
 
 import jaxnerf
-from jaxnerf.evaluation.evaluate import evaluate
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training.metric_log import read_rows
-from runs import smoke_config
+from runs import evaluate, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 

@@ -1,5 +1,7 @@
 """jit on one device, sharded jit and pmap on four: the same run."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,6 +114,17 @@ def test_uneven_batch_is_an_error(mode):
     state = create_state(toy_model(), optax.sgd(0.1), 0)
     with pytest.raises(ValueError, match="batch_size 30 does not split evenly over 4 device"):
         devices.compile_step(step, state, None, batch_size=30, mode=mode)
+
+
+def test_the_compiled_step_sums_the_gradient_and_four_numbers():
+    model = toy_model()
+    step = make_train_step(model, optax.sgd(0.1), toy_draw, LOSSES)
+    state = create_state(model, optax.sgd(0.1), 0)
+    data = random_rays(0, (16,)), jnp.array([-1])
+    run, _, _ = devices.compile_step(step, state, data, batch_size=16, mode="sharded")
+    sums = re.findall(r"= (.*?) all-reduce(?:-start)?\(", run.compiled.as_text())
+    shapes = [shape for each in sums for shape in re.findall(r"\w+\[([\d,]*)\]", each)]
+    assert sum(np.prod([int(side) for side in shape.split(",") if side]) for shape in shapes) == 2 * 9 + 4
 
 
 def test_unknown_mode_is_an_error():

@@ -11,11 +11,10 @@ import pytest
 
 from jaxnerf.evaluation import aggregate
 from jaxnerf.evaluation.evaluate import score_run
-from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime import memory, shards
 from jaxnerf.training import workdir
-from runs import run_forked
+from runs import render_path, run_forked
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -200,7 +199,7 @@ def test_views_of_other_settings_are_not_mixed(fresh, run, whole):
 @pytest.mark.slow
 def test_shards_of_a_path_make_its_video_when_all_frames_exist(run, rendered, tmp_path, capsys):
     folder = shutil.copytree(run[0], tmp_path / "run", ignore=shutil.ignore_patterns("eval", "whole"))
-    options = {"path": "turntable", "num_frames": 3, "size": (8, 8), "kind": "gif", "settings": {"chunk": 64}}
+    options = {"path": "turntable", "num_frames": 3, "width": 8, "height": 8, "video": "gif", "settings": {"chunk": 64}}
     target = folder / "renders" / "turntable-20"
     assert render_path(folder, shard=(1, 2), **options) == [target]
     assert "shard 1/2 is done, 2 frames of others are missing" in capsys.readouterr().err

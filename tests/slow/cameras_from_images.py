@@ -66,7 +66,7 @@ def estimate(images, out, report):
     if not report.exists():
         start, before = time.monotonic(), os.times()
         flags = (f"--images={images}", f"--out={out}", f"--max_size={MAX_SIZE}", "--num_threads=1")
-        command = [sys.executable, "-m", "jaxnerf.tools.structure_from_motion.program", *flags]
+        command = [sys.executable, "-m", runs.module_of("cameras"), *flags]
         text = subprocess.run(command, cwd=runs.ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
         after = os.times()
         cpu = after.children_user + after.children_system - before.children_user - before.children_system
@@ -78,7 +78,7 @@ def estimate(images, out, report):
 
 def check(out, plot):
     """Returns whether jaxnerf-check finds no error in a dataset, and the points in it."""
-    command = [sys.executable, "-m", "jaxnerf.tools.capture_check.program", f"--data_dir={out}", f"--out={plot}"]
+    command = [sys.executable, "-m", runs.module_of("check"), f"--data_dir={out}", f"--out={plot}"]
     done = subprocess.run(command, cwd=runs.ROOT, stdout=subprocess.PIPE, text=True)
     print(done.stdout, file=sys.stderr)
     return done.returncode == 0 and "points on which the images agree" in done.stdout

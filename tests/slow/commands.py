@@ -55,13 +55,12 @@ def main() -> int:
 def run(line: str, folder: pathlib.Path) -> subprocess.CompletedProcess:
     """Runs a command line in a folder, at a small size."""
     program, *flags = shlex.split(line)
-    module = PROGRAMS[program]
     if "=DIR" in line:
         for kind in ("color", "gt-color"):
             shutil.copytree(next(folder.glob("runs/lego/eval/*")) / kind, folder / "DIR" / kind)
     flags = [flag.replace("/path/to/dataset", "lego").replace("/path/to/lego", "lego") for flag in flags]
     flags = [flag.replace("--error_budget=0.002", "--error_budget=0.1") for flag in flags]  # after 20 steps all is fog
-    command = [sys.executable, "-m", f"jaxnerf.{module}", *flags, *SHORT.get(module, [])]
+    command = [sys.executable, "-m", PROGRAMS[program], *flags, *SHORT.get(program.removeprefix("jaxnerf-"), [])]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

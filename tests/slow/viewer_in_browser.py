@@ -18,7 +18,7 @@ import imageio.v3 as iio
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from runs import ROOT, free_port
+from runs import ROOT, free_port, module_of
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 FLAGS = [
@@ -67,7 +67,7 @@ def refusals(run, port):
         ([f"--workdir={run}", "--port=99999"], "99999"),
     ):
         done = subprocess.run(
-            [sys.executable, "-m", "jaxnerf.tools.viewer.program", *flags], capture_output=True, text=True, cwd=ROOT
+            [sys.executable, "-m", module_of("view"), *flags], capture_output=True, text=True, cwd=ROOT
         )
         lines = done.stderr.strip().splitlines()
         check(done.returncode and len(lines) == 1 and words in lines[0], f"refused in one line: {lines[-1]}")
@@ -328,7 +328,7 @@ def number(page, label, value):
 def server(program, *flags, flag="port"):
     """Yields a program that serves on a free port, and the port."""
     port = free_port()
-    command = [sys.executable, "-m", f"jaxnerf.{program}", *flags, f"--{flag}={port}"]
+    command = [sys.executable, "-m", module_of(program), *flags, f"--{flag}={port}"]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     try:
         for line in process.stderr:
@@ -345,7 +345,7 @@ def server(program, *flags, flag="port"):
 
 
 def call(program, *flags):
-    subprocess.run([sys.executable, "-m", f"jaxnerf.{program}", *map(str, flags)], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, "-m", module_of(program), *map(str, flags)], cwd=ROOT, check=True)
 
 
 def cpu_seconds(process):

@@ -11,6 +11,7 @@ import pytest
 from absl import flags
 from ml_collections import config_flags
 
+import captures
 from helpers import compiled
 from jaxnerf import Camera, SparsePoints, Views
 from jaxnerf.configs import default, lego_fast, lego_mlp_fast
@@ -19,7 +20,6 @@ from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
 from jaxnerf.data.geometry import visual_hull
 from jaxnerf.data.ray_batches import view_rays
-from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO
 from jaxnerf.registry import FIELDS, Part
@@ -64,7 +64,6 @@ AUTO_FIELDS = {
     "train.lr_steps": 300,
     "eval.sample_multiplier": 3,
     "eval.chunk": 512,
-    "eval.max_uncertainty": 0.75,
     "eval.max_samples": 2048,
 }
 
@@ -184,12 +183,6 @@ def test_every_auto_field_is_inferred_and_logged(resolved):
     assert f"a pixel covers {PIXEL:.4g}" in "".join(lines)
 
 
-def test_a_value_that_each_checkpoint_has_stays_auto(views):
-    config = changed(read_config(auto_config()), {"eval.max_uncertainty": AUTO})
-    config = resolve_for_device(resolve(config, views).config)[0]
-    assert config.eval.max_uncertainty == AUTO and not auto_fields(config)
-
-
 @pytest.mark.parametrize("contracted, weight", [(False, 0.01), (True, 0.001)])
 def test_distortion_weighs_less_where_nothing_bounds_the_scene(views, contracted, weight):
     config = changed(read_config(auto_config(contracted=contracted)), {"losses.distortion": AUTO})
@@ -280,7 +273,7 @@ def test_explicit_values_do_not_change(views):
     assert as_json(given) == before and unresolved(given)
     changed = {name for name, value in fields(config).items() if value != fields(given)[name]}
     names = ("contracted", "lower", "upper", "step_size", "resolution", "min_views")
-    expected = {"data.world", "data.fingerprint", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
+    expected = {"data.world", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
     expected |= {"data.near", "data.background_color", "cameras.num_images", "losses.depth", "hash_grid.prefilter"}
     assert changed == expected
 
@@ -674,7 +667,7 @@ def test_workdir_gives_the_same_model(resolved, views, tmp_path):
 
 @pytest.mark.scenes("lego")
 def test_sizes_of_lego(scenes_dir):
-    lego = blender.load_blender(scenes_dir / "lego", split="train", factor=8)  # with fewer views the box is larger
+    lego = captures.load_blender(scenes_dir / "lego", split="train", factor=8)  # with fewer views the box is larger
     config = resolve(lego_fast.get_config(), lego).config
     occupancy = config.occupancy
     assert (np.abs([occupancy.lower, occupancy.upper]) < 1.3).all()

@@ -11,7 +11,7 @@ import jaxnerf
 from helpers import all_finite
 from jaxnerf import Batch, Camera, Views
 from jaxnerf.data import ray_batches
-from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import refined_views, restore_run
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import Model
@@ -29,7 +29,7 @@ from jaxnerf.training.config import read_config
 from jaxnerf.training.optimizer import OptimizerOptions, make_optimizer
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import TrainData, make_train_step
-from runs import smoke_config
+from runs import evaluate, smoke_config
 from toys import LOSSES, toy_rendering
 
 pytest_plugins = ["run_fixtures"]

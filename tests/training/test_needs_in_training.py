@@ -12,14 +12,13 @@ import pytest
 import captures
 import jaxnerf
 from jaxnerf.core.scene import NEEDS, needs_of
-from jaxnerf.evaluation.evaluate import evaluate
 from jaxnerf.evaluation.restore import restore_with_grid
 from jaxnerf.fields.base import Field
-from jaxnerf.tools.exporters.base import ExportSettings, export_run
+from jaxnerf.tools.exporters.base import export_run
 from jaxnerf.tools.viewer.frame_renderer import FrameCamera, FrameRenderer
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.step import ProgressData
-from runs import PACKED, smoke_config
+from runs import PACKED, evaluate, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -123,7 +122,7 @@ def test_it_is_scored_exported_and_viewed(workdir, tmp_path):
     folder = shutil.copytree(workdir, tmp_path / "run")
     assert evaluate(folder, split="held_out")["views"] == 2
     for kind in ("points", "splats"):
-        export_run(folder, kind, settings=ExportSettings(resolution=16, num_views=4, num_points=500), say=print)
+        export_run(folder, kind, resolution=16, num_views=4, num_points=500)
     run = restore_with_grid(folder)
     renderer = FrameRenderer(run, run.experiment.load_split("train"), chunk=512)
     state = renderer.scene_state(STEPS, run.variables(STEPS))

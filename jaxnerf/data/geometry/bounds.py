@@ -8,7 +8,6 @@ from jaxnerf.data.geometry.poses import gaze_center
 from jaxnerf.data.geometry.world import poses_of, unit_of
 from jaxnerf.data.readers.base import Capture
 
-BLENDER_RANGE = (2.0, 6.0)  # near and far of the NeRF paper's synthetic scenes, world units
 _OUTLIERS = 1.0  # percent of points at each end that may be wrong matches
 _MARGIN = 0.8  # for matter without points: near is multiplied, far divided by it
 _MIN_POINTS = 8  # points that a view must show for bounds
@@ -20,12 +19,13 @@ _FARTHEST = 10.0  # far over the distance to what the cameras look at, if nothin
 def with_bounds(capture: Capture) -> Capture:
     """Returns the Capture with bounds in every frame, in world units along the camera's axis.
 
-    Existing bounds are kept. Otherwise they come from the points that the frame shows. Without points, near is
-    the depth from which two other cameras see what the frame sees, and far is the end of the dataset's box.
+    Existing bounds are kept, and else those that the format defines. Otherwise they come from the points that the frame
+    shows. Without points, near is the depth from which two other cameras see what the frame sees, and far is the end of
+    the dataset's box.
     """
     if all(frame.bounds is not None for frame in capture.frames):
         return capture
-    found = [frame.bounds or _of_points(capture, frame) for frame in capture.frames]
+    found = [frame.bounds or capture.bounds or _of_points(capture, frame) for frame in capture.frames]
     unknown = [index for index, bounds in enumerate(found) if bounds is None]
     for index, bounds in zip(unknown, _shared_depths(capture, unknown), strict=True):
         found[index] = bounds
@@ -56,22 +56,6 @@ def unsuited_to_ndc(capture: Capture) -> str:
     return "at a layer that is thin beside how far they are apart" if survey else ""
 
 
-def blender_range(poses: Float[np.ndarray, "V 3 4"]) -> tuple[float, float]:
-    """Returns the near and far of a dataset in Blender's format, from the poses of its training views.
-
-    They are 2 and 6 as in the NeRF paper's scenes, whose cameras look at a point 4 units away. Where cameras look at a
-    point that is not between them, as in a scene of other units, they are one half and three halves of its distance.
-    """
-    near, far = BLENDER_RANGE
-    offset = gaze_center(poses) - poses[:, :, 3]
-    distance = float(np.median(np.linalg.norm(offset, axis=1)))
-    ahead = -np.einsum("vi,vi->v", offset, poses[:, :, 2])
-    looks_there = np.mean(ahead > 0.8 * np.linalg.norm(offset, axis=1)) > 0.8
-    if near < distance < far or not (looks_there and distance > 0):
-        return near, far
-    return float(f"{distance / 2:.3g}"), float(f"{1.5 * distance:.3g}")
-
-
 def override_bounds(capture: Capture, near: float, far: float, to_file: Float[np.ndarray, "4 4"]) -> Capture:
     """Returns the Capture with near and far in place of its frames' bounds, each unless it is 0.
 
@@ -87,7 +71,7 @@ def override_bounds(capture: Capture, near: float, far: float, to_file: Float[np
     frames = []
     for frame in capture.frames:
         bounds = near / unit or frame.bounds[0], far / unit or frame.bounds[1]
-        if not 0 <= bounds[0] < bounds[1]:
+        if not 0 <= bounds[0] < bounds[1] < np.inf:
             raise ValueError(
                 f"{capture.source}: {frame.name} has near {bounds[0] * unit:g} and far {bounds[1] * unit:g}, "
                 "expected near < far; correct data.near and data.far, or set them to 0"

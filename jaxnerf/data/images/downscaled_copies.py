@@ -55,7 +55,7 @@ def factor_for(capture: Capture, width: int) -> tuple[int, int]:
     if width < 1:
         raise ValueError(f"data.width is {width}, expected at least 1 px; correct it, or set data.factor")
     factors = np.arange(1, max(math.ceil(2 * full / width), 2) + 1)
-    if capture.format == "blender":  # the Blender reader does not crop, so the factor divides the size
+    if capture.rendered:  # such images are not cropped
         common = math.gcd(*(side for frame in frames for side in (frame.camera.height, frame.camera.width)))
         valid = factors[common % factors == 0]
     else:

@@ -2,20 +2,21 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from jaxnerf.core.types import Camera, SparsePoints
 from jaxnerf.core.views import Views
-from jaxnerf.data.images.downscaled_copies import choose_copies
+from jaxnerf.data.images.downscaled_copies import choose_copies, with_size
 from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_image, read_mask
 from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers
-from jaxnerf.data.readers.base import Capture, Frame, frame_times
+from jaxnerf.data.readers.base import Capture, frame_times
 from jaxnerf.data.readers.validation import check_background, check_factor
 
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # number of coefficients
@@ -31,7 +32,7 @@ def split_indices(capture: Capture, split: str, *, hold: int = 8) -> Int[np.ndar
     Raises:
         ValueError: if the split is unknown or empty.
     """
-    if split not in ("train", "val", "test"):
+    if split not in {"train", "val", "test", *(capture.splits or ())}:
         raise ValueError(f"{capture.source}: split is {split!r}, expected 'train', 'val' or 'test'; choose one")
     if capture.splits:
         other = {"val": "test", "test": "val"}.get(split, split)
@@ -80,29 +81,24 @@ def load_capture(
         ValueError: names the file, what was found, what is expected and what to do.
     """
     factor, background = check_factor(factor), check_background(background)
-    frames, shrink = choose_copies(capture.frames, factor)
+    if capture.rendered:
+        frames, shrink = tuple(map(with_size, capture.frames)), factor
+    else:
+        frames, shrink = choose_copies(capture.frames, factor)
     chosen = [frames[index] for index in split_indices(capture, split, hold=hold)]
     chosen = chosen if select is None else [chosen[index] for index in select(len(chosen))]
-    return load_frames(chosen, shrink, background=background, source=capture.source, points=capture.points)
+    if capture.rendered:
+        _check_rendered(chosen, factor, background)
+    return _load_frames(chosen, shrink, background=background, source=capture.source, points=capture.points)
 
 
-def load_frames(
-    chosen: Sequence[Frame],
-    shrink: int,
-    *,
-    background: tuple[float, ...] | None,
-    source: Path,
-    points: Float[np.ndarray, "N 3"] | None = None,
-) -> Views:
-    """Reads frames, whose cameras have a height and width, as `load_capture` does.
+def split_rule(capture: Capture) -> str:
+    """Returns in words which frames are those of the split "test", see `split_indices`."""
+    return "all that the dataset's own lists name" if capture.splits else "every 8th by name, from the first"
 
-    Args:
-        chosen: with bounds.
-        shrink: see `load_capture.factor`; the frames' images are used.
-        background: see `load_capture`.
-        source: for messages.
-        points: see `Capture`.
-    """
+
+def _load_frames(chosen, shrink, *, background, source, points):
+    """Reads frames, whose cameras have a height and width, with sparse points as `load_capture` does."""
     with ThreadPoolExecutor(num_workers()) as pool:
         forms = list(pool.map(functools.partial(_form, shrink=shrink, background=background), chosen))
     sizes = np.array([form.size for form in forms])
@@ -127,6 +123,29 @@ def load_frames(
         sparse=_sparse_points(points, chosen, forms, shrink),
         time=frame_times(frame.time for frame in chosen),
     )
+
+
+def _check_rendered(frames, factor, background):
+    """Raises a ValueError if a rendered image has no alpha to composite, or another size than stated or usual."""
+    (*usual, _), usual_dtype = image_form(frames[0].image)
+    for frame in frames:
+        path, declared = frame.image, (frame.camera.height, frame.camera.width)
+        (height, width, channels), dtype = image_form(path)
+        if background is not None and channels != 4:
+            raise ValueError(
+                f"{path}: has no alpha, expected RGBA; set data.background to 'none' (background=None) for RGB"
+            )
+        if declared != (height, width):
+            expected = f"w = {declared[1]}, h = {declared[0]} as its file states"
+            raise ValueError(f"{path}: is {width} x {height}, expected {expected}; correct one of them")
+        if height % factor or width % factor:
+            common = math.gcd(height, width)
+            works = ", ".join(str(k) for k in range(1, common + 1) if common % k == 0)
+            found = f"factor {factor} does not divide {width} x {height}"
+            raise ValueError(f"{path}: {found}, expected a divisor; choose one of {works}")
+        if [height, width] != usual or dtype != usual_dtype:
+            expected = f"{usual[1]} x {usual[0]} {usual_dtype} as {frames[0].image.name}"
+            raise ValueError(f"{path}: is {width} x {height} {dtype}, expected {expected}; render all alike")
 
 
 def stack_cameras(cameras: Sequence[Camera], names: Sequence[str]) -> Camera:

@@ -1,6 +1,7 @@
 """The result of every reader: posed images in the world of the dataset's files, not yet decoded."""
 
 import dataclasses
+import inspect
 import math
 import os
 from collections.abc import Iterable
@@ -49,8 +50,31 @@ class Frame(NamedTuple):
     time: float | None = None
 
 
+class CameraFiles(NamedTuple):
+    """How the files of a format state cameras, for messages that say what to change in them.
+
+    Attributes:
+        poses: the matrices, in words.
+        axes: [3, 3], the camera axes of jaxnerf in those of the files.
+        lines: the part of a matrix that holds one axis: "columns" or "rows".
+        mirror: how to mirror the world in one coordinate.
+        focal: how to set a focal length of {x}, {y} px, {factor} times the stated one, and the angle {angle}, in
+            radians, that it gives the width of the image. {file} is the name of the Capture's source.
+        bounds: where near and far of each frame are stated; {source} is the Capture's.
+    """
+
+    poses: str = "every pose"
+    axes: Float[np.ndarray, "3 3"] = np.eye(3)
+    lines: str = "columns"
+    mirror: str = "also mirror the world"
+    focal: str = "{file}: the focal length to about {x:.5g}, {y:.5g} px"
+    bounds: str = "the bounds in {source}"
+
+
 class Capture(NamedTuple):
     """The images of a dataset, sorted by name.
+
+    A reader sets the first three fields, and of the others those that it knows.
 
     Attributes:
         format: the name under which the reader is registered.
@@ -62,6 +86,12 @@ class Capture(NamedTuple):
         notes: one line for each part of the dataset that was skipped or found at another place, with the reason.
         choices: one line for each choice of the reader that the files leave open, with the reason.
         origin: [3] the point of the files' world, in their units, that is the origin of this one; None: theirs is.
+        normalised: whether training takes place in the files' world, as the format defines where the scene is.
+        rendered: whether a program has rendered the images: all have alpha and one size, which a factor divides.
+        bounds: (near, far) of frames without their own, world units, where the format defines them; None: they follow
+            from points and cameras.
+        bounds_reason: why the bounds are not those that the format usually has; "": they are.
+        files: how the files state the cameras.
     """
 
     format: str
@@ -73,6 +103,11 @@ class Capture(NamedTuple):
     notes: tuple[str, ...] = ()
     choices: tuple[str, ...] = ()
     origin: Float[np.ndarray, "3"] | None = None
+    normalised: bool = False
+    rendered: bool = False
+    bounds: tuple[float, float] | None = None
+    bounds_reason: str = ""
+    files: CameraFiles = CameraFiles()
 
 
 def fingerprint(capture: Capture) -> str:
@@ -114,17 +149,33 @@ def detect_formats(folder: str | os.PathLike) -> list[str]:
     return found
 
 
-def read_capture(folder: str | os.PathLike, format: str = "auto") -> Capture:
+def read_capture(folder: str | os.PathLike, format: str = "auto", *, split: str | None = None) -> Capture:
     """Reads the Capture in a folder, in a given format or in the first that is detected.
 
     If the cameras are far from the origin of the files' world, as in geographic coordinates, the Capture has another
     origin near them, see `origin_near`: float32, in which Views are, does not hold such positions.
 
+    Args:
+        folder: of the dataset.
+        format: the name of a registered reader, or "auto".
+        split: whose frames are enough; a reader of `has_split_files` reads only its file.
+
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    capture = READERS.get(detect_formats(folder)[0] if format == "auto" else format).read(Path(folder))
-    return _moved_near(capture if capture.format == "blender" else _with_masks(capture, Path(folder)))
+    format = detect_formats(folder)[0] if format == "auto" else format
+    read = READERS.get(format).read
+    if has_split_files(format):
+        return read(Path(folder), split=split)
+    return moved_near(_with_masks(read(Path(folder)), Path(folder)))
+
+
+def has_split_files(format: str) -> bool:
+    """Returns whether each split of a format has a file of its own: its reader asks for `split`.
+
+    Such a reader also finds masks and the origin by itself. The images of one split do not depend on the others'.
+    """
+    return "split" in inspect.signature(READERS.get(format).read).parameters
 
 
 def origin_near(positions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"] | None:
@@ -142,31 +193,39 @@ def origin_near(positions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"] |
     return np.array([float(f"{value:.12g}") for value in np.round(middle / unit) * unit])
 
 
-def moved(frame: Frame, origin: Float[np.ndarray, "3"] | None) -> Frame:
-    """Returns a frame whose camera's position is relative to an origin; None: 0."""
-    if origin is None:
-        return frame
-    pose = np.array(frame.camera.to_world, np.float64)
-    pose[:, 3] -= origin
-    return frame._replace(camera=dataclasses.replace(frame.camera, to_world=pose))
+def moved_near(capture: Capture, positions: Float[np.ndarray, "V 3"] | None = None) -> Capture:
+    """Returns the Capture with an origin near its training cameras, if that of the files is far away.
 
-
-def _moved_near(capture):
-    """Returns the Capture with an origin near its training cameras, if that of the files is far away."""
-    frames, splits = capture.frames, capture.splits or {}
-    train = [frames[index] for index in splits.get("train") or range(len(frames))]
-    origin = origin_near(np.stack([np.asarray(frame.camera.to_world, np.float64)[:, 3] for frame in train]))
+    Args:
+        capture: in the files' world.
+        positions: of the training cameras; None: the Capture has them.
+    """
+    if positions is None:
+        train = (capture.splits or {}).get("train") or range(len(capture.frames))
+        positions = np.stack([_position(capture.frames[index].camera) for index in train])
+    origin = origin_near(positions)
     if origin is None:
         return capture
     place = ", ".join(f"{value:.10g}" for value in origin)
     line = f"positions are relative to ({place}): the cameras are far from the files' origin"
     return capture._replace(
-        frames=tuple(moved(frame, origin) for frame in frames),
+        frames=tuple(_moved(frame, origin) for frame in capture.frames),
         points=None if capture.points is None else capture.points - origin,
         box=None if capture.box is None else tuple(corner - origin for corner in capture.box),
         choices=(*capture.choices, line),
         origin=origin,
     )
+
+
+def _position(camera):
+    return np.asarray(camera.to_world, np.float64)[:, 3]
+
+
+def _moved(frame, origin):
+    """Returns a frame whose camera's position is relative to an origin."""
+    pose = np.array(frame.camera.to_world, np.float64)
+    pose[:, 3] -= origin
+    return frame._replace(camera=dataclasses.replace(frame.camera, to_world=pose))
 
 
 def _with_masks(capture, folder):

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.data.readers.colmap_model import (
     AGAIN,
     MODEL_FOLDERS,
@@ -22,6 +22,13 @@ from jaxnerf.data.readers.image_paths import ImageFinder, nearly
 from jaxnerf.data.readers.validation import check_inside, is_number
 from jaxnerf.registry import Reader
 
+_FILES = CameraFiles(
+    poses="every world-to-camera matrix [R | t] of the images file",
+    axes=np.diag([1.0, -1.0, -1.0]),
+    lines="rows",
+    mirror="also negate column 1 of every R and x of every point (the world is mirrored)",
+    focal="the cameras file: every focal length times {factor:.3g}, or run COLMAP again",
+)
 _LENSES = {  # COLMAP's camera model: its number of focal lengths, and the lens of Camera
     "SIMPLE_PINHOLE": (1, "pinhole"),
     "PINHOLE": (2, "pinhole"),
@@ -80,7 +87,7 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     if not len(ids):
         points, frames = None, [frame._replace(seen=None, seen_at=None) for frame in frames]
     frames = tuple(sorted(frames, key=lambda frame: frame.name))
-    return Capture("colmap", model, frames, points=points, notes=tuple(notes))
+    return Capture("colmap", model, frames, points=points, notes=tuple(notes), files=_FILES)
 
 
 def models_in(folder: Path) -> list[Path]:

@@ -12,6 +12,8 @@ from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.readers.intrinsics import ignored_facts, read_camera
 from jaxnerf.data.readers.validation import required
 
+MIRROR = "also negate row 1 of every transform_matrix (the world is mirrored)"  # see `CameraFiles.mirror`
+
 
 def read_poses(
     source: Path, frames: Sequence[tuple[str, Mapping[str, Any]]]

@@ -7,10 +7,18 @@ import numpy as np
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.images.downscaled_copies import downscaled_folders, list_images
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.data.readers.json_frames import rounding_notes
 from jaxnerf.data.readers.validation import MAX_FLOAT32, read_npy
 from jaxnerf.registry import Reader
+
+_FILES = CameraFiles(
+    poses="the 3 x 5 matrix in every row of poses_bounds.npy",
+    axes=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+    mirror="also negate row 1 of every 3 x 5 matrix except in column 5 (the world is mirrored)",
+    focal="poses_bounds.npy: row 3 of every column 5 to about {x:.5g}",
+    bounds="the last two columns of {source}",
+)
 
 
 def read_capture(folder: Path) -> Capture:
@@ -37,7 +45,7 @@ def read_capture(folder: Path) -> Capture:
             width=int(width),
         )
         frames.append(Frame(path.stem, path, camera, follow_exif=False, bounds=tuple(bound.tolist())))
-    return Capture("llff", source, tuple(frames), notes=tuple(notes))
+    return Capture("llff", source, tuple(frames), notes=tuple(notes), files=_FILES)
 
 
 def _read_poses(path):

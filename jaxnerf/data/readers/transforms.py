@@ -6,15 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.data.readers.image_paths import ImageFinder, fold, nearly
 from jaxnerf.data.readers.intrinsics import number_in, wrong_value
-from jaxnerf.data.readers.json_frames import read_cameras, read_poses, read_splits, split_ranges
+from jaxnerf.data.readers.json_frames import MIRROR, read_cameras, read_poses, read_splits, split_ranges
 from jaxnerf.data.readers.ply import read_points
 from jaxnerf.data.readers.split_files import SPLITS, full_cameras, split_files
 from jaxnerf.data.readers.validation import is_number, read_json, read_times, required
 from jaxnerf.registry import Reader
 
+_FILES = CameraFiles(
+    poses="every transform_matrix of the JSON files",
+    mirror=MIRROR,
+    focal="{file}: fl_x, fl_y (or camera_angle_x) to about {x:.5g}, {y:.5g}",
+)
 _UNUSED = {  # facts of other programs that are no camera's, and what sets them instead
     "up": "data.up sets the axis that is up",
     "exposure": "cameras.exposure trains the exposure of each image",
@@ -65,6 +70,7 @@ def read_capture(folder: str | os.PathLike) -> Capture:
         box=file.box,
         notes=(*file.notes, *finder.notes(source), *split_notes),
         choices=tuple(_world(file)),
+        files=_FILES,
     )
 
 
@@ -88,6 +94,7 @@ def _read_splits(folder, stated):
         box=first.box,
         notes=(*_joined_notes(files.values()), *finder.notes(first.source), *notes),
         choices=(choice, *held_out, *_world(first)),
+        files=_FILES,
     )
 
 

@@ -1,5 +1,6 @@
 """Renders a trained run along a camera path, resumes where it was interrupted, and makes a video."""
 
+import dataclasses
 import glob
 import importlib.util
 import os
@@ -8,16 +9,18 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import imageio.v2
 import numpy as np
 
+from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path
-from jaxnerf.evaluation.restore import newest_step, refined_views, render_settings, restore_run
+from jaxnerf.evaluation.paths.camera_path import CameraPath
+from jaxnerf.evaluation.restore import newest_step, refined_views
 from jaxnerf.evaluation.supersampling import MAX_RAYS, render_pixels, trained_footprint
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, shards
@@ -27,26 +30,59 @@ from jaxnerf.training.metric_log import Progress, minutes
 VIDEO_KINDS = ("auto", "mp4", "gif", "none")
 
 
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """What is rendered.
+
+    Attributes:
+        path: see `camera_path.make_path`; when None `path_poses.default_kind` selects one, and it is printed.
+        num_frames, closed, up: see `camera_path.make_path`; without up, it is that of the run's option `data.up`.
+        width, height: px, see `camera_path.resize`.
+        max_rays_per_pixel: a pixel that covers more of the scene than a ray of training is the mean over as many rays
+            as training has there, and at most so many, see `Footprint.rays_per_side`.
+    """
+
+    path: str | None = None
+    num_frames: int | None = None
+    closed: bool = False
+    up: str | None = None
+    width: int | None = None
+    height: int | None = None
+    max_rays_per_pixel: int = MAX_RAYS
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """What is written of the frames.
+
+    Attributes:
+        name: in place of the path's in the names of folder and video.
+        rgba: whether rgba/0000.png is written, too: straight alpha, without the background.
+        depth: whether there is a video of the depth, too.
+        video: its kind, see `video_suffix`.
+        fps: frames per second; when None the path file's, or 24.
+        overwrite: whether frames of that name are deleted first.
+        shard: (index, count): only every count-th frame, from frame `index` on. The process that finds all
+            frames finished makes the depth images and the videos.
+    """
+
+    name: str | None = None
+    rgba: bool = False
+    depth: bool = False
+    video: str = "auto"
+    fps: float | None = None
+    overwrite: bool = False
+    shard: tuple[int, int] = shards.WHOLE
+
+
 def render_path(
+    run: TrainedRun,
     workdir: str | os.PathLike,
+    frames: Frames,
+    output: Output,
     *,
-    path: str | None = None,
     step: int | None = None,
-    data_dir: str | None = None,
-    settings: dict[str, Any] | None = None,
-    size: tuple[int | None, int | None] = (None, None),
-    num_frames: int | None = None,
-    closed: bool = False,
-    up: str | None = None,
-    fps: float | None = None,
-    name: str | None = None,
-    rgba: bool = False,
-    depth: bool = False,
     predictor: Callable[[TrainedRun], Any] | None = None,
-    kind: str = "auto",
-    overwrite: bool = False,
-    shard: tuple[int, int] = shards.WHOLE,
-    max_rays_per_pixel: int = MAX_RAYS,
 ) -> list[pathlib.Path]:
     """Renders a camera path to <workdir>/renders/<path>-<step>/ and a video beside that folder.
 
@@ -56,109 +92,119 @@ def render_path(
     the whole path; and path.json, everything that the frames depend on. Existing frames are not rendered again.
 
     Args:
+        run: restored from the workdir.
         workdir: the folder that training wrote.
-        path: see `camera_path.make_path`; when None `path_poses.default_kind` selects one, and it is printed.
+        frames: what is rendered.
+        output: what is written of it.
         step: of the checkpoint; the newest when None.
-        data_dir, settings: see `restore_run`.
-        size: (width, height) px, see `camera_path.resize`.
-        num_frames, closed, up: see `camera_path.make_path`; without up, it is that of the run's option `data.up`.
-        fps: frames per second; when None the path file's, or 24.
-        name: in place of the path's in the names of folder and video.
-        rgba: whether rgba/0000.png is written, too: straight alpha, without the background.
-        depth: whether there is a video of the depth, too.
         predictor: TrainedRun -> `uncertainty.predict.Predictor`. The predicted errors are then written, too, as
             uncertainty/0000.tiff, float32, in units of colour, and uncertainty/0000.png, black where they are 0 and
             white where they are largest in the whole path, apart from a hundredth of its pixels; and a video of these.
-        kind: of video, see `video_suffix`.
-        overwrite: whether frames of that name are deleted first.
-        shard: (index, count): only every count-th frame, from frame `index` on. The process that finds all
-            frames finished makes the depth images and the videos.
-        max_rays_per_pixel: a pixel that covers more of the scene than a ray of training is the mean over as many rays
-            as training has there, and at most so many, see `Footprint.rays_per_side`.
 
     Returns:
         The paths written: the folder and the videos.
 
     Raises:
-        ValueError: if there is no such run, checkpoint or path, or frames of that name have another provenance.
+        ValueError: if there is no such checkpoint or path, or frames of that name have another provenance.
     """
-    suffix = video_suffix(kind)
+    suffix, name = video_suffix(output.video), output.name
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
-    run = restore_run(workdir, data_dir=data_dir, settings=settings)
     step = newest_step(run, workdir, step)
-    variables = run.variables(step)
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
-    up = up or run.experiment.config.data.up or None
-    path = camera_path.make_path(select_kind(path, views, up), views, num_frames=num_frames, closed=closed, up=up)
-    path = camera_path.resize(path, *size)
-    sides = trained_footprint(run, views).rays_per_side(path.poses, path.focal, max_rays=max_rays_per_pixel)
-    _print_rays(sides)
-    target = pathlib.Path(workdir) / "renders" / f"{name or path.name}-{step}"
+    shown = _shown(run, run.variables(step), frames)
+    target = pathlib.Path(workdir) / "renders" / f"{name or shown.path.name}-{step}"
     atomic_files.check_tree(target.parent)
-    shards.refuse_overwrite(overwrite, shard, target)
-    found = predictor and predictor(run)
-    provenance = _provenance(run, step, variables, views, path, closed, sides)
-    provenance |= {"uncertainty": found.identity} if found else {}
-    shards.make_folder(target, provenance, overwrite=overwrite)
-    missing = _write_frames(target, run, variables, views, path, sides, rgba=rgba, predictor=found, shard=shard)
+    shards.refuse_overwrite(output.overwrite, output.shard, target)
+    shown = shown._replace(predictor=predictor and predictor(run))
+    shards.make_folder(target, {**_provenance(shown, frames), "step": step}, overwrite=output.overwrite)
+    missing = _write_frames(target, shown, output)
     written = [target]
     if missing:
-        print(f"shard {shard[0]}/{shard[1]} is done, {missing} frames of others are missing", file=sys.stderr)
+        index, count = output.shard
+        print(f"shard {index}/{count} is done, {missing} frames of others are missing", file=sys.stderr)
         return written
-    for folder, wanted in (("color", True), ("depth", depth), ("uncertainty", found)):
+    for folder, wanted in (("color", True), ("depth", output.depth), ("uncertainty", predictor)):
         if wanted and suffix:
             end = "" if folder == "color" else f"-{folder}"
             written.append(target.with_name(f"{target.name}{end}{suffix}"))
-            files = [target / folder / f"{index:04d}.png" for index in range(len(path.poses))]
-            write_video(written[-1], files, fps or path.fps or 24.0)
+            files = [target / folder / f"{index:04d}.png" for index in range(len(shown.path.poses))]
+            write_video(written[-1], files, output.fps or shown.path.fps or 24.0)
     return written
 
 
-def _write_frames(target, run, variables, views, path, sides, *, rgba, predictor, shard):
+class _Shown(NamedTuple):
+    """A checkpoint of a run, with refined Views, and the cameras that it is rendered from, with rays per side [N]."""
+
+    run: TrainedRun
+    variables: Any
+    views: Views
+    path: CameraPath
+    sides: np.ndarray
+    predictor: Any = None
+
+
+def _shown(run, variables, frames):
+    """Makes the path of frames; prints what has been chosen for it."""
+    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    up = frames.up or run.experiment.config.data.up or None
+    options = {"num_frames": frames.num_frames, "closed": frames.closed, "up": up}
+    path = camera_path.make_path(select_kind(frames.path, views, up), views, **options)
+    path = camera_path.resize(path, frames.width, frames.height)
+    footprint = trained_footprint(run, views)
+    sides = footprint.rays_per_side(path.poses, path.focal, max_rays=frames.max_rays_per_pixel)
+    _print_rays(sides)
+    return _Shown(run, variables, views, path, sides)
+
+
+def _write_frames(target, shown, output):
     """Renders those frames of a shard that are not in a folder yet; see `render_path`.
 
     Returns:
         How many frames of other shards are missing; 0 when the images of depths and errors are written, too.
     """
-    kinds = {"depth": "tiff", "color": "png", **({"rgba": "png"} if rgba else {})}
+    path, predictor = shown.path, shown.predictor
+    kinds = {"depth": "tiff", "color": "png"} | ({"rgba": "png"} if output.rgba else {})
     kinds |= {"uncertainty": "tiff"} if predictor else {}
     files = [[target / kind / f"{index:04d}.{end}" for kind, end in kinds.items()] for index in range(len(path.poses))]
     for kind in kinds:
         (target / kind).mkdir(parents=True, exist_ok=True)
-
-    def missing():
-        return [index for index, group in enumerate(files) if not all(file.is_file() for file in group)]
-
-    frames = shards.indices_of(range(len(files)), shard)
+    frames = shards.indices_of(range(len(files)), output.shard)
     readable = output_images.readable([files[index] for index in frames], [(path.height, path.width)] * len(frames))
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
-    if todo:
-        posed, progress = camera_path.posed_views(views, path), Progress(len(frames))
-        compiled = None
-        for done, index in enumerate(todo, len(frames) - len(todo) + 1):
-            pixels = camera_path.path_pixels(posed, path, index, offset=run.experiment.config.data.pixel_offset)
-            size = float(np.sqrt(np.prod(posed.cameras.focal[index] / path.focal[index])))
-            image, distance = render_pixels(run, variables, posed, index, pixels, side=int(sides[index]), size=size)
-            planes = [np.asarray(distance, np.float32), output_images.to_8_bits(image.rgb)]
-            if rgba:
-                planes.append(output_images.straight_alpha(image.rgb, image.opacity, run.experiment.background))
-            if predictor:
-                planes.append(predictor.error(run.experiment.view_rays(posed, index, pixels)))
-            for file, plane in zip(files[index], planes, strict=True):
-                output_images.write_image(file, plane)
-            compiled, left = compiled or (time.monotonic(), done), ""
-            if done > compiled[1]:  # the first frame takes longer
-                seconds = (time.monotonic() - compiled[0]) / (done - compiled[1])
-                left = f", {minutes(seconds * (len(frames) - done))} left"
-            progress.show(done, f"frames of {target}{left}")
-        progress.close()
-    if not missing():
+    progress, compiled = Progress(len(frames)), None
+    for done, (index, planes) in enumerate(_planes(shown, todo, rgba=output.rgba), len(frames) - len(todo) + 1):
+        for file, plane in zip(files[index], planes, strict=True):
+            output_images.write_image(file, plane)
+        compiled, left = compiled or (time.monotonic(), done), ""
+        if done > compiled[1]:  # the first frame takes longer
+            seconds = (time.monotonic() - compiled[0]) / (done - compiled[1])
+            left = f", {minutes(seconds * (len(frames) - done))} left"
+        progress.show(done, f"frames of {target}{left}")
+    progress.close()
+    missing = sum(not all(file.is_file() for file in group) for group in files)
+    if not missing:
         _write_depth_images([group[0] for group in files])
         if predictor:
             _write_error_images([group[-1] for group in files])
         atomic_files.sweep(target)
-    return len(missing())
+    return missing
+
+
+def _planes(shown, indices, *, rgba):
+    """Yields the index of each frame, and its distance, colour and what else is written of it."""
+    run, path = shown.run, shown.path
+    posed = camera_path.posed_views(shown.views, path)
+    for index in indices:
+        pixels = camera_path.path_pixels(posed, path, index, offset=run.experiment.config.data.pixel_offset)
+        size = float(np.sqrt(np.prod(posed.cameras.focal[index] / path.focal[index])))
+        sides = {"side": int(shown.sides[index]), "size": size}
+        image, distance = render_pixels(run, shown.variables, posed, index, pixels, **sides)
+        planes = [np.asarray(distance, np.float32), output_images.to_8_bits(image.rgb)]
+        if rgba:
+            planes.append(output_images.straight_alpha(image.rgb, image.opacity, run.experiment.background))
+        if shown.predictor:
+            planes.append(shown.predictor.error(run.experiment.view_rays(posed, index, pixels)))
+        yield index, planes
 
 
 def select_kind(kind, views, up):
@@ -184,19 +230,21 @@ def _print_rays(sides):
         print(f"rays: {count} per pixel{where}, {why}", file=sys.stderr)
 
 
-def _provenance(run, step, variables, views, path, closed, sides):
+def _provenance(shown, frames):
     """Returns everything that the frames depend on, for path.json."""
+    path, sides, views = shown.path, shown.sides, shown.views
     provenance = {"path": path.source, "frames": len(path.poses), "width": path.width, "height": path.height}
     if path.source == "interpolate":
-        provenance["closed"] = closed
+        provenance["closed"] = frames.closed
     if sides.max() > 1:
         provenance["rays_per_pixel"] = fingerprint(sides)
+    if shown.predictor:
+        provenance["uncertainty"] = shown.predictor.identity
     return {
         **provenance,
-        "step": step,
-        **render_settings(run),
-        "config": fingerprint(run.identity),
-        "parameters": fingerprint(variables[0]),
+        **shown.run.settings,
+        "config": fingerprint(shown.run.identity),
+        "parameters": fingerprint(shown.variables[0]),
         "cameras": fingerprint(views.cameras, views.near, views.far, views.to_file, *views.names),
     }
 

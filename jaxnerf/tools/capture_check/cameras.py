@@ -107,7 +107,7 @@ def judge_axes(capture: Capture, evidence: Evidence) -> tuple[list[Finding], Evi
         f"matches fit these, {percent(stored.fraction)} fit the poses as stored"
     )
     expected = "camera-to-world with x right, y up, looking along -z (or as the format defines)"
-    change = axes_change(capture.format, other.turn, other.inverted)
+    change = axes_change(capture.files, other.turn, other.inverted)
     finding = Finding("error", "axes", found, expected, change)
     return [finding], evidence._replace(poses=as_intended(evidence.poses, other), fraction=other.fraction)
 

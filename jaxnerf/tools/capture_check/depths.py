@@ -5,8 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.core.cameras import project
-from jaxnerf.data.geometry.bounds import BLENDER_RANGE, blender_range, depths, with_bounds
-from jaxnerf.data.geometry.world import poses_of
+from jaxnerf.data.geometry.bounds import depths, with_bounds
 from jaxnerf.data.readers.base import Capture
 from jaxnerf.tools.capture_check.findings import Finding, named, percent
 from jaxnerf.tools.capture_check.tracks import Tracks
@@ -26,22 +25,15 @@ def ranges(capture: Capture, near: float | None, far: float | None) -> tuple[Flo
     The second value is None if near and far are computed from the poses and points.
     """
     stated = None
-    if capture.format == "blender":
-        usual = blender_range(_training_poses(capture))
-        bounds, stated = np.tile(usual, (len(capture.frames), 1)), _FIELDS if usual == BLENDER_RANGE else None
-    else:
-        if all(frame.bounds is not None for frame in capture.frames):
-            stated = f"the last two columns of {capture.source}"
-        bounds = np.array([frame.bounds for frame in with_bounds(capture).frames])
+    if all(frame.bounds is not None for frame in capture.frames):
+        stated = capture.files.bounds.format(source=capture.source)
+    elif capture.bounds and not capture.bounds_reason:
+        stated = _FIELDS
+    bounds = np.array([frame.bounds for frame in with_bounds(capture).frames])
     for column, value in enumerate((near, far)):
         if value is not None:
             bounds[:, column], stated = value, _FIELDS
     return bounds, stated
-
-
-def _training_poses(capture):
-    """Returns the poses of the training views, from which training infers near and far."""
-    return poses_of(capture)[list((capture.splits or {}).get("train") or range(len(capture.frames)))]
 
 
 def view_depths(

@@ -154,7 +154,7 @@ def _odd_sizes(capture, images, readable):
         (height, width), frame = images[index].size, capture.frames[index]
         if (height, width) == usual[0][0] or usual[0][1] < 0.5 * len(readable):
             continue
-        severity = "error" if capture.format == "blender" else "warning"
+        severity = "error" if capture.rendered else "warning"
         expected = "{1} x {0} as most images".format(*usual[0][0])
         found, change = f"{frame.image} is {width} x {height}", "that file: copy or render it again at that size"
         findings.append(Finding(severity, "size", found, expected, change, (index,)))
@@ -169,9 +169,9 @@ def _odd_alpha(capture, images, readable):
         found = f"{named(capture, few)} has {has}, unlike the other {len(readable) - len(few)} images"
         change = "those files: export them again as the others"
         return [Finding("error", "mask", found, "alpha in all images or in none", change, tuple(few))]
-    if not opaque or capture.format != "blender":
+    if not opaque or not capture.rendered:
         return []
-    found = "no image has alpha, and a Blender dataset is composited over white by default"
+    found = "no image has alpha, and rendered images are composited over white by default"
     return [Finding("warning", "mask", found, "RGBA", "--config.data.background=none, or render RGBA")]
 
 

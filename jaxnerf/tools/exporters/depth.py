@@ -6,9 +6,9 @@ import pathlib
 import numpy as np
 
 from jaxnerf.evaluation.output_images import write_image
+from jaxnerf.options import is_auto
 from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.exporters.base import ExportSource
-from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.surfaces import inside, render_depth_images
 
 
@@ -20,8 +20,8 @@ def export_depth(source: ExportSource, folder: pathlib.Path) -> None:
     """
     for name in ("depth", "images"):
         (folder / name).mkdir()
-    box = None if source.settings.box is None else np.float64(source.settings.box).reshape(2, 3)
-    frames, images = [], render_depth_images(source, source.settings.size)
+    size, box = source.settings.size, source.settings.corners
+    frames, images = [], render_depth_images(source, None if is_auto(size) else size)
     files = [pathlib.PurePath(image.name).name for image in images]
     if len(set(files)) < len(files):  # of images in several folders
         files = [f"{index:04d}_{file}" for index, file in enumerate(files)]
@@ -38,6 +38,3 @@ def export_depth(source: ExportSource, folder: pathlib.Path) -> None:
     content = {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **lens, "depth_unit_scale_factor": 1.0}
     atomic_files.write_text(folder / "transforms.json", json.dumps({**content, "frames": frames}, indent=1) + "\n")
     source.say(f"{len(images)} depth images of {camera.width} x {camera.height} px, float32, in the dataset's units")
-
-
-EXPORTER = Exporter(export_depth)

@@ -24,13 +24,14 @@ from skimage import measure
 from jaxnerf.core.cameras import project
 from jaxnerf.data.geometry.poses import AXES, axis_of, up_of
 from jaxnerf.data.geometry.world import poses_in_file
+from jaxnerf.options import is_auto
 from jaxnerf.runtime import atomic_files, memory, stages
-from jaxnerf.tools.exporters.base import TEXTURED_FACES, ExportSource, check_memory
-from jaxnerf.tools.exporters.registration import Exporter
+from jaxnerf.tools.exporters.base import ExportSource, check_memory
 from jaxnerf.tools.exporters.surface_colors import surface_colors
 from jaxnerf.tools.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 from jaxnerf.tools.exporters.texture import textured
 
+_TEXTURED_FACES = 30_000  # the detail is in the texture
 _BYTES_PER_VOXEL = 16  # of the dense field, its index and what marching cubes keeps
 _TRUNCATION = 2.5  # voxels
 _FREE = 3.0  # truncations in front of a surface, from which on space counts as free whatever the surface's normal
@@ -49,7 +50,8 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
         ValueError: if no surface is in the box, or the field does not fit into memory.
     """
     settings = source.settings
-    images = render_depth_images(source, settings.size or settings.resolution, all_around=True, colors=False)
+    size = settings.resolution if is_auto(settings.size) else settings.size
+    images = render_depth_images(source, size, all_around=True, colors=False)
     box = export_box(source, images)
     voxel, shape = grid_shape(box, settings.resolution)
     check_memory(_BYTES_PER_VOXEL * float(np.prod(shape)), memory.available(), "give a smaller --resolution or --box")
@@ -60,7 +62,7 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
             raise ValueError(f"no surface is in the box {np.round(box, 4).tolist()}; give another --box")
         surface = trimesh.Trimesh(vertices, faces[keep_large_pieces(faces, settings.min_piece)], process=False)
         surface.remove_unreferenced_vertices()
-        mesh = decimated(surface, settings.max_faces or (TEXTURED_FACES if settings.texture else 0))
+        mesh = decimated(surface, settings.max_faces or (_TEXTURED_FACES if settings.texture else 0))
 
     def colors(points):
         return surface_colors(source, images, *on_surface(surface, points), reach=_TRUNCATION * voxel)
@@ -73,7 +75,7 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     with atomic_files.naming(path):
         if settings.format == "glb":
             poses = poses_in_file(np.asarray(source.views.cameras.to_world), source.views.to_file)
-            given = settings.up or source.run.experiment.config.data.up
+            given = source.run.experiment.config.data.up if is_auto(settings.up) else settings.up
             up = axis_of(given) if given else up_of(poses)
             nearest = max(AXES, key=lambda axis: axis_of(axis) @ up)
             angle = np.degrees(np.arccos(np.clip(axis_of(nearest) @ up, -1, 1)))
@@ -87,9 +89,6 @@ def export_mesh(source: ExportSource, folder: pathlib.Path) -> None:
     texture = f"a texture of {settings.texture} x {settings.texture}, " if settings.texture else ""
     count = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
     source.say(f"{count}, {texture}{sides} in the dataset's units")
-
-
-EXPORTER = Exporter(export_mesh)
 
 
 def write_glb(mesh: trimesh.Trimesh, path: pathlib.Path, *, up: Float[np.ndarray, "3"]) -> None:

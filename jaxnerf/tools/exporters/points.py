@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxnerf.tools.exporters.base import ExportSource
-from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 
-_NUM_POINTS = 200_000  # by default
 _TYPES = {"f": ("float", "<f4"), "u": ("uchar", "u1")}
 
 
@@ -24,7 +22,7 @@ def export_points(source: ExportSource, folder: pathlib.Path) -> None:
     images = render_depth_images(source, settings.image_size)
     box = export_box(source, images)
     points, normals, rgb = surface_points(images, box)[:3]
-    chosen = thinned(points, settings.num_points or _NUM_POINTS)
+    chosen = thinned(points, settings.num_points)
     write_ply(
         folder / "points.ply",
         {
@@ -34,9 +32,6 @@ def export_points(source: ExportSource, folder: pathlib.Path) -> None:
         },
     )
     source.say(f"{len(chosen):,} points with normals and colours, in the dataset's units")
-
-
-EXPORTER = Exporter(export_points)
 
 
 def surface_points(images: Sequence[DepthImage], box: np.ndarray) -> tuple[np.ndarray, ...]:

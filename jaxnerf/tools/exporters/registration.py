@@ -1,9 +1,19 @@
 """The exporters that `jaxnerf-export --kind` selects by name, and the function that adds one."""
 
+import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jaxnerf.registry import Registry
+from jaxnerf.options import Options
+from jaxnerf.registry import Registry, checked_options
+from jaxnerf.tools.exporters.options import (
+    ExportOptions,
+    MeshOptions,
+    PointsOptions,
+    SplatsOptions,
+    SurfaceOptions,
+    WebOptions,
+)
 
 
 class Exporter(NamedTuple):
@@ -12,20 +22,37 @@ class Exporter(NamedTuple):
     Attributes:
         export: (ExportSource, folder) -> None.
         check: raises a ValueError for a TrainedRun that cannot be exported; None: all can.
+        options: the class of `ExportSource.settings`.
     """
 
     export: Callable[..., None]
     check: Callable[..., Any] | None = None
+    options: type[Options] = SurfaceOptions
 
 
-EXPORTERS = Registry(
-    "exporter",
-    "jaxnerf.register_exporter",
-    {name: f"jaxnerf.tools.exporters.{name}:EXPORTER" for name in ("mesh", "points", "depth", "splats", "web")},
-)
+def _on_demand(module, name):
+    """Returns a function of the package's exporters whose module is imported when it is called."""
+    return lambda *args: getattr(importlib.import_module(f"jaxnerf.tools.exporters.{module}"), name)(*args)
 
 
-def register_exporter(name: str, export: Callable[..., Any], *, check: Callable[..., Any] | None = None) -> None:
+EXPORTERS = Registry("exporter", "jaxnerf.register_exporter", {})
+for _name, _options in {
+    "mesh": MeshOptions,
+    "points": PointsOptions,
+    "depth": ExportOptions,
+    "splats": SplatsOptions,
+}.items():
+    EXPORTERS.add(_name, Exporter(_on_demand(_name, f"export_{_name}"), options=_options))
+EXPORTERS.add("web", Exporter(_on_demand("web", "export_web"), _on_demand("web", "network_of"), WebOptions))
+
+
+def register_exporter(
+    name: str,
+    export: Callable[..., Any],
+    *,
+    check: Callable[..., Any] | None = None,
+    options: type[Options] | None = None,
+) -> None:
     """Registers a way to export a trained run under a name for `jaxnerf-export --kind`.
 
     Args:
@@ -34,8 +61,10 @@ def register_exporter(name: str, export: Callable[..., Any], *, check: Callable[
             into the folder, which is moved into place when it returns.
         check: (run: TrainedRun) -> anything; raises a ValueError that says why the run cannot be exported. It is called
             before anything is computed, and for a run without a grid before one is extracted. None: all runs can be.
+        options: the class of `source.settings`, see `jaxnerf.extend.Options`: each option is a flag of jaxnerf-export,
+            with checks and help. None: those that the exporters of surfaces have in common, see `SurfaceOptions`.
 
     Raises:
-        ValueError: if another exporter has that name.
+        ValueError: if another exporter has that name, or if `options` is no such class.
     """
-    EXPORTERS.add(name, Exporter(export, check))
+    EXPORTERS.add(name, Exporter(export, check, checked_options("register_exporter", options) or SurfaceOptions))

@@ -17,14 +17,13 @@ from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import refined_views
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.fields.hash_grid import harmonics
+from jaxnerf.options import is_auto
 from jaxnerf.tools.exporters.base import ExportSource
 from jaxnerf.tools.exporters.gaussians import Gaussians, rasterize, read_spz, write_gaussians, write_spz
 from jaxnerf.tools.exporters.points import surface_points, thinned
-from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.splat_fit import fit_gaussians
 from jaxnerf.tools.exporters.surfaces import export_box, render_depth_images, sphere_directions
 
-_NUM_POINTS = 60_000  # by default
 _NUM_DIRECTIONS = 32  # from which the colour of a point is evaluated
 _NUM_NEIGHBORS = 4
 _WIDTH, _THICKNESS = 0.6, 0.15  # standard deviations along and across the surface, in distances to the neighbours
@@ -45,10 +44,11 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
     """
     settings = source.settings
     longest = int(source.views.size[0].max())
-    images = render_depth_images(source, settings.size or min(settings.image_size, longest))
+    size = min(settings.image_size, longest) if is_auto(settings.size) else settings.size
+    images = render_depth_images(source, size)
     box = export_box(source, images)
     points, normals, _, extinction, field_x = surface_points(images, box)
-    chosen = thinned(points, settings.num_points or _NUM_POINTS)
+    chosen = thinned(points, settings.num_points)
     points, normals, extinction, field_x = (each[chosen] for each in (points, normals, extinction, field_x))
     gaussians = make_gaussians(points, normals, extinction, colors_of(source, field_x, normals))
     if settings.fit_steps:
@@ -63,9 +63,6 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
         f"{len(points):,} Gaussians; PSNR {value:.2f} dB, as SPZ {rounded:.2f} dB, over {count} views of {split}, "
         f"where the run has {of_run:.2f} dB"
     )
-
-
-EXPORTER = Exporter(export_splats)
 
 
 def make_gaussians(points: np.ndarray, normals: np.ndarray, extinction: np.ndarray, colors: np.ndarray) -> Gaussians:

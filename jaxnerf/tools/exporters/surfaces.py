@@ -183,8 +183,8 @@ def export_box(source: ExportSource, images: list[DepthImage]) -> Float[np.ndarr
     Without a setting it holds the points on the surfaces but for the outermost 0.5 % along each axis, and a margin of
     a tenth of its sides. If the run's space is contracted, only the points in its inner half count.
     """
-    if source.settings.box is not None:
-        return np.float64(source.settings.box).reshape(2, 3)
+    if source.settings.corners is not None:
+        return source.settings.corners
     parts = [image.points()[np.isfinite(image.depth) & (image.depth > 0)][::7] for image in images]
     points = np.concatenate(parts)
     grid = source.variables[1]

@@ -25,7 +25,6 @@ from jaxnerf.evaluation.restore import TrainedRun, refined_views
 from jaxnerf.fields.hash_grid import HashGrid
 from jaxnerf.tools.exporters import web_scene
 from jaxnerf.tools.exporters.base import ExportSource
-from jaxnerf.tools.exporters.registration import Exporter
 from jaxnerf.tools.exporters.web_scene import WebScene
 
 MAGIC = b"JAXNERF1"
@@ -91,9 +90,6 @@ def network_of(run: TrainedRun) -> HashGrid:
     names = (*HashGrid.__dataclass_fields__,)
     values = {name: getattr(options, name) for name in names if hasattr(options, name) and name != "compute_dtype"}
     return HashGrid(lower=occupancy.lower, upper=occupancy.upper, **values)
-
-
-EXPORTER = Exporter(export_web, check=network_of)
 
 
 def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:

@@ -13,6 +13,7 @@ import optax
 
 from jaxnerf.data import dataset
 from jaxnerf.options import is_auto
+from jaxnerf.registry import needs_folder
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.tools.interop.published_weights import Network, read_weights
@@ -79,7 +80,7 @@ def convert(
 def _resolved(config: RunConfig) -> RunConfig:
     """Returns the config resolved against its dataset, or as far as possible if there is no dataset."""
     try:
-        if config.data.format != "synthetic":
+        if needs_folder(config.data.format):
             dataset.dataset_folder(config.data.dir)
     except ValueError:
         if is_auto(config.data.background_color):  # as it is inferred for all models without an occupancy grid

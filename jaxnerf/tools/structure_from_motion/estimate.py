@@ -316,7 +316,7 @@ def _check_choice(name, value, choices):
 def _check_out(out, overwrite):
     """Raises a ValueError if a dataset in the folder would hide the new one, or be replaced without being asked."""
     formats = [name for name in READERS.names() if READERS.get(name).detect(out)]
-    if formats and formats[0] != "colmap":
+    if formats and READERS.get(formats[0]) is not colmap.READER:
         raise ValueError(
             f"{out}: holds a dataset of the format {formats[0]}, which would be read instead of the new cameras; "
             "choose another --out"

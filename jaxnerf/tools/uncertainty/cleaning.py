@@ -20,6 +20,7 @@ from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.uncertainty.base import UncertaintySource
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 
+MAX_UNCERTAINTY = "max_uncertainty"  # in the settings of a run that is cleaned
 ESTIMATOR = "laplace"  # whose estimate is a function of position
 _LIMITS = (0.99, 0.97, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5)  # that "auto" tries
 _MOST_LOSS = 0.02  # dB, that "auto" may cost
@@ -27,33 +28,37 @@ _NUM_RAYS = 2**14  # by which "auto" measures it
 _LEAST_ERROR = 1 / (12 * 255**2)  # mean square of rounding to 8 bits
 
 
-def cleaned(run: TrainedRun, workdir: str | os.PathLike) -> TrainedRun:
-    """Returns a run whose occupancy grids lack the cells that are more uncertain than `eval.max_uncertainty`.
+def cleaned(run: TrainedRun, workdir: str | os.PathLike, limit: float | str | None) -> TrainedRun:
+    """Returns a run whose occupancy grids lack the cells that are more uncertain than a limit.
 
     The estimate of a cell is that of its centre. It is computed when the variables of a checkpoint are read, from the
     grid that training left, and kept in <workdir>/uncertainty/STEP/. Only the content of the grid changes, so
-    nothing is compiled that would not be without it. With a limit of 1 the run is returned as it is.
-
-    A limit of "auto" is lowered as long as the PSNR of training rays falls by at most 0.02 dB. It stays "auto" in the
-    config of the run, as each checkpoint has its own.
+    nothing is compiled that would not be without it. The uncertainty of a cell is how far the training images let it be
+    displaced, over how far it could be without them.
 
     Args:
         run: as it is restored.
         workdir: the run's folder.
+        limit: above 0; 1 is what a cell has without any image. "auto": as low as the PSNR of training rays, which
+            it may lower by 0.02 dB, allows at each checkpoint; 1 or None: the run is returned as it is.
 
     Returns:
         The run. Its `variables` raise a ValueError if it renders without an occupancy grid.
+
+    Raises:
+        ValueError: on a limit that is out of range.
     """
-    limit = run.experiment.config.eval.max_uncertainty
-    if not is_auto(limit) and limit >= 1:
+    if limit is None or limit == 1:
         return run
+    if not (is_auto(limit) or 0 < limit < 1):
+        raise ValueError(f"max_uncertainty is {limit}, expected more than 0 and at most 1, or auto; correct it")
 
     @functools.lru_cache(maxsize=1)
     def variables(step):
         params, grid = run.variables(step)
         if grid is None:
             raise ValueError(
-                f"eval.max_uncertainty is {limit} and the run renders without an occupancy grid, whose cells it "
+                f"max_uncertainty is {limit} and the run renders without an occupancy grid, whose cells it "
                 "removes; give --bake_occupancy, or drop --max_uncertainty"
             )
         source = UncertaintySource.of(run, workdir, step, (params, grid), say=_say)
@@ -70,7 +75,7 @@ def cleaned(run: TrainedRun, workdir: str | os.PathLike) -> TrainedRun:
         _say(f"{100 * removed:.1f} % of the occupied cells are more uncertain than {used:g}, and removed")
         return params, found
 
-    return run._replace(variables=variables)
+    return run._replace(variables=variables, settings={**run.settings, MAX_UNCERTAINTY: limit})
 
 
 def _lowest_limit(source, uncertainty):

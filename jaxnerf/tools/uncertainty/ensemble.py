@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf.core.types import Rays
-from jaxnerf.evaluation.restore import newest_step, render_settings, restore_run
+from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource
+from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY, cleaned
 
 
 def estimate_ensemble(source: UncertaintySource) -> Estimate:
@@ -26,8 +27,10 @@ def estimate_ensemble(source: UncertaintySource) -> Estimate:
         raise ValueError("the estimator 'ensemble' needs other runs of the same config; give --members=DIR,...")
     run, members = source.run, [(source.run.render_image, source.variables)]
     seen = {fingerprint(source.variables[0]): "the run itself"}
+    settings = dict(run.settings)
+    limit = settings.pop(MAX_UNCERTAINTY, None)
     for workdir in source.members:
-        other = restore_run(workdir, settings=_changed_settings(run))
+        other = cleaned(restore_run(workdir, settings=settings), workdir, limit)
         if differing := _difference(other.identity, run.identity):
             raise ValueError(
                 f"{workdir}: its field or sampler has other options than the run's, expected a run of the same config "
@@ -50,11 +53,6 @@ def estimate_ensemble(source: UncertaintySource) -> Estimate:
         return jnp.sqrt(variance + (1 - opacity) ** 2)
 
     return Estimate(score, f"ensemble of {', '.join(sorted(seen))[:400]}")
-
-
-def _changed_settings(run):
-    settings = render_settings(run)
-    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _difference(first, second):

@@ -19,6 +19,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty import calibration as calibrations
 from jaxnerf.tools.uncertainty.base import Score, UncertaintySource
 from jaxnerf.tools.uncertainty.calibration import Calibration, pixel_error, score_order
+from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 
 
@@ -139,8 +140,8 @@ def make_predictor(
     variables = run.variables(step)
     source = UncertaintySource.of(run, workdir, step, variables, members=members, say=say)
     key = fingerprint(run.identity, variables[0], *([] if variables[1] is None else [variables[1]]))
-    path, limit = source.folder / f"{name}.json", run.experiment.config.eval.max_uncertainty
-    if limit != 1:
+    path, limit = source.folder / f"{name}.json", run.settings.get(MAX_UNCERTAINTY)
+    if limit is not None:
         path = path.with_stem(f"{name}-max_uncertainty-{limit if is_auto(limit) else f'{limit:g}'}")
     with atomic_files.one_at_a_time(path.with_suffix(".lock"), lambda: say(f"{path}: waits for another process")):
         found = estimate(source)

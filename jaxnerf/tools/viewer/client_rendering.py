@@ -13,7 +13,8 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from jaxnerf.tools.exporters import web
-from jaxnerf.tools.exporters.base import ExportSettings, ExportSource
+from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.options import WebOptions
 from jaxnerf.tools.viewer.frame_renderer import SceneState
 
 FRAMES = "/frames/"  # the address of the page that shows frames of the server
@@ -80,7 +81,7 @@ class ClientRendering:
             if self._encoded[0] is not state:
                 variables = state.params, state.grid
                 scene = web.scene_of(viewer.run, variables, _PRECISION)
-                source = ExportSource(viewer.run, state.step, variables, viewer.views, ExportSettings(), print)
+                source = ExportSource(viewer.run, state.step, variables, viewer.views, WebOptions(), print)
                 self._encoded = state, web.encode(scene, web.about(source, scene, viewer.score), level=_COMPRESSION)
             return self._encoded[1]
 

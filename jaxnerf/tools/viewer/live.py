@@ -12,6 +12,7 @@ import numpy as np
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
 from jaxnerf.runtime import atomic_files
+from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.tools.uncertainty.laplace import stored_uncertainty
 from jaxnerf.tools.viewer.server import HOST, PORT, Viewer, check_port, import_viser
 from jaxnerf.training import metric_log
@@ -40,7 +41,7 @@ def view_run(
         workdir: the folder that training wrote or writes.
         data_dir: see `restore_run`.
         step: of the only checkpoint to show; None: always the newest.
-        max_uncertainty: a number or "auto", in place of the config's `eval.max_uncertainty`, unless it is None.
+        max_uncertainty: of the cells of the grid, see `cleaned`.
         host, port: see `Viewer.listen`.
         ended: set by another thread to stop.
 
@@ -49,8 +50,7 @@ def view_run(
     """
     import_viser()
     check_port(host, port)
-    settings = {} if max_uncertainty is None else {"max_uncertainty": max_uncertainty}
-    run = restore_with_grid(workdir, data_dir=data_dir, settings=settings)
+    run = cleaned(restore_with_grid(workdir, data_dir=data_dir), workdir, max_uncertainty)
     first = newest_step(run, workdir, step)
     variables = run.variables(first)
     views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])

@@ -13,8 +13,9 @@ from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import axis_of, gaze_center
 from jaxnerf.data.geometry.world import direction_in_run
 from jaxnerf.evaluation import output_images
-from jaxnerf.evaluation.paths.render_path import render_path
-from jaxnerf.evaluation.restore import newest_step
+from jaxnerf.evaluation.paths.render_path import Frames, Output, render_path
+from jaxnerf.evaluation.restore import newest_step, restore_run
+from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY, cleaned
 from jaxnerf.tools.viewer.frame_renderer import MAX_SIDE, MODES, UNCERTAINTY, FrameCamera, frame_image
 from jaxnerf.tools.viewer.keyframes import cameras_through, load_keyframes, save_path
 from jaxnerf.tools.viewer.render_loop import Delivery, Request
@@ -408,10 +409,9 @@ class Page:
 
         def render():
             try:
-                limit = self._viewer.run.experiment.config.eval.max_uncertainty
-                options = {"step": step, "data_dir": self._viewer.data_dir, "overwrite": overwrite}
-                options["settings"] = {"max_uncertainty": limit}
-                written = render_path(self._viewer.workdir, path=str(path), **options)
+                workdir, limit = self._viewer.workdir, self._viewer.run.settings.get(MAX_UNCERTAINTY)
+                run = cleaned(restore_run(workdir, data_dir=self._viewer.data_dir), workdir, limit)
+                written = render_path(run, workdir, Frames(path=str(path)), Output(overwrite=overwrite), step=step)
                 self._path_status.content = f"video: {written[-1]}"
             finally:
                 done.set()

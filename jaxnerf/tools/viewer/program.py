@@ -5,16 +5,13 @@ It serves http://127.0.0.1:8080 until it is stopped.
 
 from absl import flags
 
+from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is shown.")
-_MAX_UNCERTAINTY = cli.define_number(
-    "max_uncertainty",
-    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
-    "allow; 1: off. It overrides config.eval.max_uncertainty.",
-)
+_MAX_UNCERTAINTY = cli.define_number("max_uncertainty", run_flags.MAX_UNCERTAINTY)
 _HOST = flags.DEFINE_string(
     "host", "127.0.0.1", "The address to listen on. 0.0.0.0 lets other machines connect, without a password."
 )

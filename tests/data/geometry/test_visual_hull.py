@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import captures
 from helpers import all_finite, assert_batch_is_vmap_is_jit, compiled
 from jaxnerf import Camera, Views, look_at, pixel_grid, rays_from_pixels
 from jaxnerf.core.cameras import project
 from jaxnerf.data.geometry.visual_hull import hull_bounds, visual_hull
 from jaxnerf.data.ray_batches import view_rays
-from jaxnerf.data.readers import blender
 
 LENSES = [
     ("pinhole", None),
@@ -191,10 +191,10 @@ def test_rays_of_lego_test_pixels_with_alpha_hit_the_hull_of_the_training_views(
     content["frames"] = content["frames"][::3]  # reading the images takes most of the time
     (tmp_path / "transforms_train.json").write_text(json.dumps(content))
     (tmp_path / "train").symlink_to(scenes_dir / "lego" / "train")
-    train = blender.load_blender(tmp_path, split="train")
+    train = captures.load_blender(tmp_path, split="train")
     valid = visual_hull(train, *BOX, resolution=128)
     assert 0.03 < valid.mean() < 0.2
-    test = blender.load_blender(scenes_dir / "lego", split="test")
+    test = captures.load_blender(scenes_dir / "lego", split="test")
     pixels = np.asarray(pixel_grid(800, 800)[::16, ::16]).reshape(-1, 2)
     t = np.linspace(2, 6, 400, dtype=np.float32)[None]  # half a cell apart
     for index in range(0, len(test.offset), 9):

@@ -119,16 +119,16 @@ def test_exif_orientation_is_ignored_if_cameras_refer_to_stored_pixels(tmp_path,
 
 
 @pytest.mark.parametrize(
-    "format, size, width, expected",
+    "rendered, size, width, expected",
     [
-        ("blender", (512, 512), 200, 2),
-        ("blender", (800, 800), 200, 4),
-        ("transforms", (1920, 1080), 200, 5),
-        ("transforms", (100, 150), 800, 1),
+        (True, (512, 512), 200, 2),
+        (True, (800, 800), 200, 4),
+        (False, (1920, 1080), 200, 5),
+        (False, (100, 150), 800, 1),
     ],
 )
-def test_the_factor_for_a_width_is_valid(tmp_path, format, size, width, expected):
-    capture = a_capture(tmp_path, NAMES, size=size, format=format)
+def test_the_factor_for_a_width_is_valid(tmp_path, rendered, size, width, expected):
+    capture = a_capture(tmp_path, NAMES, size=size)._replace(rendered=rendered)
     small = Frame("a", tmp_path / "a.png", dataclasses.replace(capture.frames[0].camera))
     put(tmp_path, ("a",), *size)
     assert downscaled_copies.factor_for(capture._replace(frames=(small,)), width) == (expected, size[1])

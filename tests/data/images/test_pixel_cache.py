@@ -10,7 +10,6 @@ from test_load_images import a_capture, pixels
 
 import captures
 from jaxnerf.data.images import image_files, load_images, pixel_cache
-from jaxnerf.data.readers import blender
 
 SHAPE = (12, 4)
 
@@ -152,8 +151,8 @@ def test_readers_return_the_same_pixels_mapped_and_in_memory(tmp_path, monkeypat
 
     def read():
         views = [
-            blender.load_blender(tmp_path / "blender"),
-            blender.load_blender(tmp_path / "blender", select=lambda count: [count - 1]),
+            captures.load_blender(tmp_path / "blender"),
+            captures.load_blender(tmp_path / "blender", select=lambda count: [count - 1]),
             load_images.load_capture(capture, background=(1, 1, 1)),
             load_images.load_capture(capture, factor=2, select=lambda count: range(1, count)),
         ]

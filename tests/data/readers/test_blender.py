@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from captures import write_png16
+from captures import load_blender, write_png16
 from jaxnerf.data.images.image_files import average_tiles, read_image, to_straight
 from jaxnerf.data.images.load_images import load_capture
-from jaxnerf.data.readers.blender import load_blender, read_capture
+from jaxnerf.data.readers.blender import read_capture
 
 _POSE = [[1.0, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
 
@@ -176,10 +176,10 @@ def test_errors_of_the_json_file(dataset, change, message):
         ({"factor": 3}, r"r_0\.png: factor 3 does not divide 8 x 12.*one of 1, 2, 4$"),
         ({"factor": 0}, "factor is 0"),
         ({"factor": 2.5}, "factor is 2.5"),
-        ({"near": 6.0}, "near, far is 6.0, 6.0"),
-        ({"near": -1.0}, "near, far is -1.0"),
-        ({"far": math.inf}, "near, far is 2.0, inf"),
-        ({"far": math.nan}, "near, far is 2.0, nan"),
+        ({"near": 6.0}, "r_0 has near 6 and far 6, expected near < far"),
+        ({"near": -1.0}, "r_0 has near -1"),
+        ({"far": math.inf}, "r_0 has near 2 and far inf"),
+        ({"far": math.nan}, "r_0 has near 2 and far nan"),
         ({"background": "white"}, "background is 'white'"),
         ({"background": (255, 255, 255)}, "background is"),
     ],

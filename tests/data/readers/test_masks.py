@@ -42,7 +42,7 @@ def write(folder, shots, format):
 def test_masks_are_found_and_reported(tmp_path, shots, format, place):
     folder = write(tmp_path, shots, format)
     (folder / "masks").rename(folder / place)
-    resolved, lines = dataset.resolve(DataOptions(format="auto", background="auto", ndc="auto", dir=str(folder)))
+    resolved, lines, _ = dataset.resolve(DataOptions(format="auto", background="auto", ndc="auto", dir=str(folder)))
     assert resolved.format == format
     said = f"8 of 8 images have one, such as {folder / place / '000.png'}: dark pixels are ignored"
     assert [line for line in lines if line.startswith("masks ")] == [f"masks         {said} in training and metrics"]

@@ -10,7 +10,7 @@ import captures
 import jaxnerf
 from jaxnerf.data import dataset
 from jaxnerf.data.dataset import DataOptions
-from jaxnerf.data.readers import base, blender, transforms
+from jaxnerf.data.readers import base, transforms
 
 LENS = {"lens": "opencv", "center": (13.0, 14.5), "focal": (30.0, 34.0), "distance": 2.2}
 PARTS = {"train": range(6), "val": range(6, 7), "test": range(7, 8)}
@@ -107,14 +107,14 @@ def test_plain_files_have_the_cameras_of_blender(tmp_path):
     captures.write_blender(tmp_path, captures.noise(captures.orbit(3)))
     content = json.loads((tmp_path / "transforms_train.json").read_text())
     angle = content["camera_angle_x"]
-    views = blender.load_blender(tmp_path)
+    views = captures.load_blender(tmp_path)
     np.testing.assert_array_equal(views.cameras.focal, np.full((3, 2), np.float32(0.5 * 32 / np.tan(0.5 * angle))))
     np.testing.assert_array_equal(views.cameras.center, [[16, 12]] * 3)
     assert views.cameras.lens == "pinhole" and views.cameras.distortion is None
     content["frames"][1] |= {"camera_angle_x": 1.0}
     content["camera_angle_y"] = 0.5
     (tmp_path / "transforms_train.json").write_text(json.dumps(content))
-    focal = blender.load_blender(tmp_path).cameras.focal
+    focal = captures.load_blender(tmp_path).cameras.focal
     np.testing.assert_allclose(focal[0], [16 / np.tan(angle / 2), 12 / np.tan(0.25)], rtol=1e-6)
     np.testing.assert_allclose(focal[1], [16 / np.tan(0.5), 12 / np.tan(0.25)], rtol=1e-6)
 

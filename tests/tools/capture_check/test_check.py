@@ -152,7 +152,7 @@ def test_inverted_and_swapped_axes_are_found(folders, tmp_path):
     report = planted(folders, tmp_path, "transforms", lambda f: planting.edit_poses(f, invert))
     assert kinds(report) == {"axes"} and "invert it" in report.findings[0].change
     swapped = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-    change = findings.axes_change("transforms", swapped.T, False)
+    change = findings.axes_change(report.capture.files, swapped.T, False)
     assert change.endswith("replace its columns by +2, -1, +3 of the old ones")
 
 

@@ -12,7 +12,7 @@ from export_sources import CENTER, RADIUS, SIZE, source_of
 from jaxnerf.core.types import Camera
 from jaxnerf.fields.base import Field
 from jaxnerf.tools.exporters import base, gaussians, surfaces
-from jaxnerf.tools.exporters.base import ExportSettings, export_run
+from jaxnerf.tools.exporters.base import export_run
 from jaxnerf.tools.exporters.depth import export_depth
 from jaxnerf.tools.exporters.mesh import export_mesh, fuse, keep_large_pieces, level_set, solid_field, write_glb
 from jaxnerf.tools.exporters.points import export_points, thinned
@@ -147,8 +147,6 @@ def test_a_glb_has_the_up_that_is_given(tmp_path):
         vertices.append(trimesh.load(tmp_path / name / "mesh.glb", force="mesh").vertices)
     assert vertices[0][:, 1].mean() == pytest.approx(CENTER[2], abs=0.05)
     assert vertices[1][:, 1].mean() == pytest.approx(-CENTER[2], abs=0.05)
-    with pytest.raises(ValueError, match="up is 'z', expected one of .*; correct --up"):
-        base._check_settings(ExportSettings(up="z"))
 
 
 def test_a_mesh_is_decimated_on_request(tmp_path):
@@ -285,17 +283,21 @@ def test_the_rasterizer_composites_by_depth():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"resolution": 4096}, "resolution is 4096, expected 16 to 1,024"),
-        ({"num_points": 0}, "num_points is 0"),
+        ({"resolution": 4096}, "--resolution is 4096, expected from 16 to 1,024"),
+        ({"up": "z"}, "--up is 'z', expected one of .*; correct it"),
+        ({"texture": 256}, "texture is 256 and format is 'ply', expected 'glb' or 'obj'"),
+        ({"texture": 9000, "format": "glb"}, "--texture is 9000, expected from 64 to 8,192, or 0; correct it"),
+        ({"split": True}, "--split is no field, expected one of"),
+        ({"min_piece": 2.0}, "min_piece is 2.0"),
         ({"size": 5}, "size is 5"),
-        ({"format": "stl"}, "format is 'stl', expected one of ply, glb, obj"),
-        ({"box": (0, 0, 0, 1, 1)}, "box is 0, 0, 0, 1, 1, expected six numbers"),
+        ({"format": "stl"}, "format is 'stl', expected one of .*'glb', 'obj'"),
+        ({"box": (0, 0, 0, 1, 1)}, r"box is \(0, 0, 0, 1, 1\), expected six numbers"),
         ({"box": (0, 0, 0, 1, 1, 0)}, "each lower one below"),
     ],
 )
 def test_settings_out_of_range_are_named(tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
-        export_run(tmp_path, "mesh", settings=ExportSettings(**change))
+        export_run(tmp_path, "mesh", **change)
 
 
 @pytest.fixture
@@ -352,7 +354,7 @@ def test_a_run_that_cannot_be_exported_is_refused_before_its_grid_is_extracted(m
     monkeypatch.setitem(base.EXPORTERS._parts, "test", Exporter(lambda source, folder: None, check))
     with pytest.raises(ValueError, match="has no colours"):
         export_run(tmp_path, "test")
-    assert calls == [{}] and not list(tmp_path.iterdir())
+    assert calls == [None] and not list(tmp_path.iterdir())
     assert base.EXPORTERS.get("web").check is not None
 
 

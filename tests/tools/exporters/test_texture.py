@@ -6,7 +6,6 @@ import trimesh
 from scipy.ndimage import map_coordinates
 
 from jaxnerf.tools.exporters import texture
-from jaxnerf.tools.exporters.base import ExportSettings, _check_settings
 from jaxnerf.tools.exporters.texture import rasterize, textured, unwrap
 
 SIZE = 256
@@ -82,7 +81,3 @@ def test_narrow_triangles_have_texels_up_to_their_tips():
 def test_settings_that_have_no_texture_are_named():
     with pytest.raises(ValueError, match="no room for the .* charts .* larger --texture"):
         unwrap(trimesh.creation.icosphere(subdivisions=3), 16)
-    with pytest.raises(ValueError, match="texture is 256 and format is 'ply', expected 'glb' or 'obj'"):
-        _check_settings(ExportSettings(texture=256))
-    with pytest.raises(ValueError, match="texture is 9000, expected 64 to 8,192, or 0; correct --texture"):
-        _check_settings(ExportSettings(texture=9000, format="glb"))

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import published
 from jaxnerf import load_scene
 from jaxnerf.configs import blender_paper, llff_paper
-from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.fields.mlp import mlp_field
 from jaxnerf.tools.interop.convert import convert
@@ -28,7 +28,7 @@ from jaxnerf.training import build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
 from published import as_flax, as_state_dict, random_layers
-from runs import run_forked, smoke_config
+from runs import evaluate, run_forked, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")

@@ -15,17 +15,16 @@ import pytest
 from jaxnerf.core.occupancy.grid import create_grid, is_occupied
 from jaxnerf.core.types import Batch, Rays
 from jaxnerf.core.views import Views
-from jaxnerf.evaluation.evaluate import evaluate, train_and_evaluate
+from jaxnerf.evaluation.evaluate import score_run, train_and_evaluate
 from jaxnerf.evaluation.restore import TrainedRun, restore_run
 from jaxnerf.fields.base import Field
-from jaxnerf.models.base import ViewOptions
 from jaxnerf.tools.uncertainty import calibration, cleaning, laplace, predict
 from jaxnerf.tools.uncertainty.base import Estimate
 from jaxnerf.tools.uncertainty.cleaning import cell_centers, cleaned
 from jaxnerf.tools.uncertainty.laplace import deform, interpolate
 from jaxnerf.tools.uncertainty.predict import make_predictor
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
-from runs import PACKED, smoke_config
+from runs import PACKED, evaluate, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 
@@ -159,14 +158,14 @@ def test_the_uncertainty_at_a_position_is_the_standard_deviation_there():
     np.testing.assert_allclose(at(jnp.array([-1e9, 0.0, 0.0])), 1, rtol=1e-5)
 
 
-def stub_run(grid, limit, hold_out=0):
+def stub_run(grid, hold_out=0):
     """Returns a TrainedRun that has nothing but a checkpoint of step 5, with a grid."""
     data = SimpleNamespace(hold_out=hold_out, pixel_offset=0.5, ndc=False)
-    config = SimpleNamespace(data=data, eval=SimpleNamespace(max_uncertainty=limit))
+    config = SimpleNamespace(data=data)
     views = Views(**dict.fromkeys(field.name for field in dataclasses.fields(Views)))
     model = SimpleNamespace(needs=())
     experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split: views, model=model)
-    fields = dict.fromkeys(TrainedRun._fields) | {"experiment": experiment, "identity": "fixed"}
+    fields = dict.fromkeys(TrainedRun._fields) | {"experiment": experiment, "identity": "fixed", "settings": {}}
     return TrainedRun(**fields | {"steps": lambda: [5], "variables": lambda step: (np.ones(3), grid)})
 
 
@@ -175,7 +174,7 @@ def test_cells_that_are_more_uncertain_than_the_limit_are_empty(tmp_path, monkey
     grid = create_grid([-1.0] * 3, [3.0] * 3, np.ones((8, 4, 4), bool), initial_density=1.0, contracted=contracted)
     estimate = Estimate(None, "fixed", lambda x: jnp.where(x[..., 0] > 2, 0.7, 0.3))
     monkeypatch.setitem(ESTIMATORS._parts, "laplace", lambda source: estimate)
-    _, found = cleaned(stub_run(grid, 0.5), tmp_path).variables(5)
+    _, found = cleaned(stub_run(grid), tmp_path, 0.5).variables(5)
     # The box is [-1, 3]; where it is contracted its inner half is [0, 2], and its outer quarters hold the rest.
     kept = 6
     assert np.asarray(found.occupied).all(axis=(1, 2)).tolist() == [True] * kept + [False] * (8 - kept)
@@ -200,20 +199,23 @@ def test_auto_removes_as_many_cells_as_training_rays_allow(tmp_path, monkeypatch
         missing = 1 - np.asarray(variables[1].occupied)[:6].mean()
         return SimpleNamespace(rgb=batch.rgb + 0.1 * (1 + 0.1 * missing))
 
-    run = stub_run(grid, "auto")._replace(render_image=render_image)
-    _, found = cleaned(run, tmp_path).variables(5)
+    run = stub_run(grid)._replace(render_image=render_image)
+    _, found = cleaned(run, tmp_path, "auto").variables(5)
     assert np.asarray(found.occupied).all(axis=(1, 2)).tolist() == [True] * 6 + [False] * 2
     assert "25.0 % of the occupied cells are more uncertain than 0.75" in capsys.readouterr().err
     everywhere = Estimate(None, "fixed", lambda x: jnp.full(x.shape[:-1], 1.0 + 1e-6))
     monkeypatch.setitem(ESTIMATORS._parts, "laplace", lambda source: everywhere)
-    assert cleaned(run, tmp_path).variables(5)[1] is grid and "no cell is removed" in capsys.readouterr().err
+    assert cleaned(run, tmp_path, "auto").variables(5)[1] is grid and "no cell is removed" in capsys.readouterr().err
 
 
 def test_cleaning_is_off_by_default_and_needs_a_grid(tmp_path):
-    run = stub_run(None, 1.0)
-    assert cleaned(run, tmp_path) is run and ViewOptions().max_uncertainty == 1
+    run = stub_run(None)
+    assert cleaned(run, tmp_path, 1.0) is run and cleaned(run, tmp_path, None) is run
+    for limit in (0.0, 1.5):
+        with pytest.raises(ValueError, match=f"max_uncertainty is {limit}, expected more than 0 and at most 1"):
+            cleaned(run, tmp_path, limit)
     with pytest.raises(ValueError, match="without an occupancy grid"):
-        cleaned(stub_run(None, 0.5), tmp_path).variables(5)
+        cleaned(run, tmp_path, 0.5).variables(5)
 
 
 def test_one_of_several_processes_calibrates(tmp_path, monkeypatch):
@@ -227,14 +229,14 @@ def test_one_of_several_processes_calibrates(tmp_path, monkeypatch):
 
     monkeypatch.setattr(predict, "_calibrate", calibrate)
     monkeypatch.setitem(ESTIMATORS._parts, "fixed", lambda source: Estimate(lambda rays: rays.near, "fixed"))
-    run = stub_run(None, 1.0, hold_out=8)
+    run = stub_run(None, hold_out=8)
     with ThreadPoolExecutor(3) as pool:
         made = [pool.submit(make_predictor, run, tmp_path, "fixed", say=said.append) for _ in range(3)]
         assert len({each.result().identity for each in made}) == 1
     assert len(calls) == 1 and sum("waits for another process" in line for line in said) == 2
     make_predictor(run, tmp_path, "fixed", coverage=0.8, say=said.append)
     assert len(calls) == 2 and "calibrated for a coverage of 0.9, and is calibrated again" in said[-2]
-    make_predictor(stub_run(None, 0.25, hold_out=8), tmp_path, "fixed", say=said.append)  # renders other images
+    make_predictor(run._replace(settings={"max_uncertainty": 0.25}), tmp_path, "fixed", say=said.append)
     assert len(calls) == 3
     assert {path.name for path in tmp_path.rglob("*.json")} == {"fixed.json", "fixed-max_uncertainty-0.25.json"}
 
@@ -275,7 +277,7 @@ def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path,
 
     with np.load(tmp_path / "uncertainty" / "20" / "laplace.npz") as stored:
         limit = float(np.median(np.sqrt((stored["std"] ** 2).mean(axis=-1))))
-    clean = evaluate(tmp_path, settings={"max_uncertainty": limit}, overwrite=True)
+    clean = score_run(cleaned(restore_run(tmp_path), tmp_path, limit), tmp_path, overwrite=True)
     assert clean["settings"]["max_uncertainty"] == limit and clean["psnr"] != results["psnr"]
     said = re.findall(r"cleaning +([\d.]+) % of the occupied cells", capsys.readouterr().err)
     assert len(said) == 1 and 10 < float(said[0]) < 90

@@ -11,10 +11,10 @@ import pytest
 
 import ball_runs
 from jaxnerf.data.synthetic import load_synthetic
-from jaxnerf.evaluation.paths.render_path import render_path
 from jaxnerf.evaluation.restore import restore_with_grid
 from jaxnerf.tools.viewer.frame_renderer import MAX_SIDE, FrameCamera, FrameRenderer, frame_image
 from jaxnerf.tools.viewer.page import Page
+from runs import render_path
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
@@ -88,7 +88,7 @@ def test_a_frame_equals_that_of_render(kind, tmp_path):
     content = {"frames": [{"transform_matrix": pose.tolist()}], "w": 30, "h": 20, "fl_x": camera.focal}
     (tmp_path / "one.json").write_text(json.dumps(content))
     options = {"settings": {"bake_occupancy": True}, "max_rays_per_pixel": 1}
-    folder, *_ = render_path(it.folder, path=str(tmp_path / "one.json"), kind="none", overwrite=True, **options)
+    folder, *_ = render_path(it.folder, path=str(tmp_path / "one.json"), video="none", overwrite=True, **options)
     expected = iio.imread(folder / "color" / "0000.png").astype(int)
     assert np.abs(frame_image(frame, "colour") - expected).max() <= 1
     assert np.ptp(expected) > 50 and 0.05 < (frame.opacity > 0.5).mean() < 0.95

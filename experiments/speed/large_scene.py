@@ -1,7 +1,7 @@
 """Writes a scene in the Blender format of any size, to measure what size alone costs in memory and time.
 
-    python experiments/scaling/large_scene.py --out=DIR [--views=1000] [--size=800] [--rendered=50]
-    python experiments/scaling/large_scene.py --out=DIR --workdir=RUN    # trains on that scene and measures
+    python experiments/speed/large_scene.py --out=DIR [--views=1000] [--size=800] [--rendered=50]
+    python experiments/speed/large_scene.py --out=DIR --workdir=RUN    # trains on that scene and measures
 
 Cameras stand on the embedded scene's spiral, each with a pose of its own. Images are rendered at --rendered px and
 enlarged, as the scene in closed form would take hours at full size; noise of a few levels makes them as hard to

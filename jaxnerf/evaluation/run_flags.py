@@ -1,0 +1,94 @@
+"""The flags of programs that render a run, and the run and the predicted errors that they ask for."""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from absl import flags
+
+from jaxnerf.runtime import cli
+
+if TYPE_CHECKING:
+    from jaxnerf.evaluation.trained_run import TrainedRun
+
+MAX_UNCERTAINTY = (  # the help of --max_uncertainty
+    "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
+    "allow; 1, or not given: all cells stay."
+)
+
+flags.disclaim_key_flags()  # a flag defined here belongs to the program that calls
+
+
+class RunFlags(NamedTuple):
+    """Flags that say which checkpoint is rendered, how, and which errors are predicted."""
+
+    workdir: flags.FlagHolder
+    data_dir: flags.FlagHolder
+    step: flags.FlagHolder
+    chunk: flags.FlagHolder
+    bake_occupancy: flags.FlagHolder
+    max_uncertainty: flags.FlagHolder
+    uncertainty: flags.FlagHolder
+    members: flags.FlagHolder
+    coverage: flags.FlagHolder
+
+    def restore(self, config: Any = None, settings: Mapping[str, Any] | None = None) -> "TrainedRun":
+        """Restores the run as the flags say; config, settings: see `restore_run`; settings win over the flags."""
+        from jaxnerf.evaluation.restore import restore_run
+
+        given = {"bake_occupancy": self.bake_occupancy.value, "chunk": self.chunk.value}
+        given = {name: value for name, value in given.items() if value is not None} | dict(settings or {})
+        run = restore_run(self.workdir.value, config, data_dir=self.data_dir.value, settings=given)
+        if self.max_uncertainty.value is None:
+            return run
+        from jaxnerf.tools.uncertainty.cleaning import cleaned
+
+        return cleaned(run, self.workdir.value, self.max_uncertainty.value)
+
+    def predictor(self) -> Callable[["TrainedRun"], Any] | None:
+        """Returns the function that makes the Predictor of a restored run; None without --uncertainty.
+
+        Raises:
+            ValueError: on a wrong flag, before anything is read.
+        """
+        from jaxnerf.tools.uncertainty.predict import requested
+
+        options = {"step": self.step.value, "members": self.members.value, "coverage": self.coverage.value}
+        return requested(self.uncertainty.value, self.workdir.value, **options)
+
+
+def define(done: str, written: str, *, required: bool = False) -> RunFlags:
+    """Defines the flags.
+
+    Args:
+        done: what the program does with a checkpoint, for the help.
+        written: what it writes of predicted errors, for the help.
+        required: whether --workdir must be given.
+    """
+    return RunFlags(
+        workdir=flags.DEFINE_string("workdir", None, "The run's folder.", required=required),
+        data_dir=flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir."),
+        step=flags.DEFINE_integer("step", None, f"The checkpoint's step. When it is not given, the newest is {done}."),
+        chunk=cli.define_count(
+            "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
+        ),
+        bake_occupancy=flags.DEFINE_bool(
+            "bake_occupancy",
+            None,
+            "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
+            "config.eval.bake_occupancy.",
+        ),
+        max_uncertainty=cli.define_number("max_uncertainty", MAX_UNCERTAINTY),
+        uncertainty=flags.DEFINE_string(
+            "uncertainty",
+            None,
+            "An estimator of the error of each pixel: laplace, of one run, ensemble, of several, or a registered one. "
+            f"The program writes {written}.",
+        ),
+        members=flags.DEFINE_list("members", None, "ensemble: workdirs of the other runs, which differ in seed."),
+        coverage=flags.DEFINE_float(
+            "coverage",
+            0.9,
+            "The fraction of true errors that the intervals of --uncertainty are to hold. They are calibrated on the "
+            "views that config.data.hold_out has kept from training.",
+        ),
+    )
