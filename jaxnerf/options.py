@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self, TypeAlias, TypeVar, dataclass_transfor
 
 AUTO = "auto"  # the only marker of a value that is inferred
 MAX_INT, MAX_FLOAT = 2**31 - 1, 3.4e38  # int32, in which JAX counts, and float32
+Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]  # lower and upper corner [3], world units
 Schedule: TypeAlias = float | tuple[tuple[float, float], ...]  # a number, or points (step, value), linear between them
 _Part = TypeVar("_Part", bound="Options")
 
@@ -124,21 +125,20 @@ class Facts(NamedTuple):
         side: px, that of a square image with as many pixels as an image has, the mean over the images.
         footprint: world units that a pixel covers at the point that the cameras look at.
         footprint_spread: side of the largest pixels' footprint over that of the smallest, at what each view shows, for
-            all but the outermost twentieths of the views, and for all sizes that training draws from.
+            all but the outermost twentieths of the views.
         num_observations: of sparse points that at least two views show; 0 unless the run can use them.
         has_alpha: whether alpha bounds the scene.
         mean_alpha: of the pixels; 1 without alpha.
         ndc: whether rays are in normalised device coordinates.
         lower, upper: world units, the corners of the box that holds what the run renders.
-        box_reason: how the box was found.
         contracted: whether the box holds all of space.
-        contraction_reason: why.
-        sampler: the name of the run's sampler.
-        large_field: whether an update of the field's parameters takes as long as half of a step's rays.
         factor: by which the images were downscaled.
+        skips_empty_cells: whether the run's sampler does, see `Options.skips_empty_cells`.
         trains_cameras: whether the run trains parameters of the training images.
-        busy_rays: rays per step that keep the device busy; None: no more than on a CPU.
-        batch_size: rays per step; 0 while that is inferred itself.
+        rays_per_step: that suit the sampler and the device, see `Options.rays_per_step`; 0 for the options of a field,
+            which are resolved before.
+        rays_reason: why.
+        batch_size: rays per step of the run; 0 for the options of a field.
     """
 
     num_views: int
@@ -151,14 +151,12 @@ class Facts(NamedTuple):
     ndc: bool = False
     lower: tuple[float, float, float] = (-1.0, -1.0, -1.0)
     upper: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    box_reason: str = ""
     contracted: bool = False
-    contraction_reason: str = ""
-    sampler: str = ""
-    large_field: bool = False
     factor: int = 1
+    skips_empty_cells: bool = False
     trains_cameras: bool = False
-    busy_rays: int | None = None
+    rays_per_step: int = 0
+    rays_reason: str = ""
     batch_size: int = 0
 
     @property
@@ -174,13 +172,13 @@ class Facts(NamedTuple):
     @property
     def has_fine_cells(self) -> bool:
         """Whether fine cells of the box pay: images resolve more than 256 of them a side, and alpha empties most."""
-        fine = self.has_alpha and not self.contracted and self.sampler == "occupancy" and self.detail > _FINE_DETAIL
-        return fine and self.mean_alpha < _MAX_ALPHA
+        fine = self.skips_empty_cells and not self.contracted and self.detail > _FINE_DETAIL
+        return fine and self.has_alpha and self.mean_alpha < _MAX_ALPHA
 
     @property
     def fills_space(self) -> bool:
         """Whether the run evaluates the field in all of space, near the cameras and far behind what they look at."""
-        return self.contracted and self.sampler == "occupancy"
+        return self.contracted and self.skips_empty_cells
 
 
 class Device(NamedTuple):
@@ -208,11 +206,19 @@ class Device(NamedTuple):
 class Options:
     """The base of a part's options; subclasses are frozen dataclasses whose fields are made by `option`.
 
+    What other parts ask a field or a sampler is declared here, too: a subclass replaces what differs.
+
     Attributes:
         changes: what depends on the options that do not say it themselves.
+        needs_box: of a field or a sampler: whether it is defined in the scene's box, and in its contraction of space if
+            there is one. A run has a box if its field or its sampler needs one.
+        skips_empty_cells: of a sampler: whether it evaluates the field in the occupied cells of a grid only. A cell may
+            then be smaller, and where space is contracted rays start close to the cameras.
     """
 
     changes: typing.ClassVar[Changes] = Changes.MODEL
+    needs_box: typing.ClassVar[bool] = True
+    skips_empty_cells: typing.ClassVar[bool] = False
 
     def resolve(self, facts: Facts, device: Device) -> tuple[Self, list[str]]:
         """Replaces the "auto" values that are inferred once, when a run starts; see `infer`."""
@@ -222,10 +228,13 @@ class Options:
         """Replaces the "auto" values that are inferred at every start, those of Changes.SPEED; see `infer`."""
         return self, []
 
-    def check(self) -> None:
-        """Raises a ValueError if values that are right one by one do not fit together."""
+    def check(self, box: Box | None = None) -> None:
+        """Raises a ValueError if values that are right one by one do not fit together, or not to the scene's box."""
 
-    def bytes_needed(self) -> dict[str, float]:
+    def check_unused(self, sampler: str) -> None:
+        """Of a sampler: raises a ValueError if a value asks for what the run's sampler, another one, does not do."""
+
+    def bytes_needed(self, box: Box | None) -> dict[str, float]:
         """Returns, by the name of an option that determines it, bytes of memory that a run with these options needs."""
         return {}
 
@@ -234,9 +243,15 @@ class Options:
         """Of a field: whether an update of its parameters takes as long as half of the rays of a step."""
         return False
 
-    def busy_rays(self, device: Device) -> int | None:
-        """Of a sampler: the rays per step that keep a device busy; None: no more than on a CPU."""
-        return None
+    def rays_per_step(self, cpu_rays: int, device: Device, *, large_field: bool) -> tuple[int, str]:
+        """Of a sampler: returns the rays of a training step that suit a device, and why.
+
+        Args:
+            cpu_rays: `train.cpu_batch_size`.
+            device: that trains.
+            large_field: whether the run's field `is_large`.
+        """
+        return cpu_rays, "train.cpu_batch_size"
 
     def rays_per_chunk(self, device: Device) -> int:
         """Of a sampler: the rays that suit a device when images are rendered.

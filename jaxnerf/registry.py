@@ -5,7 +5,7 @@ functions; a program imports such code with `--plugins=module,...`.
 """
 
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from jaxnerf.options import Facts, Options, Schedule, is_auto
@@ -18,11 +18,14 @@ class Part(NamedTuple):
         make: see `register_field` and `register_sampler`.
         options: the class of its options; None: its section of the config is a dict without checks.
         section: the config's section that holds them, if it is not that of its own name.
+        networks: of a sampler: the fields of further networks that it makes, by the name of the network, which is that
+            of the config's section with its options, too.
     """
 
     make: Callable[..., Any]
     options: type[Options] | None = None
     section: str | None = None
+    networks: Mapping[str, "Part"] = {}
 
 
 class Loss(NamedTuple):
@@ -35,6 +38,7 @@ class Loss(NamedTuple):
         weight: where the config sets none; "auto" needs `infer`.
         infer: (facts) -> the weight in place of "auto", and the line that reports it, or "".
         help: what it compares, for the reference page.
+        fixed_order: whether its gradient has a fixed order of sums where the renderings' gradients have one.
     """
 
     function: Callable[..., Any] | None
@@ -43,6 +47,7 @@ class Loss(NamedTuple):
     weight: Schedule | str = 0.0
     infer: Callable[[Facts], tuple[Schedule, str]] | None = None
     help: str = ""
+    fixed_order: bool = True
 
 
 class Reader(NamedTuple):

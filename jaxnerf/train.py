@@ -65,7 +65,7 @@ _STOPPED_CODE = flags.DEFINE_integer(
 _SEEDS = flags.DEFINE_list(
     "seeds",
     None,
-    "Seeds of several runs that train at once, such as 0,1,2,3: an ensemble. Each has a workdir of its own, "
+    "Seeds of runs that train one after the other, such as 0,1,2,3: an ensemble. Each has a workdir of its own, "
     "seed_<seed> in --workdir.",
 )
 _BATCH = cli.define_count(

@@ -24,8 +24,8 @@ from runs import PACKED, smoke_config
 KINDS = {
     "packed": {**PACKED, "occupancy.step_size": 0.05},
     "dense": {"sampling.num_fine": 0, "occupancy.resolution": 16, "occupancy.step_size": 0.05},
-    "contracted": {**PACKED, "occupancy.step_size": 0.05, "occupancy.contracted": True},
-    "ndc": {**PACKED, "occupancy.step_size": 0.02, "occupancy.contracted": False},
+    "contracted": {**PACKED, "occupancy.step_size": 0.05, "scene.contracted": True},
+    "ndc": {**PACKED, "occupancy.step_size": 0.02, "scene.contracted": False},
 }
 
 

@@ -72,3 +72,8 @@ def without_damping(params, num_freqs):
 
 def all_finite(tree):
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def out_of_memory():
+    """Returns the error that JAX raises where a device has no more memory."""
+    return jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes.")

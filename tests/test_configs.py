@@ -34,7 +34,7 @@ def resolved(config):
     return resolve_for_device(replaced(resolved, data=data))[0]
 
 
-DATA = {"format": "blender", "factor": 1, "background": "none", "background_color": ()}
+DATA = {"format": "blender", "factor": 1, "background": "none"}
 DATA |= {"world": "file", "ndc": False}
 
 
@@ -80,7 +80,6 @@ PAPER = {
     "train.lr_init": 5e-4,
     "train.lr_final": 5e-5,
     "train.lr_decay_power": 1.0,
-    "train.beta1": 0.9,
     "train.beta2": 0.999,
     "train.epsilon": 1e-7,
     "train.warmup_steps": 0,
@@ -160,7 +159,7 @@ def test_invalid_value_is_an_error(field, value, message):
 def test_unresolved_config_is_an_error():
     config = load("smoke")
     config.sampler, config.field = "occupancy", "hash_grid"
-    with pytest.raises(ValueError, match="occupancy.contracted is 'auto'; resolve the config"):
+    with pytest.raises(ValueError, match="is 'auto'; resolve the config"):
         build(config)
 
 
@@ -186,7 +185,7 @@ def _render_jaxpr(experiment):
 
 
 def test_optimizer_is_adam_with_the_configured_values():
-    options = OptimizerOptions(lr_init=0.1, lr_final=0.1, beta1=0.5, beta2=0.75, epsilon=1e-3)
+    options = OptimizerOptions(lr_init=0.1, lr_final=0.1, beta2=0.75, epsilon=1e-3)
     optimizer, _ = make_optimizer(options)
     params, gradient = jax.numpy.array([1.0]), jax.numpy.array([0.01])
     update, _ = optimizer.update(gradient, optimizer.init(params), params)

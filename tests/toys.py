@@ -41,9 +41,10 @@ def toy_draw(step, positions, data):
     return None, Batch(rays=rays, rgb=jnp.where((bad_steps == step).any(), jnp.nan, rgb))
 
 
-def run_steps(step, state, data, num_steps, mode, **options):
+def run_steps(step, state, data, num_steps, num_devices, **options):
     """Returns the last state, in numpy, and all metrics."""
-    run, state, data = devices.compile_step(step, state, data, mode=mode, **options)
+    used = jax.devices()[:num_devices]
+    run, state, data = devices.compile_step(step, state, data, devices=used, **options)
     rows = []
     for _ in range(num_steps):
         state, metrics = run(state, data)

@@ -29,7 +29,7 @@ from jaxnerf.training import metric_log
 
 VARIANTS = {
     "capture": {},
-    "black behind the scene": {"data.background_color": ()},
+    "black behind the scene": {"scene.background": ()},
     "depth off": {"losses.depth": 0.0},
     "depth 0.1 to the end": {"losses.depth": 0.1},
     "distortion off": {"losses.distortion": 0.0},

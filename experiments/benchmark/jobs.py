@@ -89,7 +89,7 @@ def _detail(job):
 
 _OF_LEGO = ("lego, 800x800, 25 test views", "lego, 800x800")
 _OF_MIC = ("mic, 800x800, 25 test views", "mic, 800x800")
-_NO_ALPHA = {"occupancy.use_alpha": False}
+_NO_ALPHA = {"scene.use_alpha": False}
 _WITHOUT_ALPHA = "lego, 100x100, 25 test views, without alpha"
 _REPOSE = "jaxnerf-cameras --images=can/images --out=can_reposed"
 _FOLDERS = "'can_undistorted', 'can_reposed/sparse/0', 'can_reposed/images'"

@@ -51,8 +51,8 @@ BASE = ("random", "farthest")
 _MOST_TEST_VIEWS = 25
 # Of runs with all images, as those of the room below, so that no program depends on which images there are.
 _LEGO = {
-    "occupancy.lower": (-0.771, -1.2698, -0.6803),
-    "occupancy.upper": (0.771, 1.2698, 1.1338),
+    "scene.lower": (-0.771, -1.2698, -0.6803),
+    "scene.upper": (0.771, 1.2698, 1.1338),
     "occupancy.resolution": 125,
     "occupancy.step_size": 0.0203168,
     "hash_grid.resolutions": (15, 31, 62, 125),

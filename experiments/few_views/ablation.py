@@ -29,7 +29,7 @@ SCENES = {
         "data.factor": 8,
         "data.view_indices": (26, 86, 2, 55, 75, 93, 16, 73),
         "data.hold_out": 11,
-        "occupancy.use_alpha": False,
+        "scene.use_alpha": False,
     },
     "fern": {"data.dir": "fern", "data.factor": 16, "data.view_indices": (0, 8, 16), "data.hold_out": 4},
 }

@@ -24,7 +24,7 @@ from jaxnerf.runtime import cli
 from jaxnerf.training import metric_log
 
 _EIGHT = {"data.view_indices": (26, 86, 2, 55, 75, 93, 16, 73)}  # of arXiv:2104.00677
-_WHITE = {"occupancy.use_alpha": False}  # the images have a white background, and no alpha
+_WHITE = {"scene.use_alpha": False}  # the images have a white background, and no alpha
 _FERN = {"data.dir": "fern", "data.factor": 8}
 # By row: its changes of the config.
 ROWS = {

@@ -254,23 +254,6 @@ def blender(context: Context, *, name: str = "lego", seconds: float) -> dict[str
     return _trained(config, context.folder / f"{name}-{seconds:g}")
 
 
-def four_scales(context: Context) -> dict[str, Any]:
-    """Trains lego on four scales for a minute and scores its test views at each, one ray a pixel."""
-    limit = 1.0 if context.tiny else 60.0
-    overrides = {"data.dir": "lego", "data.num_scales": 4, "train.max_seconds": limit}
-    config = context.config("lego_fast", profiles.FULL_SIZE | profiles.TIMED | overrides)
-    folder = context.folder / "four_scales"
-    results = _trained(config, folder)
-    run = restore.restore_run(folder)
-    variables, rows = run.variables(restore.newest_step(run, folder)), []
-    for scale in (1, 2, 4, 8):
-        smaller = {"data.factor": scale, "data.size": config.data.size // scale}  # of files; of the embedded scene
-        views = common.load_split(common.changed(config, smaller), config.eval.split)
-        psnr = _mean_psnr(run, variables, views, range(len(views.names)))
-        rows.append({"scale": f"1/{scale}" if scale > 1 else "1", "psnr": psnr})
-    return {**results, "mean psnr": float(np.mean([row["psnr"] for row in rows])), "rows": rows}
-
-
 _SMALL = {"hash_grid.width": 64, "hash_grid.view_width": 64, "hash_grid.table_size": 2**20}
 _SIZES = {
     "5 samples per ray, networks 64 wide, 2^20 rows": _SMALL | {"occupancy.pool_samples_per_ray": 5.0},

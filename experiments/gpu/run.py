@@ -55,7 +55,6 @@ PIECES = {
         for name in ("lego", "mic")
         for seconds in (15, 30, 60, 120, 300)
     },
-    "four_scales": Piece(pieces.four_scales, 2.5, "Lego on four scales, 800 x 800, 60 s"),
     "frame": Piece(pieces.frame, 2, "A frame of 800 x 800"),
     "sizes": Piece(pieces.sizes, 6, "Sizes: views held out of training, lego 800 x 800"),
     "paper_mlp": Piece(pieces.paper_mlp, 3, "The paper's network with an occupancy grid, lego 800 x 800"),

@@ -102,8 +102,8 @@ def precision(config, alpha):
 
 def background(config, alpha):
     """Nothing behind the scene or around its box. (Behind alpha there must be a colour.)"""
-    if config.sampler == "occupancy" and config.occupancy.contracted:
-        return {"occupancy.contracted": False}
+    if config.sampler == "occupancy" and config.scene.contracted:
+        return {"scene.contracted": False}
     return {} if alpha or config.data.background == "none" else {"data.background": "none"}
 
 

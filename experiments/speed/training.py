@@ -21,10 +21,10 @@ def _curve(config, seconds, **overrides):
 # auto_config infers from these images where the box is known.
 _DENSE = {"sampler": "hierarchical", "sampling.num_fine": 0, "sampling.num_coarse": 133, "fine.num_freqs": 7}
 # Where no space is known to be empty: no alpha, and the same octaves and sample distance with and without a grid.
-_EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "occupancy.use_alpha": False, "fine.num_freqs": 7}
+_EMBEDDED = {"data.format": "synthetic", "data.factor": 1, "scene.use_alpha": False, "fine.num_freqs": 7}
 _EMBEDDED["occupancy.step_size"] = 0.03
 _FERN = {"data.format": "llff", "data.dir": "fern", "data.ndc": True, "data.background": "none"}
-_FERN |= {"occupancy.use_alpha": False, "occupancy.step_size": 2 / 133, "fine.num_freqs": 7}
+_FERN |= {"scene.use_alpha": False, "occupancy.step_size": 2 / 133, "fine.num_freqs": 7}
 _FOX = {"data.format": "transforms", "data.dir": "fox"}
 # No update ever empties a cell, nothing is occluded, and the same buffer takes all samples of fewer rays.
 _NO_UPDATES = {
@@ -38,7 +38,7 @@ _ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4, "trai
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
 CURVES = {
     "grid": _curve("lego_fast", (10, 15, 30, 60, 120, 300)),
-    "grid without alpha": _curve("lego_fast", (15, 30, 60, 120), **{"occupancy.use_alpha": False}),
+    "grid without alpha": _curve("lego_fast", (15, 30, 60, 120), **{"scene.use_alpha": False}),
     "grid 200": _curve("lego_fast", (60, 300), **{"data.factor": 4}),
     "grid 400": _curve("lego_fast", (180, 600), **{"data.factor": 2}),
     "grid 800": _curve("lego_fast", (600,), **{"data.factor": 1}),

@@ -168,7 +168,7 @@ def painted_config(steps: int):
             "data.factor": 1,
             "data.world": "around",
             "data.background": "none",
-            "data.background_color": (),  # one compiled step serves all painted backgrounds
+            "scene.background": (),  # one compiled step serves all painted backgrounds
             "data.ndc": False,
             "train.batch_size": 128,
             "train.max_steps": steps,

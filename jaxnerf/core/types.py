@@ -259,7 +259,6 @@ class Batch:
         alpha: [B] in [0, 1]; 1 where the image has no alpha.
         depth: [B] in t.
         depth_weight: [B] confidence of the depth, 0 where it is unknown.
-        loss_weight: [B] see `Views`; None: 1. It is filled where the views have it.
     """
 
     rays: Rays
@@ -269,7 +268,6 @@ class Batch:
     alpha: Float[Array, " B"] | None = None
     depth: Float[Array, " B"] | None = None
     depth_weight: Float[Array, " B"] | None = None
-    loss_weight: Float[Array, " B"] | None = None
 
 
 def check_shapes(function: str, **arrays: tuple[object, str]) -> None:

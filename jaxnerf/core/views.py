@@ -34,8 +34,6 @@ class Views:
         time: [V] in [0, 1], when each image was taken in a scene that moves; None: not stated.
         image_index: [V] int32, which training image each view counts as for a scene that asks for `image_index`; None:
             its own index here.
-        loss_weight: [V] by which training multiplies the losses of the rays of a view's pixels, with a mean of 1 over
-            all pixels; None: 1.
     """
 
     pixels: UInt[Array, "P C"]
@@ -54,7 +52,6 @@ class Views:
     sparse: SparsePoints | None = None
     time: Float[Array, " V"] | None = None
     image_index: Int[Array, " V"] | None = None
-    loss_weight: Float[Array, " V"] | None = None
 
     def image(self, index: int) -> Float[Array, "H W 3"]:
         """Returns a view's colours [H, W, 3] in [0, 1]; alpha is composited over the background, or over black."""

@@ -33,7 +33,6 @@ def active_region(
     min_views: int = 0,
     ndc: bool = False,
     pixel_offset: float = 0.5,
-    drawn: Views | None = None,
 ) -> tuple[InitialCells, PixelRuns | None, Int[np.ndarray, " M"]]:
     """Finds what is known of the grid's cells, and the pixels whose rays may hit one of them.
 
@@ -45,7 +44,6 @@ def active_region(
         use_alpha: whether cells outside the visual hull of the views' alpha are invalid.
         min_views: number of views that must see a valid cell, see `seen_cells`; 0: the cameras tell nothing.
         ndc, pixel_offset: see `draw_batch`.
-        drawn: the images that training draws from, at several sizes; None: the views.
 
     Returns:
         cells: of the grid before training.
@@ -57,7 +55,6 @@ def active_region(
             f"occupancy.min_views is {min_views} with normalised device coordinates, which hold what the cameras see, "
             "expected 0; correct --config.occupancy.min_views or --config.data.ndc"
         )
-    drawn = views if drawn is None else drawn
     options = {"use_alpha": use_alpha, "ndc": ndc, "pixel_offset": pixel_offset}
     runs = {field.name for field in dataclasses.fields(PixelRuns)}
 
@@ -68,7 +65,7 @@ def active_region(
             seen, free = seen_cells(views, schedule, min_views=min_views)
             valid &= seen & ~free
             empty = valid & likely_empty_cells(views, schedule, pixel_offset=pixel_offset)
-        active = find_active_pixels(drawn, schedule, valid, **options)
+        active = find_active_pixels(views, schedule, valid, **options)
         return {"valid": valid, "empty": empty} | ({} if active is None else vars(active))
 
     def is_valid(arrays):
@@ -77,7 +74,7 @@ def active_region(
             {"valid", "empty"} | runs,
         )
 
-    name = f"active_{_fingerprint(drawn, schedule, options | {'min_views': min_views})}"
+    name = f"active_{_fingerprint(views, schedule, options | {'min_views': min_views})}"
     found = load_or_make(None, name, make, is_valid=is_valid, min_seconds=_SLOW)
     valid, empty = found.pop("valid"), found.pop("empty")
     cells = InitialCells(valid, empty if empty.any() else None)
@@ -167,7 +164,7 @@ def find_active_pixels(
     if not runs.size:
         raise ValueError(
             f"no ray of {len(views.offset)} views hits a valid cell of the box {schedule.lower} to {schedule.upper}; "
-            "correct occupancy.lower and occupancy.upper"
+            "correct scene.lower and scene.upper"
         )
     return runs
 
@@ -204,7 +201,6 @@ def _fingerprint(views, schedule, options):
         views.box,
         views.cameras,
         views.sparse,
-        views.loss_weight,
     ]
     if options["use_alpha"] and views.pixels.shape[-1] == 4:
         ends = np.append(views.offset[1:], len(views.pixels))

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 
 from jaxnerf.core.views import Views
-from jaxnerf.data.facts import LookAt, mean_color
+from jaxnerf.data.facts import LookAt
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.geometry.poses import AXES, axis_of
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
+from jaxnerf.data.scene import BACKGROUNDS
 from jaxnerf.data.shared_views import line_of, shared_views
 from jaxnerf.data.view_selection import select_views, selection
 from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, infer, is_auto, option, replaced, values_of
 from jaxnerf.registry import READERS, needs_folder
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 WORLDS = {
     "file": "cameras stay as in the file",
     "forward": "all cameras look in one direction, which becomes -z",
@@ -28,11 +28,6 @@ WORLDS = {
 }
 _NO_FOLDER = {"factor": 1, "background": "white", "world": "file", "ndc": False}  # of a dataset that is rendered
 _NEAR = 0.02  # times the cameras' distance from what they look at; hardly anything in focus is closer
-
-
-def _wrong_color(color):
-    right = len(color) in (0, 3) and all(isinstance(each, int | float) and 0 <= each <= 1 for each in color)
-    return None if right else "red, green and blue in [0, 1], or () for black"
 
 
 def _wrong_indices(indices):
@@ -60,13 +55,6 @@ class DataOptions(Options):
         protocol=True,
     )
     width: int = option(800, "see `factor`", unit="px", range=at_least(1))
-    num_scales: int = option(
-        1,
-        "sizes of the images that training draws from: full, 1/2, 1/4, ..., each the area average of the full one. "
-        "The losses of a ray weigh as the side of its pixel. It pays with `hash_grid.prefilter`.",
-        range=at_least(1),
-        changes=Changes.TRAINING,
-    )
     size: int = option(100, "side of the embedded scene's images", unit="px", range=at_least(1))
     finish: str = option(
         "usual",
@@ -76,7 +64,7 @@ class DataOptions(Options):
     near: float = option(
         AUTO,
         "Where rays start, along the camera's axis. 0: each image has its own, from the dataset. auto: one small "
-        "distance where the occupancy sampler contracts space, otherwise 0.",
+        "distance where space is contracted and its empty cells are skipped, otherwise 0.",
         unit="of the dataset's files",
         range=at_least(0),
         auto=True,
@@ -84,18 +72,11 @@ class DataOptions(Options):
     far: float = option(0.0, "where rays end, as `near`", unit="of the dataset's files", range=at_least(0))
     background: str = option(
         "white",
-        "The colour behind alpha and behind the scene. `none`: alpha is dropped, and `background_color` is behind the "
+        "The colour behind alpha and behind the scene. `none`: alpha is dropped, and `scene.background` is behind the "
         "scene. auto: `white` for images with alpha, otherwise `none`.",
         choices=tuple(BACKGROUNDS),
         auto=True,
         protocol=True,
-    )
-    background_color: tuple[float, ...] = option(
-        AUTO,
-        "behind the scene where `background` is `none`: red, green, blue in [0, 1], or () for black. auto: the mean "
-        "of the training images where the occupancy sampler contracts space, otherwise black",
-        auto=True,
-        check=_wrong_color,
     )
     hold_out: int = option(
         0, "every n-th training view belongs to the split `held_out` instead; 0: none", range=at_least(0), protocol=True
@@ -150,7 +131,7 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
         ValueError: names the file, what was found, what is expected and what to do.
     """
     inferred = DataOptions(format=AUTO, background=AUTO, world=AUTO, ndc=AUTO)  # type: ignore[arg-type]
-    known = [name for name in values_of(inferred) if name != "background_color"]  # of renderings, not of images
+    known = values_of(inferred)
     if unknown := sorted(set(options) - set(known)):
         raise ValueError(f"load_dataset: {unknown[0]} is no option, expected one of {', '.join(known)}; correct it")
     return load_split(replaced(inferred, **{"dir": str(dir)} | options), split)
@@ -159,7 +140,7 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
 def resolve(data: DataOptions) -> tuple[DataOptions, list[str], Capture | None]:
     """Resolves the options of a dataset against its folder.
 
-    `near` and `background_color` stay "auto", see `resolve_for_scene`.
+    `near` stays "auto", see `resolve_near`.
 
     Args:
         data: the options.
@@ -291,44 +272,30 @@ def _shared_with(capture, split, train):
     return {"count": len(shared), "names": [view.name for view in shared], "note": note}
 
 
-def resolve_for_scene(data: DataOptions, views: Views, *, fills_space: bool) -> tuple[DataOptions, Views, list[str]]:
-    """Resolves what concerns the space in front of the cameras, and the colour behind the scene.
+def resolve_near(data: DataOptions, views: Views, *, fills_space: bool) -> tuple[DataOptions, Views, list[str]]:
+    """Resolves where rays start.
 
     In unbounded captures each image's own near follows from what it shows. No ray would then train the space between
-    a camera and its near, so that another camera could see fog there. Distant walls and sky have little texture, so
-    training leaves them partly transparent. With black behind them they are too dark, and bright fog in front of
-    single cameras takes their place.
+    a camera and its near, so that another camera could see fog there.
 
     Args:
         data: the options, otherwise resolved.
         views: of the split "train".
-        fills_space: whether the run evaluates the field in all of space.
+        fills_space: see `Facts`.
 
     Returns:
         The options, the views with their near, and one line per inferred value.
     """
-    color, lines = data.background_color, []
-    if is_auto(color):
-        color = ()
-        if data.background == "none" and fills_space:
-            color = tuple(round(value, 3) for value in mean_color(views))
-            lines.append(f"behind        {color}, the mean colour of the training images")
-        data = replaced(data, background_color=color)
-    elif len(color) and data.background != "none":
-        raise ValueError(
-            f"data.background_color is {tuple(color)} and data.background {data.background!r}, which is behind the "
-            "scene, too; set data.background to 'none', or data.background_color to ()"
-        )
     if not is_auto(data.near):
-        return data, views, lines
+        return data, views, []
     if not fills_space:
-        return replaced(data, near=0.0), views, lines
+        return replaced(data, near=0.0), views, []
     unit = 1.0 if views.to_file is None else world.unit_of(views.to_file)
     distance = float(np.median(LookAt(views).distance))
     data = replaced(data, near=float(f"{_NEAR * distance * unit:.4g}"))
     near = np.float32(data.near / unit)
-    lines.append(f"near          {near:.3g} for all images, so that the space in front of each camera is trained")
-    return data, dataclasses.replace(views, near=np.full_like(views.near, near)), lines
+    line = f"near          {near:.3g} for all images, so that the space in front of each camera is trained"
+    return data, dataclasses.replace(views, near=np.full_like(views.near, near)), [line]
 
 
 def load_split(
@@ -419,19 +386,6 @@ def background_of(data: DataOptions) -> tuple[float, float, float] | None:
     if data.background not in BACKGROUNDS:
         raise ValueError(f"data.background is {data.background!r}, expected one of {sorted(BACKGROUNDS)}; correct it")
     return BACKGROUNDS[data.background]
-
-
-def color_behind(data: DataOptions) -> tuple[float, ...] | None:
-    """Returns the colour behind the scene of resolved options; None: black."""
-    color = data.background_color
-    if data.background != "none" or len(color) == 0:
-        return background_of(data)
-    if is_auto(color):
-        raise ValueError(
-            "data.background_color is 'auto'; resolve the config against a dataset, or set red, green and blue, or () "
-            "for black"
-        )
-    return tuple(color)
 
 
 def conventions(data: DataOptions, capture: Capture | None = None) -> dict[str, Any]:

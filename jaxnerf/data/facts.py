@@ -7,74 +7,42 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.core.views import Views
-from jaxnerf.data.geometry import poses, visual_hull
+from jaxnerf.data.geometry import poses
 from jaxnerf.data.observations import num_shared
-from jaxnerf.data.ray_batches import view_rays
-from jaxnerf.options import Facts, is_auto
+from jaxnerf.options import Box, Facts
 
-# Space is not contracted as far as the cameras, so that cells near them are small: large ones fill with fog. But the
-# cube is at most this many times as large as that which most images show: what they look at gets fewer cells then.
-_MAX_INNER_BOX = 3.0
-# Times twice the side of the cube that most images show; a stated box that is larger is no better than contraction.
-_MAX_STATED_BOX = 3.0
 _OUTLIERS = 0.05  # fraction of views whose footprints may be larger than all others, or smaller
 _MEAN_RUNS, _MEAN_RUN = 2**10, 2**10  # of pixels, of whose colours the mean is taken
 
 
 def dataset_facts(
-    views: Views,
-    *,
-    ndc: bool,
-    world: str,
-    use_alpha: bool,
-    sampler: str,
-    contracted: Any,
-    lower: Any,
-    upper: Any,
-    num_scales: int = 1,
+    views: Views, box: Box, *, ndc: bool, contracted: bool, has_alpha: bool, skips_empty_cells: bool, **others: Any
 ) -> Facts:
     """Returns the facts about a dataset.
 
     Args:
         views: of the split "train".
+        box: of the scene.
         ndc: whether rays are in normalised device coordinates.
-        world: see `DataOptions`.
-        use_alpha: whether alpha may bound the scene.
-        sampler: the name of the run's sampler.
-        contracted, lower, upper: of the box where they are set; otherwise "auto".
-        num_scales: sizes of the images that training draws from, see `DataOptions`.
-
-    Raises:
-        ValueError: if the box is empty.
+        contracted: whether the box holds all of space.
+        has_alpha: whether alpha bounds the scene.
+        skips_empty_cells: whether the run's sampler does.
+        **others: further attributes of the Facts.
     """
-    has_alpha = use_alpha and views.pixels.shape[-1] == 4 and not ndc
-    why = bound = ""
-    if is_auto(contracted):
-        contracted, why = _contracted(views, has_alpha, ndc=ndc, world=world)
-    if is_auto(lower) or is_auto(upper):
-        *corners, bound = _box(views, has_alpha, ndc=ndc, contracted=contracted)
-        digits = 4 - math.floor(math.log10(max(corners[1] - corners[0])))
-        found = [tuple(round(float(x), digits) for x in corner) for corner in corners]
-        lower, upper = (new if is_auto(old) else old for new, old in zip(found, (lower, upper), strict=True))
-    facts = Facts(
+    return Facts(
         num_views=len(views.size),
+        num_observations=num_shared(views) if contracted and skips_empty_cells else 0,
         side=float(np.sqrt(np.prod(views.size, axis=1)).mean()),
         footprint=2 / float(np.max(views.size[:, 1])) if ndc else LookAt(views).footprint,
-        footprint_spread=footprint_spread(views) * 2.0 ** (num_scales - 1),
+        footprint_spread=footprint_spread(views),
         has_alpha=has_alpha,
-        ndc=ndc,
-        lower=lower,
-        upper=upper,
-        box_reason=bound,
-        contracted=contracted,
-        contraction_reason=why,
-        sampler=sampler,
-    )
-    if not facts.longest > 0:
-        raise ValueError(f"occupancy.lower is {lower} and occupancy.upper {upper}, expected lower < upper")
-    return facts._replace(
         mean_alpha=float(sample_pixels(views)[:, 3].mean()) if has_alpha else 1.0,
-        num_observations=num_shared(views) if facts.fills_space else 0,
+        ndc=ndc,
+        lower=box[0],
+        upper=box[1],
+        contracted=contracted,
+        skips_empty_cells=skips_empty_cells,
+        **others,
     )
 
 
@@ -138,67 +106,18 @@ def footprint_spread(views: Views) -> float:
     return float(largest / smallest) if smallest > 0 else 1.0
 
 
-def footprint_radii(views: Views, num_scales: int = 1) -> tuple[float, float]:
+def footprint_radii(views: Views) -> tuple[float, float]:
     """Returns the smallest and the largest radius of the pixels' cones, world units, at the `footprints`.
 
     Args:
         views: of the split "train".
-        num_scales: sizes of the images that training draws from, see `DataOptions`.
 
     Returns:
         The radii; the smallest is at least a thousandth of the largest, as a camera may stand at what all look at.
     """
     radii = 2 / math.sqrt(12) * footprints(views)
-    largest = float(radii.max()) * 2.0 ** (num_scales - 1)
+    largest = float(radii.max())
     return max(float(radii.min()), largest / 1000), largest
-
-
-def _contracted(views, has_alpha, *, ndc, world):
-    """Returns whether the box holds all of space, and why."""
-    if ndc:
-        return False, "normalised device coordinates hold everything in view"
-    if world != "around":
-        return False, f"the world is {world!r}"
-    if views.box is not None:
-        side = float(np.max(np.asarray(views.box[1]) - np.asarray(views.box[0])))
-        if side <= _MAX_STATED_BOX * 4 * LookAt(views).inner_half_side:
-            return False, "the dataset states the scene's bounds"
-    if has_alpha:
-        return False, "alpha bounds the object"
-    return True, "nothing bounds the surroundings"
-
-
-def _box(views, use_alpha, *, ndc, contracted):
-    """Returns lower [3], upper [3], and how they were found."""
-    if ndc:
-        return *_ends_of_rays(views), "the bounds of all rays"
-    if views.box is not None and not contracted:
-        return *np.asarray(views.box, np.float64), "as the dataset states"
-    look_at = LookAt(views)
-    if contracted:
-        seen = look_at.inner_half_side
-        half, why = max((seen, "as far as most images show"), (look_at.reach, "where the cameras are"))
-        if half > _MAX_INNER_BOX * seen:
-            half, why = _MAX_INNER_BOX * seen, f"{_MAX_INNER_BOX:g} times as far as most images show"
-        why = f"not contracted within {half:.2g} of its centre, {why}"
-        return look_at.center - 2 * half, look_at.center + 2 * half, why
-    half = look_at.half_size.max()
-    lower, upper = look_at.center - half, look_at.center + half
-    if not use_alpha:
-        return lower, upper, "as large as the images at the point that all cameras look at"
-    return *visual_hull.hull_bounds(views, lower, upper), "the bounds of the visual hull"
-
-
-def _ends_of_rays(views):
-    """Returns lower [3] and upper [3] of all rays: NDC rays are straight, so the corners' rays bound all."""
-    ends = []
-    for index, (height, width) in enumerate(np.asarray(views.size)):
-        corners = np.float32([[0, 0], [width, 0], [0, height], [width, height]])
-        rays = view_rays(views, index, corners, ndc=True)
-        for t in (rays.near, rays.far):
-            ends.append(np.asarray(rays.origins + t[:, None] * rays.directions))
-    ends = np.concatenate(ends)
-    return ends.min(axis=0), ends.max(axis=0)
 
 
 def mean_color(views: Views) -> tuple[float, float, float]:

@@ -202,8 +202,7 @@ def draw_batch(
         rays = dataclasses.replace(rays, radius=rays.radius / rays_per_side)
     stored = views.pixels
     colors = stored.rows[positions] if isinstance(stored, BatchPixels) else stored[index]
-    weight = None if views.loss_weight is None else jnp.asarray(views.loss_weight)[view]
-    batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background), loss_weight=weight)
+    batch = Batch(rays=rays, rgb=pixel_colors(colors, views.background))
     if not extras:
         return keys, batch
     known = {"image_index": view.astype(jnp.int32), "pixel": pixels, "alpha": _alpha(colors)}

@@ -43,7 +43,6 @@ def select_views(views: Views, indices: Sequence[int] | Int[np.ndarray, " N"]) -
         free_depth=None if views.free_depth is None else take(views.free_depth),
         time=None if views.time is None else take(views.time),
         image_index=None if views.image_index is None else take(views.image_index),
-        loss_weight=None if views.loss_weight is None else take(views.loss_weight),
         names=tuple(views.names[index] for index in indices) if views.names else (),
         sparse=None if views.sparse is None else _select_observations(views.sparse, indices),
     )

@@ -24,12 +24,13 @@ from jaxnerf.evaluation.metrics import image_metrics, object_mask, pixel_mask
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
-from jaxnerf.runtime import atomic_files, memory, processes, shards, stages
+from jaxnerf.runtime import atomic_files, devices, memory, processes, shards, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
+from jaxnerf.training.build import load_split
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.config import Config
-from jaxnerf.training.loop import train, train_runs
+from jaxnerf.training.config import Config, read_config
+from jaxnerf.training.loop import train
 from jaxnerf.training.state import TrainState
 
 _REMEDY = "give --overwrite without --shard, or remove it"
@@ -55,38 +56,34 @@ def train_and_evaluate(config: Config, workdir: str | os.PathLike, *, views: Vie
 
 
 def train_many(configs: Sequence[Config], workdirs: Sequence[str | os.PathLike]) -> bool:
-    """Trains several runs in one program and scores each; each workdir then is that of an ordinary run.
+    """Trains and scores several runs one after the other; each workdir then is that of an ordinary run.
 
-    The runs take the same steps at the same time. On an accelerator one vmapped step computes all of them; each result
-    equals that of the run alone up to rounding in float32. On a CPU the runs share the compiled step and the dataset in
-    memory and take their steps in turn, and the results are the same, bit for bit. A time limit holds for all runs
-    together.
+    Runs whose compiled step is the same share it: those that differ in `seed`, which makes an ensemble, and those of
+    datasets with the same shapes whose inferred options agree. Runs of the same dataset read it once. There are no
+    previews and no summaries.
 
     Args:
-        configs: of the runs, see `train_and_evaluate`. They may differ in `seed`, which makes an ensemble, and in
-            `data.dir`: datasets of the same shapes. Options that are inferred from a dataset (`"auto"`), such as the
-            box, must be the same for all; set them where they are not.
-        workdirs: one for each run, made if missing. Runs continue from the newest step that all of them have.
+        configs: of the runs, see `train_and_evaluate`.
+        workdirs: one for each run, made if missing.
 
     Returns:
         Whether all are complete. False: stopped and saved; the same call continues.
 
     Raises:
-        ValueError: as `train_and_evaluate` does, and if the configs or the datasets do not fit into one program.
+        ValueError: as `train_and_evaluate` does, and if there is not one workdir for each config.
     """
-
-    def finish(views):
-        del views
-        try:
-            for config, workdir in zip(configs, workdirs, strict=True):
-                if config.eval.at_end:
-                    _score_newest(workdir)
-        except KeyboardInterrupt:
-            processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
-            return False
-        return True
-
-    return train_runs(configs, workdirs, at_end=finish)
+    if len(configs) != len(workdirs) or not configs:
+        raise ValueError(f"{len(configs)} configs and {len(workdirs)} workdirs, expected a workdir for each run")
+    if len({pathlib.Path(folder).resolve() for folder in workdirs}) < len(workdirs):
+        raise ValueError(f"workdirs {', '.join(map(str, workdirs))}: two are the same, expected one for each run")
+    configs, data, views = [read_config(config) for config in configs], None, None
+    with devices.shared_steps():
+        for config, workdir in zip(configs, workdirs, strict=True):
+            if config.data != data:
+                data, views = config.data, load_split(config, "train")[0]
+            if not train(config, workdir, views=views, at_end=functools.partial(_finish, config, workdir)):
+                return False
+    return True
 
 
 def train_observed(
@@ -98,22 +95,25 @@ def train_observed(
 ) -> bool:
     """Does what `train_and_evaluate` does, and calls a function after each step; see `loop.train`."""
     previews = Previews(workdir)
+    at_end = functools.partial(_finish, config, workdir, previews=previews)
+    return train(config, workdir, views=views, preview=previews.write, at_end=at_end, observe=observe)
 
-    def finish(views):
-        started = time.perf_counter()
-        try:
-            if config.eval.at_end:
-                _score_newest(workdir, previews.evaluated_run)
-            scored = time.perf_counter()
+
+def _finish(config, workdir, views, previews=None):
+    """Scores a run if its config asks for it, and prints the summary of its previews; returns whether it was done."""
+    started = time.perf_counter()
+    try:
+        if config.eval.at_end:
+            _score_newest(workdir, previews and previews.evaluated_run)
+        scored = time.perf_counter()
+        if previews is not None:
             lines = previews.summary(views)
             took = f"{scored - started:.1f} s for scoring, " if config.eval.at_end else ""
             processes.print_once(f"afterwards    {took}{time.perf_counter() - scored:.1f} s for this summary", *lines)
-        except KeyboardInterrupt:
-            processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
-            return False
-        return True
-
-    return train(config, workdir, views=views, preview=previews.write, at_end=finish, observe=observe)
+    except KeyboardInterrupt:
+        processes.print_once("stopped while scoring; the checkpoints are saved, and the same command continues")
+        return False
+    return True
 
 
 def _score_newest(workdir, restore=None):
@@ -252,7 +252,7 @@ def _score_views(run, render, views, folder, shard, predictor):
     sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
     readable = output_images.readable(files, sizes, is_valid=aggregate.is_finished)
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
-    progress, first = metric_log.Progress(len(frames), show=processes.is_first()), True
+    progress, first = stages.Progress(len(frames), show=processes.is_first()), True
     for done, index in enumerate(todo, len(frames) - len(todo) + 1):
         name, (height, width) = views.names[index], (int(value) for value in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)

@@ -29,7 +29,8 @@ class Footprint(NamedTuple):
         focal: px, of the images; the median.
         center: [3] world units, what the cameras look at.
         distance: world units, of the farthest camera from it; infinite in normalised device coordinates.
-        covered: sides of what a ray of training stands for, over those of the pixels of the largest images.
+        covered: the side of what a ray of training stands for, over that of the usual pixel; where the field knows the
+            size of its samples, of the largest pixels but for outliers.
     """
 
     focal: float
@@ -62,11 +63,13 @@ def trained_footprint(run: Any, views: Views) -> Footprint:
     config, look_at = run.experiment.config, LookAt(views)
     sized = "radius" in run.experiment.model.needs  # the field knows the size of its sample
     per_ray = 1 / config.train.rays_per_side  # of a pixel's side
+    focal = _mean_focal(views.cameras.focal)
+    usual = float(np.median(focal))
     return Footprint(
-        focal=float(np.median(_mean_focal(views.cameras.focal))),
+        focal=usual,
         center=look_at.center,
         distance=math.inf if config.data.ndc else float(look_at.distance.max()),
-        covered=2.0 ** (config.data.num_scales - 1) * per_ray if sized else per_ray,
+        covered=per_ray * usual / float(np.quantile(focal, 0.05)) if sized else per_ray,
     )
 
 

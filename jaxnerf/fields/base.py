@@ -16,8 +16,6 @@ from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import SceneFn, Vector
 from jaxnerf.options import Facts
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner, world units
-
 _LEAST_SPREAD = 4.0  # of footprints: those of a hand-held capture differ by up to 1.7, those of four scales by 8
 _CACHE_ROW = 512  # float32 numbers, 2 KiB
 _FEW_RAYS = 16  # with fewer rays, padding by a whole ray costs too much
@@ -37,6 +35,7 @@ class Field(NamedTuple):
         regularizers: by the name of a registered loss, the function (params) -> scalar; see `register_loss`.
         color_layers: keys of params: the first layers that serve colour alone; empty: not checked. A field is dead,
             too, if no gradient reaches these layers.
+        network: what has the parameters, for tools that write it in another form; None: they cannot.
         apply_in_fixed_order: `apply`, with a gradient whose sums have a fixed order on an accelerator, too; None: those
             of `apply` have.
     """
@@ -46,6 +45,7 @@ class Field(NamedTuple):
     input_layers: tuple[str, ...] = ()
     regularizers: Mapping[str, Callable[[Any], jax.Array]] = {}
     color_layers: tuple[str, ...] = ()
+    network: Any = None
     apply_in_fixed_order: Callable[..., tuple[jax.Array, jax.Array]] | None = None
 
 

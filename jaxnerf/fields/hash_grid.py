@@ -16,10 +16,10 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector
-from jaxnerf.fields.base import Box, Field, apply_network, infer_prefilter
+from jaxnerf.fields.base import Field, apply_network, infer_prefilter
 from jaxnerf.fields.hash_interpolation import TableLevel, interpolate, stored, transposed_product
 from jaxnerf.fields.mlp import Dense
-from jaxnerf.options import Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
+from jaxnerf.options import Box, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
 
 _glorot = linen.initializers.glorot_uniform()
@@ -88,7 +88,7 @@ class HashGridOptions(Options):
     prefilter: bool = option(
         "auto",
         "Whether the features of cells that are smaller than a pixel's footprint are damped (arXiv:2304.06706, Eq. 6). "
-        "auto: where the footprints of the training images, those of `data.num_scales` included, differ by 4 or more.",
+        "auto: where the footprints of the training images differ by 4 or more.",
         auto=True,
     )
     compute_dtype: str = option(
@@ -129,7 +129,7 @@ class HashGridOptions(Options):
         line = f"precision     {dtype} in the layers of the hash grid's networks, for this device"
         return infer(self, compute_dtype=(dtype, line))
 
-    def bytes_needed(self) -> dict[str, float]:
+    def bytes_needed(self, box: Box | None) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
         table, width, view_width, view_depth = (
             1 if is_auto(value) else value for value in (self.table_size, self.width, self.view_width, self.view_depth)
@@ -187,6 +187,7 @@ def hash_grid_field(**options: Any) -> Field:
         _scene_of(network),
         regularizers=regularizers,
         color_layers=color_layers,
+        network=network,
         apply_in_fixed_order=_scene_of(network.clone(fixed_order=True)),
     )
 
@@ -211,7 +212,7 @@ def from_options(options: HashGridOptions, box: Box | None) -> Field:
     """Makes the field "hash_grid" from its options, in the scene's box."""
     if box is None:
         raise ValueError(
-            "the box of occupancy.lower and occupancy.upper is 'auto'; resolve the config against a dataset, or set it"
+            "scene.lower or scene.upper is 'auto', expected the scene's box; resolve the config, or set both"
         )
     values = {**dataclasses.asdict(options), "compute_dtype": _COMPUTE_DTYPES[options.compute_dtype]}
     return hash_grid_field(lower=box[0], upper=box[1], **values)

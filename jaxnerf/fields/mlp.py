@@ -12,8 +12,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.encoding import encode_planes, frustum_variance
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
-from jaxnerf.fields.base import Box, Field, apply_network, infer_prefilter
-from jaxnerf.options import DTYPES, Device, Facts, Options, at_least, between, infer, is_auto, option
+from jaxnerf.fields.base import Field, apply_network, infer_prefilter
+from jaxnerf.options import DTYPES, Box, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Part
 
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
@@ -27,6 +27,8 @@ DENSITY_ACTIVATIONS = {"relu": jax.nn.relu, "softplus": jax.nn.softplus}
 @dataclasses.dataclass(frozen=True)
 class MlpOptions(Options):
     """The options of the paper's network (Fig. 7): 595,844 parameters."""
+
+    needs_box = False
 
     depth: int = option(8, "layers before the density", range=between(1, _MAX_LAYERS))
     width: int = option(256, "outputs of a layer", range=at_least(1))
@@ -65,13 +67,13 @@ class MlpOptions(Options):
             prefilter=(prefilter, f"prefilter     {'on' if prefilter else 'off'} in {{section}}: {why}"),
         )
 
-    def check(self) -> None:
+    def check(self, box: Box | None = None) -> None:
         if self.compute_dtype == "float64" and not jax.config.jax_enable_x64:
             raise ValueError("compute_dtype is 'float64', which requires the environment's JAX_ENABLE_X64=1")
         if self.prefilter and not is_auto(self.prefilter) and not self.encode:
             raise ValueError("prefilter is True and encode False, which leaves no encoding to average; set one of them")
 
-    def bytes_needed(self) -> dict[str, float]:
+    def bytes_needed(self, box: Box | None) -> dict[str, float]:
         """Returns those of parameters, gradients and the optimizer, at least."""
         return {"width": 16 * self.width * (self.width * self.depth + self.view_width)}
 

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import jax
 
 from jaxnerf.core.types import Background, Rendering, SceneFn
-from jaxnerf.fields.base import Box, Field
+from jaxnerf.fields.base import Field
 from jaxnerf.models.grid_schedule import GridSchedule
-from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
+from jaxnerf.options import BELOW_ONE, POSITIVE, Box, Changes, Device, Facts, Options, at_least, infer, option
 
+FINAL_NETWORK = "fine"  # the network of the final rendering, whose field the config names
 _SAMPLE_MULTIPLIER = 1.5  # samples of images over those of training: no jitter averages over a step in rendering
 
 
@@ -80,7 +81,7 @@ class Model(NamedTuple):
     scene: Callable[..., SceneFn]
     samples_per_ray: float
     fields: Mapping[str, Field] = {}
-    image_networks: tuple[str, ...] = ("fine",)
+    image_networks: tuple[str, ...] = (FINAL_NETWORK,)
     grid_schedule: GridSchedule | None = None
     cull: Callable[..., tuple] | None = None
     needs: tuple[str, ...] = ()
@@ -91,10 +92,12 @@ class SamplerContext(NamedTuple):
 
     Attributes:
         options: of the sampler: an instance of its registered class, or the section of its name as a dict.
-        make_field: name of a network ("fine" or "coarse") -> its Field, as the config describes it.
+        make_field: name of a network -> its Field, as the config describes it: that of FINAL_NETWORK, or one of the
+            networks that the sampler declares, see `Part`.
         view: the options of images.
         background: [3] colour behind the scene; None: black.
-        box: lower and upper corner of what the run renders, world units; None where the run has none.
+        box: lower and upper corner of the scene, world units; None where the config has none yet.
+        contracted: whether the box holds all of space.
         fixed_order: whether the sums of training must have a fixed order on an accelerator, see `render_placed`; those
             of the fields then have it.
     """
@@ -104,4 +107,5 @@ class SamplerContext(NamedTuple):
     view: ViewOptions
     background: Background | None
     box: Box | None
+    contracted: bool = False
     fixed_order: bool = False

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnerf.core.loops import is_cpu
 from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, update_grid
 from jaxnerf.fields.base import Field, field_scene
 
@@ -38,6 +39,7 @@ class GridSchedule(NamedTuple):
         create: (valid, empty=None) -> OccupancyGrid, see InitialCells.
         update: (key, step, params, OccupancyGrid, cells [L] int32, radii=None) -> OccupancyGrid, see `update_grid`.
         contracted: see OccupancyGrid.
+        min_views: training views that must see a valid cell; 0: no limit.
     """
 
     lower: Corner
@@ -48,6 +50,7 @@ class GridSchedule(NamedTuple):
     create: Callable[..., OccupancyGrid]
     update: Callable[..., OccupancyGrid]
     contracted: bool = False
+    min_views: int = 0
 
     @property
     def cell(self) -> Corner:
@@ -76,10 +79,11 @@ def make_grid_schedule(
     field: Field | None,
     threshold: float,
     update_every: int,
-    cells_per_update: int,
     contracted: bool = False,
+    min_views: int = 0,
+    cells_per_update: int = 2**18,
     initial_passes: int = 8,
-    update_chunk: int = 8160,
+    update_chunk: int | None = None,
 ) -> GridSchedule:
     """Makes the GridSchedule of a box.
 
@@ -90,11 +94,12 @@ def make_grid_schedule(
         field: Field whose density with params["fine"] updates the grid. None if the grid is never updated.
         threshold: opacity of one step below which a cell is empty.
         update_every: training steps between updates.
+        contracted: whether the box holds all of space, see OccupancyGrid.
+        min_views: see GridSchedule.
         cells_per_update: cells in one update. If there are more cells, updates are more frequent at first, until each
             cell has been updated initial_passes times; until then neighbours of dense cells are occupied, too.
-        contracted: whether the box holds all of space, see OccupancyGrid.
         initial_passes: see cells_per_update.
-        update_chunk: cells of an update that are evaluated at once.
+        update_chunk: cells of an update that are evaluated at once; None: as many as suit the device.
 
     Raises:
         ValueError: if threshold or step_size is not above 0.
@@ -103,6 +108,9 @@ def make_grid_schedule(
         raise ValueError(
             f"occupancy.threshold is {threshold} and occupancy.step_size {step_size}, expected both above 0"
         )
+    if update_chunk is None:
+        # On a CPU a little under a power of two, so that activations do not collide in the cache.
+        update_chunk = 8160 if is_cpu() else 2**18
     sides = [high - low for low, high in zip(lower, upper, strict=True)]
     shape = tuple(max(round(side / max(sides) * resolution), 1) for side in sides)
     density, spacings = threshold / step_size, _spacings(step_size, shape, contracted)
@@ -148,7 +156,7 @@ def make_grid_schedule(
 
         return jax.lax.cond(step % interval == interval - 1, updated, lambda: grid)
 
-    return GridSchedule(tuple(lower), tuple(upper), shape, step_size, threshold, create, update, contracted)
+    return GridSchedule(tuple(lower), tuple(upper), shape, step_size, threshold, create, update, contracted, min_views)
 
 
 def _spacings(step_size, shape, contracted):

@@ -10,6 +10,7 @@ from jaxnerf.core.rendering import render_hierarchical, render_rays
 from jaxnerf.core.sampling import split_key
 from jaxnerf.core.types import Background, without_samples
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
+from jaxnerf.fields.mlp import FIELD as MLP
 from jaxnerf.models.base import Model, SamplerContext
 from jaxnerf.options import Options, at_least, option
 from jaxnerf.registry import Part
@@ -18,6 +19,8 @@ from jaxnerf.registry import Part
 @dataclasses.dataclass(frozen=True)
 class HierarchicalOptions(Options):
     """The options of the sampler "hierarchical"."""
+
+    needs_box = False
 
     num_coarse: int = option(64, "samples per ray for the coarse network", range=at_least(1))
     num_fine: int = option(
@@ -35,6 +38,14 @@ class HierarchicalOptions(Options):
         0.0, "standard deviation of the noise on the density in training", unit="1 / world unit", range=at_least(0)
     )
 
+    def check_unused(self, sampler: str) -> None:
+        for name, value, other in (("density_noise", self.density_noise, 0.0), ("stratified", self.stratified, True)):
+            if value != other:
+                raise ValueError(
+                    f"{name} is {value}, which the sampler {sampler!r} does not read; set it to {other}, or use the "
+                    "sampler 'hierarchical'"
+                )
+
 
 def from_context(context: SamplerContext) -> Model:
     """Makes the model that the options describe; with `num_fine` 0 it has one network, "fine"."""
@@ -45,7 +56,7 @@ def from_context(context: SamplerContext) -> Model:
     )
 
 
-SAMPLER = Part(from_context, HierarchicalOptions, section="sampling")
+SAMPLER = Part(from_context, HierarchicalOptions, section="sampling", networks={"coarse": MLP})
 
 
 def hierarchical_model(

@@ -24,6 +24,7 @@ from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 from jaxnerf.options import (
     FRACTION,
     POSITIVE,
+    Box,
     Changes,
     Device,
     Facts,
@@ -32,7 +33,6 @@ from jaxnerf.options import (
     between,
     infer,
     is_auto,
-    numbers,
     option,
 )
 from jaxnerf.registry import Part
@@ -55,26 +55,14 @@ _POOL = between(0.01, 100_000)
 
 @dataclasses.dataclass(frozen=True)
 class OccupancyOptions(Options):
-    """The options of the sampler "occupancy"; the box also bounds the hash grid."""
+    """The options of the sampler "occupancy"."""
 
-    use_alpha: bool = option(
-        True, "whether cells outside the visual hull of the alpha channels are empty from the start"
-    )
-    contracted: bool = option(
-        "auto", "whether the box holds all of space; positions outside its inner half are then contracted", auto=True
-    )
-    lower: tuple[float, ...] = option("auto", "a corner of the box", unit="world units", auto=True, check=numbers(3))
-    upper: tuple[float, ...] = option(
-        "auto", "the opposite corner of the box", unit="world units", auto=True, check=numbers(3)
-    )
+    skips_empty_cells = True
+
     step_size: float = option("auto", "distance of samples", unit="world units", range=POSITIVE, auto=True)
     resolution: int = option("auto", "cells along the longest side", range=at_least(1), auto=True)
     threshold: float = option(0.01, "opacity over one step below which a cell is empty", range=at_least(0))
     update_every: int = option(64, "training steps between updates of the grid", range=at_least(1))
-    cells_per_update: int = option(2**18, "cells whose density an update evaluates", range=at_least(1))
-    update_chunk: int = option(
-        "auto", "cells of these evaluated at once", range=at_least(1), auto=True, changes=Changes.SPEED
-    )
     pool_samples_per_ray: float = option(
         10.0,
         "size of the sample buffer in training, divided by the number of rays. auto: on a CPU "
@@ -98,58 +86,44 @@ class OccupancyOptions(Options):
     )
 
     def resolve(self, facts: Facts, device: Device) -> tuple["OccupancyOptions", list[str]]:
-        """Infers the box, its cells and the step from what cameras and images show, the buffer from the device."""
-        contraction = f"contraction   {'on' if facts.contracted else 'off'}: {facts.contraction_reason}"
-        box = f"box           {_point(facts.lower)} to {_point(facts.upper)}, {facts.box_reason}"
+        """Infers cells and step from the scene's box and what images show, the buffer from the device."""
+        samples = self._samples_per_ray
+        if not device.is_cpu:
+            samples = float(min(max(_ACCELERATOR_SAMPLES / facts.batch_size, samples), 2 * samples))
         options, lines = infer(
             self,
-            contracted=(facts.contracted, contraction),
-            lower=(facts.lower, box),
-            upper=(facts.upper, "" if is_auto(self.lower) else box),
             min_views=(int(facts.fills_space), "valid cells   those that a training view sees" * facts.fills_space),
             resolution=_resolution(facts),
+            pool_samples_per_ray=(samples, f"batch         at most {samples:g} samples per ray on average"),
         )
         options, more = infer(options, step_size=_step_size(facts, options.resolution))
-        lines += more
-        if facts.batch_size:
-            samples = options._samples_per_ray
-            if not device.is_cpu:
-                samples = float(min(max(_ACCELERATOR_SAMPLES / facts.batch_size, samples), 2 * samples))
-            used = facts.sampler == "occupancy"
-            line = f"batch         at most {samples:g} samples per ray on average" * used
-            options, more = infer(options, pool_samples_per_ray=(samples, line))
-            lines += more
-        return options, lines
+        return options, lines + more
 
-    def resolve_for_device(self, device: Device) -> tuple["OccupancyOptions", list[str]]:
-        """Infers how many cells an update evaluates at once."""
-        # On a CPU a little under a power of two, so that activations do not collide in the cache.
-        cells = 8160 if device.is_cpu else 2**18
-        line = f"grid          {cells} cells evaluated at once in an update, for this device"
-        return infer(self, update_chunk=(cells, line))
-
-    def check(self) -> None:
-        if is_auto(self.lower) or is_auto(self.upper) or is_auto(self.step_size):
+    def check(self, box: Box | None = None) -> None:
+        if box is None or is_auto(self.step_size):
             return
-        longest = max(self._sides)
+        longest = max(_sides(box))
         if longest > _MAX_STEPS_PER_SIDE * self.step_size:
             raise ValueError(
                 f"step_size is {self.step_size}, expected at least {longest / _MAX_STEPS_PER_SIDE:.3g}: the "
                 f"longest side of the box, {longest:.3g}, in at most {_MAX_STEPS_PER_SIDE:,} steps; correct it"
             )
 
-    def bytes_needed(self) -> dict[str, float]:
+    def bytes_needed(self, box: Box | None) -> dict[str, float]:
         """Returns those of the grid."""
-        sides = (1.0, 1.0, 1.0) if is_auto(self.lower) or is_auto(self.upper) else self._sides
+        sides = [1.0, 1.0, 1.0] if box is None else _sides(box)
         if is_auto(self.resolution) or min(sides) <= 0:
             return {}
         return {"resolution": 10 * self.resolution**3 * math.prod(sides) / max(sides) ** 3}
 
-    def busy_rays(self, device: Device) -> int | None:
-        """Returns as many rays as fill the buffer of an accelerator."""
-        if device.is_cpu:
-            return None
-        return 2 ** max(math.floor(math.log2(_ACCELERATOR_SAMPLES / self._samples_per_ray)), 0)
+    def rays_per_step(self, cpu_rays: int, device: Device, *, large_field: bool) -> tuple[int, str]:
+        """Returns as many rays as fill the buffer of an accelerator; on a CPU more where the field is large."""
+        if not device.is_cpu:
+            rays = 2 ** max(math.floor(math.log2(_ACCELERATOR_SAMPLES / self._samples_per_ray)), 0)
+            return rays, "they keep this device busy"
+        if large_field:
+            return 2 * cpu_rays, "twice train.cpu_batch_size, as the hash grid's table is large"
+        return cpu_rays, "train.cpu_batch_size"
 
     def rays_per_chunk(self, device: Device) -> int:
         """Returns as many rays as fill the buffer, and not much more than a small image needs."""
@@ -160,9 +134,9 @@ class OccupancyOptions(Options):
         pool = self.pool_samples_per_ray
         return self.cpu_pool_samples_per_ray if is_auto(pool) else pool
 
-    @property
-    def _sides(self):
-        return [high - low for low, high in zip(self.lower, self.upper, strict=True)]
+
+def _sides(box):
+    return [high - low for low, high in zip(*box, strict=True)]
 
 
 def _resolution(facts):
@@ -182,14 +156,10 @@ def _step_size(facts, resolution):
     return step, f"step size     {step:.4g}; a pixel covers {facts.footprint:.4g} world units"
 
 
-def _point(point):
-    return "(" + ", ".join(f"{value:.2f}" for value in point) + ")"
-
-
 def from_context(context: SamplerContext) -> Model:
     """Makes the model that the options describe."""
     field = context.make_field("fine")
-    schedule = schedule_of(context.options, field)
+    schedule = schedule_of(context.options, context.box, field, contracted=context.contracted)
     given = {"background": context.background, "fixed_order": context.fixed_order}
     return occupancy_model(field, schedule, context.options, context.view, **given)
 
@@ -197,19 +167,26 @@ def from_context(context: SamplerContext) -> Model:
 SAMPLER = Part(from_context, OccupancyOptions, section="occupancy")
 
 
-def schedule_of(options: OccupancyOptions, field: Field | None) -> GridSchedule:
-    """Makes the GridSchedule that resolved options describe; field: None without updates."""
+def schedule_of(options: OccupancyOptions, box: Box | None, field: Field | None, *, contracted: bool) -> GridSchedule:
+    """Makes the GridSchedule that resolved options describe.
+
+    Args:
+        options: resolved.
+        box: of the scene; a ValueError is raised without one.
+        field: that updates the grid; None: there are no updates.
+        contracted: whether the box holds all of space.
+    """
+    if box is None:
+        raise ValueError("scene.lower or scene.upper is 'auto'; resolve the config against a dataset, or set both")
     return make_grid_schedule(
-        options.lower,
-        options.upper,
+        *box,
         resolution=options.resolution,
         step_size=options.step_size,
         field=field,
         threshold=options.threshold,
         update_every=options.update_every,
-        cells_per_update=options.cells_per_update,
-        contracted=options.contracted,
-        update_chunk=options.update_chunk,
+        contracted=contracted,
+        min_views=options.min_views,
     )
 
 

@@ -1,4 +1,4 @@
-"""Devices: the same training step under jit, sharded jit and pmap.
+"""Devices: the same training step under jit on one device, and under sharded jit on several.
 
 With several processes (see `processes.cluster`) the devices are those of all processes. Each process reads all
 training views and copies them to each of its devices, because any ray may come from any pixel. The pixel depends
@@ -7,8 +7,9 @@ renders and differentiates the rays of its own devices; gradients are summed ove
 process writes config.json and metrics.jsonl and prints; all take part in a checkpoint.
 """
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -19,9 +20,26 @@ from jax.sharding import Mesh, NamedSharding, SingleDeviceSharding
 from jax.sharding import PartitionSpec as P
 
 from jaxnerf.runtime import memory, processes
+from jaxnerf.runtime.fingerprint import fingerprint
 
-MODES = ("auto", "jit", "sharded", "pmap")
 CPU_MICROBATCH_SAMPLES = 12_288  # the fastest in experiments/speed: activations stay in the cache
+_MAX_SHARED = 4  # a run compiles at most two: of one step, and of several in a dispatch
+_shared: dict[Any, Any] | None = None  # compiled steps, by what they were compiled from; None: they are not shared
+
+
+@contextlib.contextmanager
+def shared_steps() -> Iterator[None]:
+    """Lets runs that train one after the other share compiled steps.
+
+    Inside, `compile_step` compiles equal programs once. Runs have equal programs if they differ in what is data only:
+    the seed, images and cameras of the same shapes, the number of steps.
+    """
+    global _shared
+    _shared = {}
+    try:
+        yield
+    finally:
+        _shared = None
 
 
 def compile_step(
@@ -31,7 +49,7 @@ def compile_step(
     *,
     batch_size: int,
     microbatch_size: int | None = None,
-    mode: str = "auto",
+    devices: Sequence[jax.Device] | None = None,
 ) -> tuple[Callable[..., tuple], Any, Any]:
     """Compiles a training step for the devices, and places its state and data there.
 
@@ -43,30 +61,23 @@ def compile_step(
         data: what the step draws from; copied to every device. The same in all processes.
         batch_size: rays per step, over all devices of all processes.
         microbatch_size: rays whose gradient is computed at once; None, or more than a device has: all of them.
-        mode: "jit" (one device), "sharded" (jit over a mesh of all devices), "pmap", or "auto": jit on one
-            device, otherwise sharded.
+        devices: of all processes; None: all. On several the step is jitted over a mesh of them.
 
     Returns:
-        run, state, data: run(state, data) -> (state, metrics) consumes its state; run.compiled is what JAX
-        compiled, with its memory_analysis() and as_text(), except for pmap in several processes.
+        step, state, data: step(state, data) -> (state, metrics) consumes its state; step.compiled is what JAX
+        compiled, with its memory_analysis() and as_text().
 
     Raises:
-        ValueError: if the batch does not split evenly, the processes' data differ, or on an unknown mode.
+        ValueError: if the batch does not split evenly, or the processes' data differ.
         memory.OutOfMemory: if the step needs more memory than is free.
     """
-    devices = devices_of(mode)
+    devices = jax.devices() if devices is None else devices
     positions = split_positions(batch_size, len(devices), microbatch_size)
     mesh = Mesh(np.array(devices), ("batch",))
-    single = mode == "jit" or (mode == "auto" and len(devices) == 1)
+    single = len(devices) == 1
     everywhere = SingleDeviceSharding(devices[0]) if single else NamedSharding(mesh, P())
     if single:
         jitted, positions = jax.jit(train_step, donate_argnums=0), jnp.asarray(positions[0])
-    elif mode == "pmap":
-        axes = {"in_axes": (None, None, 0), "out_axes": None}
-        step = functools.partial(train_step, axis_name="batch")
-        jitted = jax.pmap(step, "batch", devices=devices, donate_argnums=0, **axes)
-        local = [index for index, device in enumerate(devices) if device.process_index == jax.process_index()]
-        positions = positions[local]
     else:
         jitted = _sharded(train_step, mesh)
         positions = place(positions, NamedSharding(mesh, P("batch")))
@@ -79,20 +90,29 @@ def compile_step(
     create = unoptimized(state, devices[0]) if callable(state) else make
     with ThreadPoolExecutor(1) as pool:
         made = None if devices[0].platform == "cpu" else pool.submit(create)
-        if mode == "pmap" and jax.process_count() > 1:  # JAX compiles this at the first call only
-            compiled = _with_global_state(jitted, everywhere)
-        else:
-            compiled = jitted.lower(shapes, data, positions).compile()
-            memory.check(compiled)
+        compiled = _compiled(jitted.lower(shapes, data, positions), devices)
+        memory.check(compiled)
         memory.release()
         state = place(processes.broadcast(made.result() if made else create()), everywhere)
     memory.release()
 
-    def run(state, data):
+    def step(state, data):
         return compiled(state, data, positions)
 
-    run.compiled = compiled
-    return run, state, data
+    step.compiled = compiled
+    return step, state, data
+
+
+def _compiled(lowered, devices):
+    """Returns a lowered step compiled, or the one that has been compiled from the same program for the same devices."""
+    if _shared is None:
+        return lowered.compile()
+    key = fingerprint(lowered.as_text()), lowered.in_tree, lowered.out_tree, tuple(devices)
+    if key not in _shared:
+        if len(_shared) == _MAX_SHARED:
+            _shared.clear()
+        _shared[key] = lowered.compile()
+    return _shared[key]
 
 
 def _sharded(train_step, mesh):
@@ -118,20 +138,6 @@ def unoptimized(function, device):
     return functools.partial(jax.jit(lambda bound: bound(), compiler_options=options), bound)
 
 
-def _with_global_state(run, everywhere):
-    """Returns the pmapped step with its state on the devices of all processes; pmap returns it on the local ones."""
-
-    def to_global(leaf):
-        parts = [shard.data for shard in leaf.addressable_shards]
-        return jax.make_array_from_single_device_arrays(leaf.shape, everywhere, parts)
-
-    def compiled(state, data, positions):
-        state, metrics = run(state, data, positions)
-        return jax.tree.map(to_global, state), metrics
-
-    return compiled
-
-
 def place(tree: Any, sharding: jax.sharding.Sharding) -> Any:
     """Places arrays on the devices of a sharding; other processes that own some of them have the same tree."""
     if sharding.is_fully_addressable:
@@ -142,15 +148,6 @@ def place(tree: Any, sharding: jax.sharding.Sharding) -> Any:
         return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
 
     return jax.tree.map(put, tree)
-
-
-def devices_of(mode: str) -> list[jax.Device]:
-    """Returns the devices, of all processes, that a mode uses; raises ValueError on an unknown mode."""
-    if mode not in MODES:
-        raise ValueError(f"train.parallel is {mode!r}, expected one of {MODES}")
-    if mode == "jit" and jax.process_count() > 1:
-        raise ValueError(f"train.parallel is 'jit' in {jax.process_count()} processes; set it to 'auto'")
-    return jax.devices()[: 1 if mode == "jit" else None]
 
 
 def default_microbatch(rays: int, samples_per_ray: float, platform: str) -> int:

@@ -8,11 +8,6 @@ from typing import Any
 
 import jax
 
-from jaxnerf.core.occupancy.ray_culling import render_selected
-from jaxnerf.core.rendering import render_image
-from jaxnerf.core.types import Rays, Rendering
-from jaxnerf.runtime import stages
-
 _HOST_FRACTION = 0.8  # of the host's free memory that a program may take; if it takes more, the system kills processes
 _AMPLE = 0.5  # of the free memory: a program that needs less will not fail for want of it
 _MARGIN = 0.9  # part of what a program needs does not scale with the size of its parts
@@ -131,79 +126,34 @@ def fit_step(
     except for rounding.
 
     Args:
-        compile_step: (state, data, microbatch size) -> run, state, data; see `devices.compile_step`.
+        compile_step: (state, data, microbatch size) -> step, state, data; see `devices.compile_step`.
         state, data: see `devices.compile_step`.
         microbatch_size: rays.
     """
     options = {"cause": "training step", "unit": "rays per microbatch (--batch)", "divisors": True}
     if jax.process_count() > 1:
         options["least"] = microbatch_size  # all processes run the same program, so one cannot change it
-    (run, state, data), size = back_off(lambda size: compile_step(state, data, size), microbatch_size, **options)
-    needed, free = _needed(getattr(run, "compiled", None)), available()
+    (step, state, data), size = back_off(lambda size: compile_step(state, data, size), microbatch_size, **options)
+    needed, free = _needed(getattr(step, "compiled", None)), available()
     if needed is not None and free is not None and needed < _AMPLE * free:
-        return run, state, data
+        return step, state, data
     tried = False
 
-    def run_once_or_retry(state, data):
-        nonlocal run, size, tried
+    def step_or_retry(state, data):
+        nonlocal step, size, tried
         if tried:
-            return run(state, data)
+            return step(state, data)
         kept = jax.device_get(state)  # a step consumes its state, even if it fails
 
         def attempt(new_size):
-            nonlocal run
+            nonlocal step
             given = state, data
             if new_size != size:
-                run, *given = compile_step(kept, data, new_size)
-            return jax.block_until_ready(run(*given))
+                step, *given = compile_step(kept, data, new_size)
+            return jax.block_until_ready(step(*given))
 
         result, size = back_off(attempt, size, **options)
         tried = True
         return result
 
-    return run_once_or_retry, state, data
-
-
-def image_renderer(
-    render: Callable[[Any, Rays], Rendering], default: int, cull: Callable[..., tuple] | None = None
-) -> Callable[..., Rendering]:
-    """Makes the function (variables, rays [...], chunk=None) -> Rendering [...], in chunks that fit into memory.
-
-    Args:
-        render: (variables, Rays [N]) -> Rendering [N], jitted.
-        default: rays per chunk where none are given. An image with fewer rays has one chunk of about its size.
-        cull: (variables, Rays [...]) -> bool [...], which rays to render, and the Rendering of the others;
-            None: all are rendered.
-    """
-    fitting = {}  # requested chunk -> the one that fits
-    checked = set()
-
-    def image(variables, rays, chunk=None):
-        requested = min(default if chunk is None else chunk, 1 << (rays.near.size - 1).bit_length())
-        key = requested, _shapes(variables)
-
-        def attempt(size):
-            def part(rays):
-                if (size, key) not in checked:
-                    # For the arrays themselves, not only their shapes: the call would compile again for arrays that are
-                    # bound to a device.
-                    check(render.lower(variables, rays).compile())
-                    release()
-                    checked.add((size, key))
-                return render(variables, rays)
-
-            if cull is None:
-                return jax.block_until_ready(render_image(part, rays, chunk=size))
-            return jax.block_until_ready(render_selected(part, rays, *cull(variables, rays), chunk=size))
-
-        with stages.stage("rendering an image"):
-            result, fitting[key] = back_off(
-                attempt, fitting.get(key, requested), cause="image", unit="rays per chunk (--chunk)"
-            )
-        return result
-
-    return image
-
-
-def _shapes(tree):
-    return tuple((leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(tree))
+    return step_or_retry, state, data

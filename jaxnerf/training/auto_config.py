@@ -8,6 +8,7 @@ import jax
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.facts import dataset_facts
+from jaxnerf.data.scene import bounded_by_alpha, resolve_background, resolve_scene
 from jaxnerf.options import Changes, Device, Facts, changing, is_auto, replaced
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.runtime.processes import Detail
@@ -41,8 +42,9 @@ class Resolved(NamedTuple):
 def resolve(config: Config, views: Views | None = None, *, platform: str | None = None) -> Resolved:
     """Resolves a config against its dataset; explicit values are never changed.
 
-    Options of Changes.SPEED stay "auto"; see `resolve_for_device`. Sections that a run does not use are resolved, too:
-    evaluation may use them later, as `eval.bake_occupancy` does.
+    The order is that in which parts depend on each other: the dataset, the scene's box, the field, training, the
+    sampler, all others. Options of Changes.SPEED stay "auto"; see `resolve_for_device`. Sections that a run does not
+    use are resolved, too: evaluation may use them later, as `eval.bake_occupancy` does.
 
     Args:
         config: of a run.
@@ -58,30 +60,42 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     data, lines, capture = dataset.resolve(config.data)
     if views is None:
         views = dataset.load_split(data, "train", capture=capture, fingerprint=config.fingerprint)
-    config = replaced(config, data=data, fingerprint=config.fingerprint or dataset.fingerprint(data, capture))
-    facts = _facts(config, views)
-    samplers = [SAMPLERS.get(name).section or name for name in SAMPLERS.names()]
-    others = [name for name in config.sections() if name not in (*samplers, "data", "train")]
-    config = _resolve_sections(config, [*samplers, *others], facts, device, lines)
-    field, sampler = (
-        config.options_of(registry.get(name), name)
-        for registry, name in ((FIELDS, config.field), (SAMPLERS, config.sampler))
-    )
-    facts = facts._replace(
-        large_field=getattr(field, "is_large", False),
-        factor=config.data.factor,
+    fingerprint = config.fingerprint or dataset.fingerprint(data, capture)
+    sampler = config.declared_by(SAMPLERS)
+    has_alpha = bounded_by_alpha(config.scene, views, ndc=data.ndc)
+    # A box only for rendering holds all that cameras see.
+    has_alpha &= config.has_box
+    scene, found = resolve_scene(config.scene, views, ndc=data.ndc, world=data.world, has_alpha=has_alpha)
+    if config.has_box or config.eval.bake_occupancy:
+        lines += map(Detail, found)
+    facts = dataset_facts(
+        views,
+        scene.box,
+        ndc=data.ndc,
+        contracted=scene.contracted,
+        has_alpha=has_alpha,
+        factor=data.factor,
+        skips_empty_cells=sampler.skips_empty_cells,
         trains_cameras=config.cameras.any,
-        busy_rays=sampler.busy_rays(device) if hasattr(sampler, "busy_rays") else None,
     )
-    config = _resolve_sections(config, ["train"], facts, device, lines)
-    facts = facts._replace(batch_size=config.train.batch_size)
-    config = _resolve_sections(config, samplers, facts, device, lines)
-    data, views, more = dataset.resolve_for_scene(config.data, views, fills_space=facts.fills_space)
-    config = replaced(config, data=data, losses=_resolve_losses(config.losses, facts, lines))
+    scene, more = resolve_background(scene, views, behind_alpha=data.background, fills_space=facts.fills_space)
+    data, views, near = dataset.resolve_near(data, views, fills_space=facts.fills_space)
+    config = replaced(config, data=data, scene=scene, fingerprint=fingerprint)
+    samplers = [SAMPLERS.get(name).section or name for name in SAMPLERS.names()]
+    fields = [name for name in config.parts if name not in samplers]
+    others = [name for name in config.sections() if name not in (*fields, *samplers, "data", "scene", "train")]
+    config = _resolve_sections(config, fields, facts, device, lines)
+    rays, why = sampler.rays_per_step(
+        config.train.cpu_batch_size, device, large_field=config.declared_by(FIELDS).is_large
+    )
+    batch = rays if is_auto(config.train.batch_size) else config.train.batch_size
+    facts = facts._replace(rays_per_step=rays, rays_reason=why, batch_size=batch)
+    config = _resolve_sections(config, ["train", *samplers, *others], facts, device, lines)
+    config = replaced(config, losses=_resolve_losses(config.losses, facts, lines))
     left = [name for name in auto_fields(config) if name not in device_fields(config)]
     if left:
         raise ValueError(f"{left[0]} is 'auto', which is not inferred for this field; set a value")
-    return Resolved(config, views, lines + more)
+    return Resolved(config, views, lines + more + near)
 
 
 def resolve_for_device(config: Config, platform: str | None = None) -> tuple[RunConfig, list[str]]:
@@ -99,9 +113,7 @@ def resolve_for_device(config: Config, platform: str | None = None) -> tuple[Run
     """
     config, lines = read_config(config), []
     device = Device(platform or jax.default_backend(), jax.process_count())
-    sampler = config.options_of(SAMPLERS.get(config.sampler), config.sampler)
-    if hasattr(sampler, "rays_per_chunk"):
-        device = device._replace(chunk=sampler.rays_per_chunk(device))
+    device = device._replace(chunk=config.declared_by(SAMPLERS).rays_per_chunk(device))
     others = [name for name in config.sections() if name != "train"]
     config = _resolve_sections(config, others, None, device, lines)
     if is_auto(config.train.microbatch_size) and not is_auto(config.train.batch_size):
@@ -129,24 +141,6 @@ def fill_from(config: Config, resolved: Config) -> RunConfig:
     return replaced(changed(config, {name: values[name] for name in names}), fingerprint=resolved.fingerprint)
 
 
-def _facts(config, views):
-    paper = config.sampler == "hierarchical" and config.field == "mlp"  # has no box
-    occupancy = config.occupancy
-    return dataset_facts(
-        views,
-        ndc=config.data.ndc,
-        world=config.data.world,
-        # Alpha bounds the box of a field that is defined in it, unless the scene moves: no image then shows where all
-        # of it ever is. A box only for rendering holds all that cameras see.
-        use_alpha=occupancy.use_alpha and not paper and views.time is None,
-        sampler=config.sampler,
-        contracted=occupancy.contracted,
-        lower=occupancy.lower,
-        upper=occupancy.upper,
-        num_scales=config.data.num_scales,
-    )
-
-
 def _resolve_sections(
     config: RunConfig, names: Iterable[str], facts: Facts | None, device: Device, lines: list[str]
 ) -> RunConfig:
@@ -156,8 +150,6 @@ def _resolve_sections(
     """
     sections = config.sections()
     used = used_sections(config)
-    if config.field != "mlp" or config.sampler != "hierarchical" or config.eval.bake_occupancy:
-        used.add("occupancy")  # its box
     for name in names:
         if name not in sections:
             continue

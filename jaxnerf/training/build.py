@@ -16,9 +16,9 @@ from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.facts import footprint_radii
 from jaxnerf.data.geometry.free_space import interpolated_depths
 from jaxnerf.data.observations import confident_observations
-from jaxnerf.data.scales import with_scales
+from jaxnerf.data.scene import bounded_by_alpha
 from jaxnerf.fields.base import Field, contract_field
-from jaxnerf.models.base import Model, SamplerContext
+from jaxnerf.models.base import FINAL_NETWORK, Model, SamplerContext
 from jaxnerf.models.occupancy import bake_occupancy, schedule_of
 from jaxnerf.options import Changes, Options, changing, is_auto, values_of
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
@@ -76,7 +76,6 @@ def build(config: Config) -> Experiment:
     """
     config = read_config(config)
     given, train = config.data, config.train
-    _check_scales(config)
     model = build_model(config)
     losses, cameras = build_losses(config.losses, model), build_cameras(config, model.needs)
     _filled(config.train, "train")
@@ -125,7 +124,7 @@ def build(config: Config) -> Experiment:
         view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc, needs=model.needs)),
         world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=given.ndc)),
         prepare=functools.partial(_prepare, config, model, extras),
-        background=dataset.color_behind(given),
+        background=config.scene.color_behind(given.background),
         pixel_rays=pixel_rays,
     )
 
@@ -147,8 +146,7 @@ def _pixel_rays(train, cameras, extras):
 def _check_fixed_order(losses, cameras):
     """Raises a ValueError if the gradient of what is trained has no fixed order on an accelerator."""
     others = {"cameras.exposure or cameras.refine": cameras is not None}
-    # The gradient of the depth loss depends on its own sums over rays; those of other losses do not.
-    others["losses.depth"] = any(loss.name == "depth" for loss in losses)
+    others |= {f"losses.{loss.name}": not LOSSES.get(loss.name).fixed_order for loss in losses}
     found = [name for name, is_on in others.items() if is_on]
     if found:
         raise ValueError(
@@ -166,22 +164,23 @@ def build_model(config: Config, wrap: Callable[[Field], Field] | None = None, *,
         fixed_order: whether the sums of training have a fixed order on an accelerator, too.
     """
     config = read_config(config)
-    part = SAMPLERS.get(config.sampler)
-    _check_sampling(config)
+    part, scene = SAMPLERS.get(config.sampler), config.scene
+
+    def make_field(network):
+        field = _make_field(config, network, fixed_order)
+        return wrap(field) if wrap is not None and network == FINAL_NETWORK else field
+
     return part.make(
         SamplerContext(
-            options=_filled(config.options_of(part, config.sampler), part.section or config.sampler),
-            make_field=lambda network: _wrapped(wrap, network, _make_field(config, network, fixed_order)),
+            options=_filled(config.options_of(SAMPLERS), part.section or config.sampler),
+            make_field=make_field,
             view=config.eval,
-            background=dataset.color_behind(config.data),
-            box=_box(config),
+            background=scene.color_behind(config.data.background),
+            box=scene.box,
+            contracted=scene.contracted is True,
             fixed_order=fixed_order,
         )
     )
-
-
-def _wrapped(wrap, network, field):
-    return wrap(field) if wrap is not None and network == "fine" else field
 
 
 def build_cameras(config: RunConfig, needs: tuple[str, ...] = ()) -> CameraParameters | None:
@@ -256,8 +255,9 @@ def _of_fields(name, model):
 
 def bake_model(config: RunConfig, model: Model, visibility_rays, *, crop: bool = True):
     """Calls `bake_occupancy` for the box of a resolved config's section `occupancy`."""
-    schedule = schedule_of(_filled(config.occupancy, "occupancy"), None)
-    background = dataset.color_behind(config.data)
+    scene = config.scene
+    schedule = schedule_of(_filled(config.occupancy, "occupancy"), scene.box, None, contracted=scene.contracted)
+    background = scene.color_behind(config.data.background)
     return bake_occupancy(model, schedule, visibility_rays, config.eval, crop=crop, background=background)
 
 
@@ -273,74 +273,24 @@ def load_split(config: Config, split: str | None = None) -> tuple[Views, str, di
     return views, split, dataset.conventions(data, capture)
 
 
-def check_released(config: RunConfig, origin: str) -> None:
-    """Raises a ValueError if a config's networks differ from those of a released code."""
-    if config.sampler != "hierarchical" or config.field != "mlp":
-        raise ValueError(
-            f"sampler is {config.sampler!r} and field {config.field!r}, expected 'hierarchical' and 'mlp' as in "
-            f"{origin}"
-        )
-    activations = ("relu", "softplus") if origin == "JaxNeRF" else ("relu",)
-    for name, network in (("coarse", config.coarse), ("fine", config.fine)):
-        if not network.encode:
-            raise ValueError(f"{name}.encode is False, expected True as in {origin}")
-        if network.density_bias:
-            raise ValueError(f"{name}.density_bias is {network.density_bias}, expected 0 as in {origin}")
-        if network.density_activation not in activations:
-            raise ValueError(
-                f"{name}.density_activation is {network.density_activation!r}, expected "
-                f"{' or '.join(map(repr, activations))} as in {origin}"
-            )
-
-
-def _check_sampling(config):
-    """Raises a ValueError if the section `sampling` asks for what the sampler "occupancy" does not do."""
-    sampling = config.sampling
-    if config.sampler == "occupancy" and sampling.density_noise:
-        raise ValueError(
-            f"sampling.density_noise is {sampling.density_noise} and the sampler 'occupancy', which adds no "
-            "noise; set it to 0, or use the sampler 'hierarchical'"
-        )
-    if config.sampler == "occupancy" and not sampling.stratified:
-        raise ValueError(
-            "sampling.stratified is False and the sampler 'occupancy', which draws its samples; set it to True, "
-            "or use the sampler 'hierarchical'"
-        )
-
-
-def _check_scales(config):
-    """Raises a ValueError if images of several sizes do not fit the rest of the config."""
-    reasons = {
-        "data.ndc is True, and rays in normalised device coordinates depend on the size of all images": config.data.ndc,
-        "the section cameras has parameters of each training image": config.cameras.any,
-        "train.batching is 'single_image', which draws each size as often": config.train.batching != "all_images",
-    }
-    for reason, holds in reasons.items():
-        if config.data.num_scales > 1 and holds:
-            raise ValueError(f"data.num_scales is {config.data.num_scales}, expected 1, as {reason}")
-
-
 def _make_field(config, network, fixed_order) -> Field:
-    """Makes the field of a network; that of "coarse" is always an MLP."""
-    name = config.field if network == "fine" else "mlp"
-    part, box = FIELDS.get(name), _box(config)
-    section = network if name == "mlp" else name
-    options = getattr(config, network) if name == "mlp" else config.options_of(part, name)
-    field = part.make(_filled(options, section), box)
+    """Makes the field of a network: the one that the config names, or one of the sampler's own networks."""
+    sampler = SAMPLERS.get(config.sampler)
+    if network == FINAL_NETWORK:
+        part, options = FIELDS.get(config.field), config.options_of(FIELDS)
+        section = part.section or config.field
+    else:
+        part, options, section = sampler.networks[network], getattr(config, network), network
+    field = part.make(_filled(options, section), config.scene.box)
     if fixed_order and field.apply_in_fixed_order is not None:
         field = field._replace(apply=field.apply_in_fixed_order)
     # The paper's networks are not contracted; all other fields are defined in the box.
-    in_box = config.sampler != "hierarchical" or name != "mlp"
-    if in_box and config.occupancy.contracted is True:
-        if box is None:
-            raise ValueError("occupancy.lower or occupancy.upper is 'auto'; resolve the config, or set both")
-        return contract_field(field, *box)
+    declared = options if isinstance(options, Options) else Options()
+    if (declared.needs_box or config.declared_by(SAMPLERS).needs_box) and config.scene.contracted is True:
+        if config.scene.box is None:
+            raise ValueError("scene.lower or scene.upper is 'auto'; resolve the config, or set both")
+        return contract_field(field, *config.scene.box)
     return field
-
-
-def _box(config):
-    corners = config.occupancy.lower, config.occupancy.upper
-    return None if any(map(is_auto, corners)) else corners
 
 
 def _filled(options, section):
@@ -372,19 +322,17 @@ def _prepare(config, model, extras, views):
             "dataset; do not set it"
         )
     cells = indices = None
-    drawn = views if config.data.num_scales == 1 else with_scales(views, config.data.num_scales)
     if model.grid_schedule is None:
-        active = unmasked_pixels(drawn)
+        active = unmasked_pixels(views)
     else:
         cells, active, indices = active_region(
             views,
             model.grid_schedule,
             # What is empty in one image of a scene that moves may hold matter in others.
-            use_alpha=config.occupancy.use_alpha and not config.data.ndc and views.time is None,
-            min_views=config.occupancy.min_views if views.time is None else 0,
+            use_alpha=bounded_by_alpha(config.scene, views, ndc=config.data.ndc),
+            min_views=model.grid_schedule.min_views if views.time is None else 0,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
-            drawn=drawn,
         )
     seed = np.uint32(config.seed % 2**32)
     sparse = None
@@ -392,8 +340,6 @@ def _prepare(config, model, extras, views):
         sparse = confident_observations(views)
         if not config.data.ndc:
             depths = interpolated_depths(dataclasses.replace(views, sparse=sparse))
-            if drawn is not views:  # no depth is known in images of other sizes
-                depths = np.pad(depths, [(0, len(drawn.size) - len(views.size)), *[(0, 0)] * 3])
             sparse = dataclasses.replace(sparse, interpolated=depths)
     progress = None
     if "progress" in model.needs or config.train.rays_per_side > 1:
@@ -401,10 +347,10 @@ def _prepare(config, model, extras, views):
         progress = ProgressData(np.float32(config.train.lr_steps), np.float32(0))
     radii = None
     if model.grid_schedule is not None and "radius" in model.needs:
-        smallest, largest = footprint_radii(views, config.data.num_scales)
+        smallest, largest = footprint_radii(views)
         radii = np.float32([smallest / config.train.rays_per_side, largest])
-    # The mask is part of the active pixels.
-    drawn = dataclasses.replace(drawn, mask=None, sparse=sparse)
+    # The mask is part of the active pixels. Names, which no step reads, would be part of the compiled step.
+    drawn = dataclasses.replace(views, mask=None, sparse=sparse, names=())
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)
 
 

@@ -5,13 +5,10 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeAlias
 
-from ml_collections import ConfigDict
+from ml_collections import ConfigDict, FieldReference
 
 from jaxnerf.data.dataset import DataOptions
-from jaxnerf.fields.hash_grid import HashGridOptions
-from jaxnerf.fields.mlp import MlpOptions
-from jaxnerf.models.hierarchical import HierarchicalOptions
-from jaxnerf.models.occupancy import OccupancyOptions
+from jaxnerf.data.scene import SceneOptions
 from jaxnerf.options import (
     Changes,
     Option,
@@ -27,11 +24,11 @@ from jaxnerf.options import (
     short_repr,
     values_of,
 )
-from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part
+from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part, Registry
 from jaxnerf.runtime import memory
 from jaxnerf.runtime.config_fields import typed
 from jaxnerf.training.camera_parameters import CameraOptions
-from jaxnerf.training.earlier_options import in_todays_names, refuse
+from jaxnerf.training.earlier_options import RENAMED, in_todays_names, refuse, today
 from jaxnerf.training.options import EvalOptions, TrainOptions
 
 _MAX_SEED = 2**63 - 1  # what jax.random.key takes
@@ -42,12 +39,11 @@ class RunConfig(Options):
     """The config of a run.
 
     Attributes:
-        coarse: the network that guides the fine samples; sampler "hierarchical" only.
-        fine: the network of the final rendering, if the field is "mlp".
         fingerprint: no option but a record: that of the dataset that the run is trained on, see `dataset.fingerprint`.
         losses: the weight of each loss, by its registered name; 0: off.
-        plugins: the options of registered fields and samplers, by name; of a config that has been read, only of those
-            that it uses. A part without a class of options has a dict.
+        parts: the options of fields and samplers, by the name of their section; of a config that has been read, those
+            of built-in parts and of others that it uses. A part without a class of options has a dict. Each is an
+            attribute of the config, too.
     """
 
     seed: int = option(0, "seed of all random numbers", max_int=_MAX_SEED)
@@ -57,39 +53,50 @@ class RunConfig(Options):
     sampler: str = option("hierarchical", "`hierarchical` (section `sampling`), `occupancy`, or a registered one")
     fingerprint: str = ""
     data: DataOptions = dataclasses.field(default_factory=DataOptions)
-    coarse: MlpOptions = dataclasses.field(default_factory=MlpOptions)
-    fine: MlpOptions = dataclasses.field(default_factory=MlpOptions)
-    sampling: HierarchicalOptions = dataclasses.field(default_factory=HierarchicalOptions)
-    hash_grid: HashGridOptions = dataclasses.field(default_factory=HashGridOptions)
-    occupancy: OccupancyOptions = dataclasses.field(default_factory=OccupancyOptions)
+    scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
     losses: Mapping[str, Schedule] = dataclasses.field(default_factory=lambda: default_weights())
     cameras: CameraOptions = dataclasses.field(default_factory=CameraOptions)
     train: TrainOptions = dataclasses.field(default_factory=TrainOptions)
     eval: EvalOptions = dataclasses.field(default_factory=EvalOptions)
-    plugins: Mapping[str, Any] = dataclasses.field(default_factory=lambda: default_plugins())
+    parts: Mapping[str, Any] = dataclasses.field(default_factory=lambda: default_parts())
+
+    def __getattr__(self, name: str) -> Any:
+        parts = self.__dict__.get("parts", {})
+        if name not in parts:
+            raise AttributeError(f"the config has no section {name!r}")
+        return parts[name]
 
     def sections(self) -> dict[str, Options]:
-        """Returns the options of all parts, by the name of their section; those of plugins without a class excepted."""
+        """Returns the options of all parts, by the name of their section; those without a class excepted."""
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {name: part for name, part in {**own, **self.plugins}.items() if isinstance(part, Options)}
+        return {name: part for name, part in {**own, **self.parts}.items() if isinstance(part, Options)}
 
     def with_sections(self, sections: Mapping[str, Any]) -> "RunConfig":
         """Returns a config with other sections, by name."""
-        own = {name: part for name, part in sections.items() if name not in self.plugins}
-        plugins = {name: sections.get(name, part) for name, part in self.plugins.items()}
-        return dataclasses.replace(self, plugins=plugins, **own)
+        own = {name: part for name, part in sections.items() if name not in self.parts}
+        parts = {name: sections.get(name, part) for name, part in self.parts.items()}
+        return dataclasses.replace(self, parts=parts, **own)
 
-    def options_of(self, part: Part, name: str) -> Any:
-        """Returns the options of a registered part: those of its section, or of the section of its name."""
-        if part.section is None and name in self.plugins:
-            return self.plugins[name]
-        section = getattr(self, part.section or name, None)
-        return (part.options() if part.options else {}) if section is None else section
+    def options_of(self, registry: Registry) -> Any:
+        """Returns the options of the run's part in a registry, the run's field or sampler."""
+        name = self.field if registry is FIELDS else self.sampler
+        part = registry.get(name)
+        return self.parts.get(part.section or name, part.options() if part.options else {})
+
+    def declared_by(self, registry: Registry) -> Options:
+        """Returns the options of the run's field or sampler for what they declare; default ones if it has no class."""
+        options = self.options_of(registry)
+        return options if isinstance(options, Options) else Options()
+
+    @property
+    def has_box(self) -> bool:
+        """Whether the run's field is defined in the scene's box."""
+        return any(self.declared_by(registry).needs_box for registry in (FIELDS, SAMPLERS))
 
     def to_dict(self) -> dict[str, Any]:
         """Returns {section: {option: value}}, and the values of the options that are in no section."""
         sections = {name: values_of(part) for name, part in self.sections().items()}
-        plain = {name: dict(part) for name, part in self.plugins.items() if name not in sections}
+        plain = {name: dict(part) for name, part in self.parts.items() if name not in sections}
         record = {"fingerprint": self.fingerprint} if self.fingerprint else {}
         return {**record, **values_of(self), **sections, **plain, "losses": dict(self.losses)}
 
@@ -106,21 +113,29 @@ def default_weights() -> dict[str, Any]:
     return {name: LOSSES.get(name).weight for name in LOSSES.names()}
 
 
-def default_plugins() -> dict[str, Options]:
-    """Returns the default options of all registered fields and samplers that are not built in, by name.
+def part_sections() -> dict[str, Part]:
+    """Returns the registered fields and samplers, and the fields of a sampler's further networks, by their section.
 
     Raises:
         ValueError: if one has the name of an option or section of every config.
     """
-    parts = {name: registry.get(name) for registry in (FIELDS, SAMPLERS) for name in registry.names()}
-    plugins = {name: part for name, part in parts.items() if part.section is None}
-    for field in dataclasses.fields(RunConfig):
-        if field.name in plugins:
-            raise ValueError(
-                f"a field or sampler is registered as {field.name!r}, which every config has for something else; "
-                "register it under another name"
-            )
-    return {name: part.options() for name, part in plugins.items() if part.options}
+    found: dict[str, Part] = {}
+    for registry in (SAMPLERS, FIELDS):
+        for name in registry.names():
+            part = registry.get(name)
+            section = part.section or name
+            if section in found or section in RunConfig.__dataclass_fields__:
+                raise ValueError(
+                    f"a field or sampler is registered as {section!r}, which every config has for something else; "
+                    "register it under another name"
+                )
+            found |= {**part.networks, section: part}
+    return found
+
+
+def default_parts() -> dict[str, Options]:
+    """Returns the default options of all registered fields and samplers, by the name of their section."""
+    return {name: part.options() for name, part in part_sections().items() if part.options}
 
 
 def read_config(config: Config) -> RunConfig:
@@ -139,19 +154,26 @@ def read_config(config: Config) -> RunConfig:
     record = content.pop("fingerprint", "")
     kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
     top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "config.")
-    parts = {name: read(kind, _section(content, name), f"config.{name}.") for name, kind in kinds.items()}
+    own = {name: read(kind, _section(content, name), f"config.{name}.") for name, kind in kinds.items()}
     losses = {name: _read_weight(name, weight) for name, weight in _section(content, "losses").items()}
-    plugins = {name: _read_plugin(name, section) for name, section in {**top.plugins, **content}.items()}
+    registered = part_sections()
+    built_in = [name for name, part in registered.items() if part.section]
+    parts = {name: read(registered[name].options, _section(content, name), f"config.{name}.") for name in built_in}
+    parts |= {
+        name: _read_part(name, registered.get(name), part)
+        for name, part in {**top.parts, **content}.items()
+        if name not in parts
+    }
     fingerprint = "" if is_auto(record) else record  # a run that was converted without its dataset has "auto"
-    config = dataclasses.replace(top, **parts, losses=losses, plugins=plugins, fingerprint=fingerprint)
-    used, known = used_sections(config), {*kinds, "losses", *FIELDS.names(), *SAMPLERS.names()}
-    unknown = sorted(name for name in plugins if name not in known | used)
+    config = dataclasses.replace(top, **own, losses=losses, parts=parts, fingerprint=fingerprint)
+    used, known = used_sections(config), {*kinds, "losses", *registered}
+    unknown = sorted(name for name in parts if name not in known | used)
     if unknown:
         raise ValueError(
             f"--config.{unknown[0]} is no field, expected one of {sorted(known | set(declarations(RunConfig)))}; "
             "correct the name, or import the module that registers it with --plugins=MODULE"
         )
-    config = replaced(config, plugins={name: part for name, part in plugins.items() if name in used})
+    config = replaced(config, parts={name: part for name, part in parts.items() if name in {*built_in, *used}})
     _check(config)
     return config
 
@@ -162,6 +184,15 @@ def to_config_dict(config: RunConfig) -> ConfigDict:
     for name, declaration, kind, value in declared(config):
         section, dot, field = name.rpartition(".")
         (content[section] if dot else content)[field] = typed(value, kind, auto=declaration.auto)
+    for old, new in RENAMED.items():
+        (section, name), (new_section, _, new_name) = old.split("."), new.name.rpartition(".")
+        if not new_section:  # a record, not an option
+            continue
+        # One reference under both names: whichever is set, the other follows.
+        value = content[new_section][new_name]
+        if not isinstance(value, FieldReference):
+            value = content[new_section][new_name] = FieldReference(value)
+        content[section][name] = value
     return ConfigDict(content)
 
 
@@ -185,7 +216,7 @@ def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
     """Returns a config with other values, {"section.option": value}, checked as `read_config` does."""
     content = config.to_dict()
     for name, value in values.items():
-        section, dot, field = name.partition(".")
+        section, dot, field = today(name).partition(".")
         if dot:
             content[section] = {**content.get(section, {}), field: value}
         else:
@@ -225,7 +256,7 @@ def identity(config: RunConfig) -> str:
         for name, option_, _, value in declared(config)
         if option_.changes & Changes.IMAGES and not name.startswith("eval.")
     }
-    plain = {name: part for name, part in config.plugins.items() if not isinstance(part, Options)}
+    plain = {name: part for name, part in config.parts.items() if not isinstance(part, Options)}
     return json.dumps({**render, **plain}, sort_keys=True)
 
 
@@ -247,11 +278,10 @@ def _section(content, name):
     return section
 
 
-def _read_plugin(name, section):
+def _read_part(name, part, section):
     """Returns the options of a registered part; of one that is not registered, or has no class, the section itself."""
     if isinstance(section, Options):
         return section
-    part = next((registry.get(name) for registry in (FIELDS, SAMPLERS) if name in registry.names()), None)
     if not isinstance(section, Mapping):
         raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
     if part is None or part.options is None:
@@ -261,15 +291,17 @@ def _read_plugin(name, section):
 
 def _check(config):
     """Checks values that concern each other, and that what a run keeps fits into memory."""
-    free, used = memory.available(), used_sections(config)
+    free, used, box = memory.available(), used_sections(config), config.scene.box
+    samplers = {SAMPLERS.get(name).section or name for name in SAMPLERS.names()}
     for section, part in config.sections().items():
-        if section == "occupancy" and config.sampler != "occupancy":
-            continue
         try:
-            part.check()
+            if section in samplers - used:
+                part.check_unused(config.sampler)
+                continue
+            part.check(box)
         except ValueError as error:
             raise ValueError(f"--config.{section}.{error}") from None
-        needed = part.bytes_needed() if free is not None and section in used else {}
+        needed = part.bytes_needed(box) if free is not None and section in used else {}
         for name, size in needed.items():
             if size > free:
                 raise ValueError(
@@ -281,8 +313,8 @@ def _check(config):
 
 def used_sections(config: RunConfig) -> set[str]:
     """Returns the names of the sections that training with a config uses."""
-    used = {"data", "train", "eval", "cameras", "losses"}
+    used = {"data", "scene", "train", "eval", "cameras", "losses"}
     for name, registry in ((config.field, FIELDS), (config.sampler, SAMPLERS)):
         part = registry.get(name) if name in registry.names() else Part(None)
-        used.add(part.section or name)
-    return used | ({"coarse"} if config.sampler == "hierarchical" else set())
+        used |= {part.section or name, *part.networks}
+    return used

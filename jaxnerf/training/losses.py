@@ -33,6 +33,7 @@ DEPTH = Loss(
     needs=("depth", "depth_weight"),
     weight="auto",
     infer=_weight_of_depth,
+    fixed_order=False,  # it depends on sums over rays of its own
     help="distance of the weights from the dataset's sparse points, and from depths interpolated between them (after "
     "arXiv:2107.02791); auto: at the start of training where space is contracted and there are such points",
 )

@@ -1,4 +1,4 @@
-"""The record of a run: metrics.jsonl, event files for TensorBoard, and what the terminal shows."""
+"""The record of a run: metrics.jsonl, event files for TensorBoard, and the lines that the terminal shows."""
 
 import json
 import logging
@@ -6,7 +6,7 @@ import os
 import pathlib
 import sys
 import time
-from typing import Any, TextIO
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,10 +14,10 @@ import numpy as np
 from jaxnerf.core.metrics import decibels
 from jaxnerf.core.views import Views
 from jaxnerf.runtime.atomic_files import naming, open_regular, parse_json, partial_file, read_bytes, write_text
-from jaxnerf.runtime.devices import devices_of
 from jaxnerf.runtime.processes import Detail
 from jaxnerf.training.dead_networks import dead_networks
 from jaxnerf.training.options import UNLIMITED_STEPS
+from jaxnerf.training.pace import Clock, Pace
 from jaxnerf.training.state import TrainState
 
 _logger = logging.getLogger(__name__)
@@ -53,6 +53,11 @@ class MetricLog:
             print(f"{self._path}: dropped an incomplete last line", file=sys.stderr)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self.rows))
         self._events = _Events(workdir, first_step=first_step)
+
+    @property
+    def seconds(self) -> float:
+        """Returns the seconds of training at the last row; 0 before the first."""
+        return self.rows[-1]["seconds"] if self.rows else 0.0
 
     def append(self, row: dict[str, Any]) -> None:
         """Adds a row: "step" and other numbers. NaN and infinity are written as Python's json writes them."""
@@ -152,48 +157,9 @@ class _Events:
             print(f"{self._folder}: {why}", file=sys.stderr)
 
 
-class Progress:
-    """A progress bar on a terminal; plain lines in a log file."""
-
-    def __init__(self, total: int | None, stream: TextIO | None = None, show: bool = True):
-        self._total, self._stream, self._shown = total, stream or sys.stderr, show
-        self._terminal = show and self._stream.isatty()
-
-    def show(self, done: int, text: str, fraction: float | None = None) -> None:
-        """Shows how many of the total steps are done, followed by a text.
-
-        Args:
-            done: steps.
-            text: what follows.
-            fraction: which part of the work is done, if not that of the steps.
-        """
-        if not self._shown:
-            return
-        fraction = min(done / self._total if fraction is None else fraction, 1.0)
-        if self._terminal:
-            bar = "#" * int(24 * fraction)
-            self._stream.write(f"\r\033[K[{bar:<24}] {100 * fraction:3.0f} %  {text}")
-        else:
-            self._stream.write(f"{done}{f'/{self._total}' if self._total else ''}  {text}\n")
-        self._stream.flush()
-
-    def note(self, *lines: str) -> None:
-        """Prints lines of their own, above the bar."""
-        if self._shown:
-            self._stream.write("".join(("\r\033[K" if self._terminal else "") + line + "\n" for line in lines))
-            self._stream.flush()
-
-    def close(self) -> None:
-        if self._terminal:
-            self._stream.write("\n")
-
-
-def header(
-    experiment: Any, views: Views, state: TrainState, *, prepare_seconds: float, compile_seconds: float
-) -> list[str]:
-    """Returns the lines that describe a run before its first step."""
-    options = experiment.config.train
-    devices = devices_of(options.parallel)
+def header(experiment: Any, views: Views, state: TrainState, compiled: Any) -> list[str]:
+    """Returns the lines that describe a run before its first step; compiled: its CompiledStep."""
+    options, devices = experiment.config.train, jax.devices()
     processes = f", in {jax.process_count()} processes" if jax.process_count() > 1 else ""
     counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
     parts = ", ".join(f"{name} {count:,}" for name, count in counts.items())
@@ -209,9 +175,11 @@ def header(
     if state.grid is not None:
         cells = "x".join(map(str, state.grid.valid.shape))
         fraction = float(state.grid.valid.mean())
-        lines.append(Detail(f"grid          {fraction:.1%} of {cells} cells valid, in {prepare_seconds:.1f} s"))
+        lines.append(
+            Detail(f"grid          {fraction:.1%} of {cells} cells valid, in {compiled.prepare_seconds:.1f} s")
+        )
     lines += [
-        f"compiled      in {compile_seconds:.1f} s",
+        f"compiled      in {compiled.compile_seconds:.1f} s",
         f"steps         {of_all(int(state.step), options)} done, {options.batch_size} rays per step in "
         f"microbatches of {min(options.microbatch_size, options.batch_size // len(devices))}",
     ]
@@ -219,7 +187,7 @@ def header(
 
 
 def row(
-    experiment: Any, step: int, recent: list[dict[str, Any]], *, seconds: float, rate: Any, compile_seconds: float
+    experiment: Any, step: int, recent: list[dict[str, Any]], clock: Clock, pace: Pace, compile_seconds: float
 ) -> dict[str, Any]:
     """Returns the row of metrics at a step.
 
@@ -228,8 +196,7 @@ def row(
         step: steps taken.
         recent: the metrics of the steps since the last row, numbers or arrays [steps of a dispatch]. Losses and
             errors are averaged over them; of all other metrics the last values count.
-        seconds: of training so far.
-        rate: rays so far -> rays per second since the last row.
+        clock, pace: of the run.
         compile_seconds: that compiling the step took.
     """
     recent = jax.device_get(recent)  # one transfer for all
@@ -239,14 +206,14 @@ def row(
     rays = step * experiment.config.train.batch_size - rays_dropped
     return {
         "step": step,
-        "seconds": seconds,
+        "seconds": clock.seconds(),
         "compile_seconds": compile_seconds,
         "rays": rays,
-        "rays_per_second": rate(rays),
+        "rays_per_second": clock.rate(rays),
         "loss": values["loss"].mean(),
         **{name: value.mean() for name, value in values.items() if name.startswith("loss_")},
         **{f"psnr_{name}": float(decibels(values[f"mse_{name}"].mean())) for name in experiment.model.image_networks},
-        "lr": float(experiment.schedule(step - 1)),
+        "lr": float(experiment.schedule(step - 1)) * pace.scale,
         "grad_norm": last["grad_norm"],
         "nonfinite": int(last["nonfinite"]),
         "nonfinite_in_a_row": int(last["nonfinite_in_a_row"]),

@@ -14,6 +14,7 @@ from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Options, at_least, opt
 from jaxnerf.training.camera_parameters import CAMERAS, CameraOptions
 from jaxnerf.training.state import PROGRESS, TrainState
 
+_BETA1 = 0.9  # decay of Adam's first moment, as in the paper
 _MIN_SIDE = 8  # least inputs and outputs of a layer that Muon updates; smaller layers gain nothing
 # Root mean square of a matrix's entries at which weight decay is as large as an update by Muon. The size of such an
 # update does not depend on the gradient's; without decay, matrices grew until training diverged after 7,000 steps of
@@ -46,7 +47,6 @@ class OptimizerOptions(Options):
         200_000, "steps of the decay; the run may end earlier or later; auto: `max_steps`", range=at_least(1), auto=True
     )
     warmup_steps: int = option(0, "steps in which the learning rate rises linearly from 0", range=at_least(0))
-    beta1: float = option(0.9, "decay of Adam's first moment", range=BELOW_ONE)
     beta2: float = option(0.999, "decay of Adam's second moment", range=BELOW_ONE)
     epsilon: float = option(1e-8, "added to the denominator of Adam", range=POSITIVE)
     muon: float = option(
@@ -80,7 +80,7 @@ def make_optimizer(
         The optimizer, whose update takes `decay`, DecayData in place of what the options say; and the learning rate of
         the networks: step -> float.
     """
-    moments = {"b1": train.beta1, "b2": train.beta2, "eps": train.epsilon}
+    moments = {"b1": _BETA1, "b2": train.beta2, "eps": train.epsilon}
 
     def optimizer_with(schedule):
         decay = _DECAY if train.muon else 0.0
@@ -111,7 +111,7 @@ def _with_cameras(optimizer, train, schedule, cameras):
         def rate(step):
             return jnp.where(step < first_step, 0.0, initial / train.lr_init * schedule(step))
 
-        return optax.adam(rate, train.beta1, train.beta2, train.epsilon)
+        return optax.adam(rate, _BETA1, train.beta2, train.epsilon)
 
     updates = {
         "networks": optimizer,

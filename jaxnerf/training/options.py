@@ -1,22 +1,19 @@
 """The options of a training run and of its evaluation that belong to no other part."""
 
 import dataclasses
-import math
 
 import jax
 
 from jaxnerf.data.ray_batches import BATCHINGS
 from jaxnerf.models.base import ViewOptions
-from jaxnerf.options import Changes, Device, Facts, at_least, between, infer, is_auto, option
-from jaxnerf.runtime import devices, processes
-from jaxnerf.training.dead_networks import CHECK_EVERY
+from jaxnerf.options import Box, Changes, Device, Facts, at_least, between, infer, is_auto, option
+from jaxnerf.runtime import devices
 from jaxnerf.training.optimizer import OptimizerOptions
 
 UNLIMITED_STEPS = 10**7  # max_steps of a run that max_seconds ends
 _STEPS_PER_ROOT_PIXEL = 1000  # training steps are proportional to the root of an image's side in pixels
 _FACTOR_OF_SEVERAL_RAYS = 8  # at which a pixel of an image averages so much that one ray blurs the field
 _SHORT_SECONDS, _SHORT_STEPS = 30.0, 2000  # a shorter run is better with more pixels than with sharper ones
-_MAX_STEPS_PER_DISPATCH = 16  # on an accelerator, where a dispatch costs as much as a small step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +22,8 @@ class TrainOptions(OptimizerOptions):
 
     batch_size: int = option(
         1024,
-        "Rays per step, over all devices. auto: `cpu_batch_size` on a CPU, twice as many for a large hash grid, and "
-        "`cpu_batch_size` with the sampler `hierarchical`; on an accelerator with the sampler `occupancy` as many as "
+        "Rays per step, over all devices. auto: as many as the sampler says, of which `cpu_batch_size` is the usual "
+        "number; the sampler `occupancy` takes twice as many for a large hash grid, and on an accelerator as many as "
         "keep it busy, in the same number of steps.",
         range=at_least(1),
         auto=True,
@@ -34,13 +31,6 @@ class TrainOptions(OptimizerOptions):
     cpu_batch_size: int = option(1024, "see `batch_size`", range=at_least(1), changes=Changes.NOTHING)
     microbatch_size: int = option(
         "auto", "rays per gradient accumulation", range=at_least(1), auto=True, changes=Changes.SPEED
-    )
-    steps_per_dispatch: int = option(
-        "auto",
-        "training steps between which the host does nothing",
-        range=at_least(1),
-        auto=True,
-        changes=Changes.SPEED,
     )
     batching: str = option(
         "all_images", "where a step draws its rays; `single_image`: from one view", choices=BATCHINGS
@@ -56,12 +46,6 @@ class TrainOptions(OptimizerOptions):
     )
     one_ray_fraction: float = option(
         0.6, "fraction of training before which a pixel has one ray, see `rays_per_side`", range=between(0, 1)
-    )
-    parallel: str = option(
-        "auto",
-        "how the step runs on several devices; `auto`: `jit` on one device, otherwise `sharded`",
-        choices=devices.MODES,
-        changes=Changes.SPEED,
     )
     deterministic: bool = option(
         False,
@@ -98,12 +82,6 @@ class TrainOptions(OptimizerOptions):
         changes=Changes.NOTHING,
     )
     max_to_keep: int = option(3, "checkpoints that are kept", range=at_least(1), changes=Changes.NOTHING)
-    max_nonfinite: int = option(
-        20,
-        "consecutive steps without a finite gradient, after which the run fails",
-        range=at_least(1),
-        changes=Changes.NOTHING,
-    )
     max_reinits: int = option(
         10,
         "reinitializations of dead networks before the run fails; 0: no check",
@@ -117,12 +95,8 @@ class TrainOptions(OptimizerOptions):
         A run is planned as a number of rays: steps of fewer rays than would be inferred are more steps. An
         accelerator takes more rays in the same number of steps.
         """
-        rays, why = self.cpu_batch_size, "train.cpu_batch_size"
-        if facts.sampler == "occupancy" and facts.large_field:
-            rays, why = 2 * rays, "twice train.cpu_batch_size, as the hash grid's table is large"
-        if facts.busy_rays is not None:
-            rays, why = facts.busy_rays, "they keep this device busy"
-        options, lines = infer(self, batch_size=(rays, f"batch         {rays:,} rays per step: {why}"))
+        rays = facts.rays_per_step
+        options, lines = infer(self, batch_size=(rays, f"batch         {rays:,} rays per step: {facts.rays_reason}"))
         batch, side = options.batch_size, facts.side
         planned = steps = max(round(_STEPS_PER_ROOT_PIXEL * side**0.5 * rays / batch), 1)
         why = f"{planned:,} steps of {batch:,} rays, for images of {side:.0f} x {side:.0f} px"
@@ -156,30 +130,22 @@ class TrainOptions(OptimizerOptions):
         return 2, f"pixels        4 rays each after {start:g} % of training, as data.factor is {facts.factor}"
 
     def resolve_for_device(self, device: Device) -> tuple["TrainOptions", list[str]]:
-        """Infers how the rays of a step, and the steps, are grouped."""
-        used = devices.devices_of(self.parallel)
+        """Infers how the rays of a step are grouped."""
         size = 0
         if is_auto(self.microbatch_size):
             if is_auto(self.batch_size):
                 raise ValueError("train.batch_size is 'auto'; resolve the config against a dataset, or set a number")
             together = self._rays_per_pixel
             size = together * devices.default_microbatch(
-                self.batch_size // len(used) // together, together * device.samples_per_ray, device.platform
+                self.batch_size // jax.device_count() // together, together * device.samples_per_ray, device.platform
             )
-        most = 1 if device.is_cpu else _MAX_STEPS_PER_DISPATCH
-        whole = math.gcd(*host_intervals(self))
-        steps = max(count for count in range(1, most + 1) if whole % count == 0)
-        return infer(
-            self,
-            microbatch_size=(size, f"microbatch    {size} rays, for this device"),
-            steps_per_dispatch=(steps, f"dispatch      {steps} training steps at a time, for this device"),
-        )
+        return infer(self, microbatch_size=(size, f"microbatch    {size} rays, for this device"))
 
     @property
     def _rays_per_pixel(self):
         return 1 if is_auto(self.rays_per_side) else self.rays_per_side**2
 
-    def check(self) -> None:
+    def check(self, box: Box | None = None) -> None:
         for name in ("batch_size", "microbatch_size"):
             value = getattr(self, name)
             if not is_auto(value) and value % self._rays_per_pixel:
@@ -195,17 +161,9 @@ class TrainOptions(OptimizerOptions):
                     "set a time, or start another run with a number of steps"
                 )
 
-    def bytes_needed(self) -> dict[str, float]:
+    def bytes_needed(self, box: Box | None) -> dict[str, float]:
         """Returns those of the rays and colours of a step, at least."""
         return {} if is_auto(self.batch_size) else {"batch_size": 64 * self.batch_size}
-
-
-def host_intervals(train: TrainOptions) -> tuple[int, ...]:
-    """Returns the numbers of steps at whose multiples training logs, saves or decides on the host."""
-    intervals = (train.log_every, train.save_every)
-    if train.max_reinits:
-        intervals += (CHECK_EVERY,)
-    return intervals + ((processes.AGREE_EVERY,) if jax.process_count() > 1 else ())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -129,7 +129,6 @@ def make_train_step(
         complete = renderings[-1].num_dropped == 0
 
         def total(values):
-            values = values if batch.loss_weight is None else batch.loss_weight * values
             return jnp.where(complete, values, 0).sum()
 
         parts = {loss.name: total(loss.function(renderings, batch)) for loss in ray_losses}

@@ -101,7 +101,7 @@ def test_without_empty_cells_the_rays_through_the_box_are_active(views):
 
 
 def test_a_box_that_no_ray_hits_is_an_error(views):
-    with pytest.raises(ValueError, match=r"no ray of 60 views .*\(50, 50, 50\).* correct occupancy.lower"):
+    with pytest.raises(ValueError, match=r"no ray of 60 views .*\(50, 50, 50\).* correct scene.lower"):
         active_region(views, a_schedule(box=((50, 50, 50), (51, 51, 51))), use_alpha=False)
 
 

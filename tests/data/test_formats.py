@@ -30,7 +30,7 @@ RAYS = 64  # per view
 
 def a_data(folder, **changes):
     """Returns the data section of configs/capture.py for a folder, at full size."""
-    return DataOptions(**{**capture.get_config().data, "dir": str(folder), "factor": 1, **changes})
+    return replaced(read_config(capture.get_config()).data, **{"dir": str(folder), "factor": 1, **changes})
 
 
 @functools.cache
@@ -239,7 +239,7 @@ def test_resolving_again_changes_nothing(tmp_path):
     synthetic, lines, _ = dataset.resolve(DataOptions())
     for resolved in (again, synthetic):  # the rest depends on the sampler and on the images
         left = {name for name, value in values_of(resolved).items() if value == "auto"}
-        assert not lines and left == {"near", "background_color"}
+        assert not lines and left == {"near"}
 
 
 def test_a_missing_folder_is_an_error():

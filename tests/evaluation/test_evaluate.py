@@ -16,8 +16,8 @@ import oracle
 from jaxnerf import load_dataset, load_scene, pixel_grid, render_image
 from jaxnerf.evaluation import external
 from jaxnerf.evaluation.evaluate import score_run, summary, watch
+from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.training import build
 from jaxnerf.training.checkpoint import Checkpoints
 from runs import evaluate, run_forked, smoke_config, start

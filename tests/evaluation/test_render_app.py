@@ -113,7 +113,7 @@ def test_rgba_over_the_background_is_the_color(rendered):
 def test_rgba_over_the_background_color_is_the_color(trained, path_file, tmp_path):
     run = shutil.copytree(trained, tmp_path / "run")
     content = json.loads((run / "config.json").read_text())
-    content["data"] |= {"background": "none", "background_color": [0.2, 0.5, 1.0]}
+    content["data"]["background"], content["scene"]["background"] = "none", [0.2, 0.5, 1.0]
     (run / "config.json").write_text(json.dumps(content))
     (folder,) = render_path(run, path=str(path_file), rgba=True, video="none", settings={"chunk": 100})
     color, rgba = (iio.imread(folder / name / "0000.png") / 255 for name in ("color", "rgba"))

@@ -78,7 +78,7 @@ def test_each_part_can_be_reduced_a_few_times_and_every_change_differs(base):
     config.hash_grid.resolutions, config.occupancy.step_size = (16, 32, 64), 0.1
     config.hash_grid.width = config.hash_grid.view_width = 64
     config.hash_grid.view_depth = 2
-    config.occupancy.contracted = True
+    config.scene.contracted = True
     for name, part in scene_needs.PARTS.items():
         current = config
         for _ in range(8):

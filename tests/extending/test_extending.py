@@ -191,7 +191,7 @@ def test_a_plugins_options_are_checked_and_inferred_like_all_others(tmp_path):
         config.gabor.num_features = "many"
     config.gabor.num_features = 4
     resolved = auto_config.resolve(config)
-    assert resolved.config.plugins["gabor"].max_frequency > 0 and "uniform" not in resolved.config.plugins
+    assert resolved.config.parts["gabor"].max_frequency > 0 and "uniform" not in resolved.config.parts
     assert any(line.startswith("gabor ") for line in resolved.lines)
 
 

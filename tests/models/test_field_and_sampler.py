@@ -49,7 +49,7 @@ def test_the_loss_falls(field, sampler):
 @pytest.mark.parametrize(("field", "value"), [("sampling.stratified", False), ("sampling.density_noise", 1.0)])
 def test_the_occupancy_sampler_names_what_it_cannot_do(field, value):
     config = smoke_config()
-    config.update_from_flattened_dict({**PACKED, "occupancy.lower": (-1.0,) * 3, "occupancy.upper": (1.0,) * 3})
-    config.update_from_flattened_dict({field: value, "occupancy.contracted": False, "occupancy.update_chunk": 64})
-    with pytest.raises(ValueError, match=f"^{field} is {value}.*sampler 'occupancy'.*'hierarchical'"):
+    config.update_from_flattened_dict({**PACKED, "scene.lower": (-1.0,) * 3, "scene.upper": (1.0,) * 3})
+    config.update_from_flattened_dict({field: value, "scene.contracted": False})
+    with pytest.raises(ValueError, match=f"^--config.{field} is {value}.*sampler 'occupancy'.*'hierarchical'"):
         build(config)

@@ -1,4 +1,4 @@
-"""jit on one device, sharded jit and pmap on four: the same run."""
+"""jit on one device and sharded jit on four: the same run."""
 
 import re
 
@@ -32,24 +32,24 @@ def views(experiment):
 
 @pytest.fixture(scope="module")
 def runs(unoptimized, experiment, views):
-    """Ten steps of configs/smoke.py on one device and on four; device_matrix.py has pmap, too."""
+    """Ten steps of configs/smoke.py on one device and on four."""
     model, optimizer = experiment.model, experiment.optimizer
     step = make_train_step(model, optimizer, experiment.draw, experiment.losses)
     return {
-        mode: run_steps(
+        count: run_steps(
             step,
             create_state(model, optimizer, 0),
             TrainData(np.uint32(0), views, None, None),
             10,
-            mode,
+            count,
             batch_size=64,
         )
-        for mode in ("jit", "sharded")
+        for count in (1, 4)
     }
 
 
 def test_ten_steps_end_in_the_same_parameters(runs):
-    (one, one_rows), (many, many_rows) = runs["jit"], runs["sharded"]
+    (one, one_rows), (many, many_rows) = runs[1], runs[4]
     start = create_state(smoke_experiment().model, optax.adam(1e-3), 0).params
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), one.params, start)
     assert min(jax.tree.leaves(moved)) > 1e-4, "the comparison needs parameters that moved"
@@ -60,23 +60,21 @@ def test_ten_steps_end_in_the_same_parameters(runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["sharded", "pmap"])
 @pytest.mark.parametrize("microbatch_size", [4, 2])
-def test_gradient_is_a_mean_over_devices(mode, microbatch_size):
+def test_gradient_is_a_mean_over_devices(microbatch_size):
     """SGD's update is proportional to the gradient, which Adam would hide."""
     optimizer = optax.sgd(0.1)
     step = make_train_step(toy_model(), optimizer, toy_draw, LOSSES)
     data = random_rays(0, (16,)), jnp.array([-1])
     states = {}
-    for name in ("jit", mode):
+    for count in (1, 4):
         state = create_state(toy_model(), optimizer, 0)
-        states[name], rows = run_steps(step, state, data, 3, name, batch_size=16, microbatch_size=microbatch_size)
+        states[count], rows = run_steps(step, state, data, 3, count, batch_size=16, microbatch_size=microbatch_size)
     assert rows[0]["loss"] > 2 * rows[2]["loss"] or rows[0]["grad_norm"] > 0.1
-    assert_same(states[mode], states["jit"], rtol=1e-6, atol=1e-6)
+    assert_same(states[4], states[1], rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("mode", ["sharded", "pmap"])
-def test_batch_is_the_same_on_any_number_of_devices(experiment, views, mode):
+def test_batch_is_the_same_on_any_number_of_devices(experiment, views):
     def probe(state, data, positions, *, axis_name=None):
         keys, batch = experiment.draw(state["step"], positions.reshape(-1), data)
         seen = {"key": jax.random.key_data(keys), "rgb": batch.rgb, "rays": batch.rays}
@@ -85,7 +83,7 @@ def test_batch_is_the_same_on_any_number_of_devices(experiment, views, mode):
 
     state = {"step": jnp.int32(3)}
     data = TrainData(np.uint32(0), views, None, None)
-    _, (seen,) = run_steps(probe, state, data, 1, mode, batch_size=64, microbatch_size=8)
+    _, (seen,) = run_steps(probe, state, data, 1, 4, batch_size=64, microbatch_size=8)
     keys, batch = jax.jit(experiment.draw)(3, jnp.arange(64), data)
     np.testing.assert_array_equal(seen["key"], jax.random.key_data(keys))
     assert_same((seen["rgb"], seen["rays"]), (batch.rgb, batch.rays))
@@ -108,12 +106,11 @@ def test_every_position_in_the_batch_occurs_once():
     np.testing.assert_array_equal(positions.ravel(), np.arange(48))
 
 
-@pytest.mark.parametrize("mode", ["sharded", "pmap"])
-def test_uneven_batch_is_an_error(mode):
+def test_uneven_batch_is_an_error():
     step = make_train_step(toy_model(), optax.sgd(0.1), toy_draw, LOSSES)
     state = create_state(toy_model(), optax.sgd(0.1), 0)
     with pytest.raises(ValueError, match="batch_size 30 does not split evenly over 4 device"):
-        devices.compile_step(step, state, None, batch_size=30, mode=mode)
+        devices.compile_step(step, state, None, batch_size=30)
 
 
 def test_the_compiled_step_sums_the_gradient_and_four_numbers():
@@ -121,15 +118,10 @@ def test_the_compiled_step_sums_the_gradient_and_four_numbers():
     step = make_train_step(model, optax.sgd(0.1), toy_draw, LOSSES)
     state = create_state(model, optax.sgd(0.1), 0)
     data = random_rays(0, (16,)), jnp.array([-1])
-    run, _, _ = devices.compile_step(step, state, data, batch_size=16, mode="sharded")
+    run, _, _ = devices.compile_step(step, state, data, batch_size=16)
     sums = re.findall(r"= (.*?) all-reduce(?:-start)?\(", run.compiled.as_text())
     shapes = [shape for each in sums for shape in re.findall(r"\w+\[([\d,]*)\]", each)]
     assert sum(np.prod([int(side) for side in shape.split(",") if side]) for shape in shapes) == 2 * 9 + 4
-
-
-def test_unknown_mode_is_an_error():
-    with pytest.raises(ValueError, match="parallel is 'tpu', expected one of"):
-        devices.compile_step(None, None, None, batch_size=4, mode="tpu")
 
 
 def test_seed_does_not_change_the_program():

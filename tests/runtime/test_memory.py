@@ -8,12 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import assert_same, random_rays
-from jaxnerf.core.occupancy.ray_culling import render_background
-from jaxnerf.core.types import Rendering
+from helpers import assert_same, out_of_memory, random_rays
 from jaxnerf.evaluation import metrics
 from jaxnerf.runtime import devices, memory
-from jaxnerf.training import loop
+from jaxnerf.training import compiled_step, loop
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step
@@ -22,10 +20,6 @@ from toys import LOSSES, OPTIMIZER, toy_draw, toy_model
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
-
-
-def out_of_memory():
-    return jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes.")
 
 
 def test_host_and_control_group_limits_are_read(tmp_path):
@@ -89,11 +83,11 @@ def test_step_that_does_not_fit_runs_in_smaller_microbatches(when, capsys):
     """The step that fails has consumed its state, as on a device."""
     data = random_rays(0, (16,)), jnp.array([-1])
     step = make_train_step(toy_model(), OPTIMIZER, toy_draw, LOSSES)
-    sizes = []
+    sizes, options = [], {"batch_size": 16, "devices": jax.devices()[:1]}
 
     def compile_step(state, data, size):
         sizes.append(size)
-        run, state, data = devices.compile_step(step, state, data, batch_size=16, microbatch_size=size, mode="jit")
+        run, state, data = devices.compile_step(step, state, data, **options, microbatch_size=size)
         if size <= 4:
             return run, state, data
         if when == "compiling":
@@ -107,7 +101,7 @@ def test_step_that_does_not_fit_runs_in_smaller_microbatches(when, capsys):
 
     run, state, data = memory.fit_step(compile_step, create_state(toy_model(), OPTIMIZER, 0), data, 16)
     whole, expected, same = devices.compile_step(
-        step, create_state(toy_model(), OPTIMIZER, 0), data, batch_size=16, microbatch_size=4, mode="jit"
+        step, create_state(toy_model(), OPTIMIZER, 0), data, **options, microbatch_size=4
     )
     for _ in range(3):
         (state, _), (expected, _) = run(state, data), whole(expected, same)
@@ -125,69 +119,6 @@ def test_a_copy_of_the_state_is_kept_only_for_a_step_that_needs_over_half_of_the
     monkeypatch.setattr(memory, "available", lambda: 100 * scale)
     found, _, _ = memory.fit_step(lambda *given: (run, None, None), None, None, 16)
     assert (found is run) == (scale > 2)
-
-
-def test_chunk_that_does_not_fit_is_halved_and_the_image_is_the_same(monkeypatch, capsys):
-    rays, tried = jax.tree.map(jnp.asarray, random_rays(0, (6, 7))), []
-
-    @jax.jit
-    def colors(scale, rays):
-        values = scale * rays.viewdirs
-        zero = jnp.zeros(rays.near.shape)
-        names = [field.name for field in dataclasses.fields(Rendering) if field.name not in ("rgb", "weights")]
-        return Rendering(rgb=values, weights=None, **dict.fromkeys(names, zero))
-
-    def render(scale, rays):
-        tried.append(rays.near.size)
-        if rays.near.size > 16:
-            raise out_of_memory()
-        return colors(scale, rays)
-
-    render.lower = colors.lower
-    image = memory.image_renderer(render, 40)
-    expected = 2 * np.asarray(rays.viewdirs)
-    np.testing.assert_allclose(image(jnp.float32(2), rays).rgb, expected, rtol=1e-6)
-    assert tried[:2] == [40, 20] and set(tried[2:]) == {10}
-    assert "out of memory in the image with 40 rays per chunk (--chunk)" in capsys.readouterr().err
-    image(jnp.float32(3), rays)
-    assert set(tried[2:]) == {10} and not capsys.readouterr().err, "the fitting chunk is remembered"
-    tried.clear()
-    np.testing.assert_allclose(image(jnp.float32(2), rays, chunk=1000).rgb, expected, rtol=1e-6)
-    assert tried[0] == 64  # all rays, in one padded shape
-    monkeypatch.setattr(memory, "available", lambda: 12 * 16 + 100)
-    tried.clear()
-    memory.image_renderer(colors, 40)(jnp.float32(2), rays)
-    assert "image with 40 rays per chunk (--chunk): needs 0.0 MB" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("chunk", [16, 64])
-@pytest.mark.parametrize("placed", [False, True])  # parameters that are bound to a device, as those of a checkpoint
-@pytest.mark.parametrize("culled", [False, True])
-def test_an_image_is_compiled_once(chunk, placed, culled):
-    rays, compiled = jax.tree.map(jnp.asarray, random_rays(0, (6, 7))), []
-
-    @jax.jit
-    def colors(scale, rays):
-        empty = render_background(rays)
-        return dataclasses.replace(empty, rgb=scale * rays.viewdirs)
-
-    def cull(scale, rays):
-        return scale * rays.viewdirs[..., 0] > 0, render_background(rays)
-
-    def listen(event, seconds, fun_name="", **_):
-        if event.endswith("backend_compile_duration") and fun_name == "jit(colors)":
-            compiled.append(seconds)
-
-    scale = jax.device_put(jnp.float32(2), jax.devices()[0] if placed else None)
-    image = memory.image_renderer(colors, chunk, cull if culled else None)
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        for _ in range(2):
-            rendered = np.asarray(rays.viewdirs[..., :1]) > (0 if culled else -2)
-            np.testing.assert_allclose(image(scale, rays).rgb, rendered * 2 * rays.viewdirs, rtol=1e-6)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-    assert len(compiled) == 1
 
 
 @pytest.mark.slow
@@ -212,10 +143,10 @@ def test_training_with_pixels_on_the_host_is_bit_exact(compiled_once, tmp_path, 
     """It is, from the start and resumed."""
     states = []
     for kind, ends in (("device", (4,)), ("host", (2, 4))):
-        monkeypatch.setattr(loop, "_stay_on_host", lambda pixels, kind=kind: kind == "host")
+        monkeypatch.setattr(compiled_step, "_stay_on_host", lambda pixels, kind=kind: kind == "host")
         (tmp_path / kind).mkdir()
         for steps in ends:
-            experiment = smoke_experiment(max_steps=steps, parallel="jit")._replace(model=toy_model())
+            experiment = smoke_experiment(max_steps=steps)._replace(model=toy_model())
             views = experiment.load_split("train")
             views = dataclasses.replace(views, mask=np.arange(len(views.pixels)) % 3 > 0)
             assert loop.run_training(experiment, views, tmp_path / kind)
@@ -226,9 +157,9 @@ def test_training_with_pixels_on_the_host_is_bit_exact(compiled_once, tmp_path, 
 
 def test_pixels_stay_on_the_host_if_the_device_is_small(monkeypatch):
     pixels = np.zeros((100, 4), np.uint8)
-    assert not loop._stay_on_host(pixels)  # a CPU maps them
+    assert not compiled_step._stay_on_host(pixels)  # a CPU maps them
     device = types.SimpleNamespace(platform="gpu", memory_stats=lambda: {"bytes_limit": 900, "bytes_in_use": 150})
     monkeypatch.setattr(jax, "local_devices", lambda: [device])
-    assert loop._stay_on_host(pixels) and not loop._stay_on_host(pixels[:90])
+    assert compiled_step._stay_on_host(pixels) and not compiled_step._stay_on_host(pixels[:90])
     device.memory_stats = lambda: None
-    assert not loop._stay_on_host(pixels)
+    assert not compiled_step._stay_on_host(pixels)

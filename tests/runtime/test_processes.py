@@ -10,7 +10,7 @@ import pytest
 
 import two_hosts
 from helpers import assert_same
-from jaxnerf.runtime import devices, processes
+from jaxnerf.runtime import processes
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
@@ -126,12 +126,6 @@ def test_missing_coordinator_prints_one_line(tmp_path):
     assert code == 1 and len(err.splitlines()) == 1, err
     assert err.startswith(f"error: waited 1 s for the other processes at {address}: nothing answers there")
     assert not (tmp_path / "run").exists()
-
-
-def test_jit_in_several_processes_is_an_error(monkeypatch):
-    monkeypatch.setattr(jax, "process_count", lambda: 2)
-    with pytest.raises(ValueError, match="parallel is 'jit' in 2 processes; set it to 'auto'"):
-        devices.devices_of("jit")
 
 
 def test_difference_between_processes_is_an_error(monkeypatch):

@@ -9,10 +9,10 @@ import threading
 
 import pytest
 
-from jaxnerf.evaluation import aggregate
+from jaxnerf.evaluation import aggregate, image_renderer
 from jaxnerf.evaluation.evaluate import score_run
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.runtime import memory, shards
+from jaxnerf.runtime import shards
 from jaxnerf.training import workdir
 from runs import render_path, run_forked
 
@@ -48,8 +48,8 @@ def fresh(run, whole):
 @pytest.fixture
 def rendered(monkeypatch):
     """A list that grows by an entry for each rendered frame."""
-    calls, render_image = [], memory.render_image
-    monkeypatch.setattr(memory, "render_image", lambda *a, **k: calls.append(1) or render_image(*a, **k))
+    calls, render_image = [], image_renderer.render_image
+    monkeypatch.setattr(image_renderer, "render_image", lambda *a, **k: calls.append(1) or render_image(*a, **k))
     return calls
 
 

@@ -70,7 +70,7 @@ def test_each_long_stage_of_a_run_says_what_it_does(shown, monkeypatch, unoptimi
     monkeypatch.setattr(stages, "_FIRST", 0.0)
     captures.write_colmap(tmp_path / "data", captures.noise(captures.orbit(9)))
     config = smoke_config(max_steps=4, log_every=4, save_every=4)
-    config.update_from_flattened_dict({**PACKED, "occupancy.min_views": 1, "occupancy.contracted": True})
+    config.update_from_flattened_dict({**PACKED, "occupancy.min_views": 1, "scene.contracted": True})
     config.data.format, config.data.dir, config.data.world = "colmap", str(tmp_path / "data"), "around"
     config.data.background = "none"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -15,17 +15,18 @@ import captures
 from helpers import compiled
 from jaxnerf import Camera, SparsePoints, Views
 from jaxnerf.configs import default, lego_fast, lego_mlp_fast
-from jaxnerf.data import dataset, synthetic
-from jaxnerf.data.dataset import DataOptions
+from jaxnerf.data import synthetic
 from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
 from jaxnerf.data.geometry import visual_hull
 from jaxnerf.data.ray_batches import view_rays
+from jaxnerf.data.scene import SceneOptions
 from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO
 from jaxnerf.registry import FIELDS, Part
 from jaxnerf.training import workdir
 from jaxnerf.training.auto_config import device_fields, fill_from, resolve, resolve_for_device
 from jaxnerf.training.build import build
+from jaxnerf.training.compiled_step import steps_per_dispatch
 from jaxnerf.training.config import RunConfig, auto_fields, changed, flatten, read_config
 from jaxnerf.training.options import UNLIMITED_STEPS
 from test_configs import fields
@@ -46,20 +47,18 @@ AUTO_FIELDS = {
     "hash_grid.view_depth": 1,
     "hash_grid.prefilter": True,
     "occupancy.pool_samples_per_ray": 6.0,
-    "occupancy.contracted": True,
-    "occupancy.lower": (-1.0, -2.0, -3.0),
-    "occupancy.upper": (1.0, 2.0, 3.5),
+    "scene.contracted": True,
+    "scene.lower": (-1.0, -2.0, -3.0),
+    "scene.upper": (1.0, 2.0, 3.5),
     "occupancy.step_size": 0.25,
     "occupancy.resolution": 32,
     "occupancy.min_views": 2,
-    "occupancy.update_chunk": 4096,
     "data.near": 0.5,
-    "data.background_color": (0.5, 0.4, 0.3),
+    "scene.background": (0.5, 0.4, 0.3),
     "cameras.num_images": 60,
     "train.batch_size": 512,
     "train.rays_per_side": 2,
     "train.microbatch_size": 128,
-    "train.steps_per_dispatch": 8,
     "train.max_steps": 300,
     "train.lr_steps": 300,
     "eval.sample_multiplier": 3,
@@ -68,11 +67,12 @@ AUTO_FIELDS = {
 }
 
 
-def auto_config(field="hash_grid", **occupancy):
-    """Returns the default config with the occupancy sampler, whose sizes are "auto"."""
+def auto_config(field="hash_grid", **options):
+    """Returns the default config with the occupancy sampler, whose sizes are "auto", and options of it or the scene."""
     config = default.get_config()
     config.data.size, config.field, config.sampler = 24, field, "occupancy"
-    config.occupancy.update(occupancy)
+    for name, value in options.items():
+        config["scene" if name in config.scene else "occupancy"][name] = value
     if field == "mlp":
         config.fine.num_freqs = AUTO
     return config
@@ -169,9 +169,9 @@ def resolved(views):
 
 def test_every_auto_field_is_inferred_and_logged(resolved):
     config, _, lines = resolved
-    occupancy = config.occupancy
-    longest = max(np.subtract(occupancy.upper, occupancy.lower))
-    assert len(occupancy.lower) == len(occupancy.upper) == 3 and 2.3 < longest < 3.5
+    occupancy, scene = config.occupancy, config.scene
+    longest = max(np.subtract(scene.upper, scene.lower))
+    assert len(scene.lower) == len(scene.upper) == 3 and 2.3 < longest < 3.5
     assert 0.3 * PIXEL < occupancy.step_size < PIXEL
     assert 0.3 * PIXEL < longest / occupancy.resolution < PIXEL
     sizes = config.hash_grid.resolutions
@@ -204,14 +204,14 @@ def test_config_of_the_paper_is_resolved_and_logs_nothing_about_a_box(views):
 def test_rays_that_hit_nothing_have_the_mean_color_of_an_unbounded_capture(views):
     """Black behind a bright scene would be replaced by fog in front of the cameras."""
     given, rgb = auto_config(), np.random.default_rng(0).integers(0, 256, (*views.pixels.shape[:1], 3), np.uint8)
-    given.data.background, given.occupancy.contracted, rgb[..., 0] = "none", True, 51
+    given.data.background, given.scene.contracted, rgb[..., 0] = "none", True, 51
     masked = np.arange(len(rgb)) % 2 == 0
     rgb[~masked] = 255
     shown = dataclasses.replace(views, pixels=rgb, mask=masked)
     for value, expected in ((AUTO, rgb[masked].mean(axis=0) / 255), ((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))):
-        given.data.background_color = value
+        given.scene.background = value
         resolved = resolve(given, shown)
-        np.testing.assert_allclose(resolved.config.data.background_color, expected, atol=5e-4)
+        np.testing.assert_allclose(resolved.config.scene.background, expected, atol=5e-4)
         assert ("mean colour" in "".join(resolved.lines)) == (value == AUTO)
         experiment = build(resolve_for_device(resolved.config)[0])
         rays = view_rays(shown, 0, np.float32([[1.5, 1.5]]))
@@ -232,12 +232,12 @@ def test_otherwise_black_or_the_color_behind_alpha_is_behind_the_scene(views, ba
     given.data.background, given.sampler = background, sampler
     config = resolve(given, dataclasses.replace(views, pixels=views.pixels[:, :3])).config
     expected = None if background == "none" else (1.0, 1.0, 1.0)
-    assert config.data.background_color == () and dataset.color_behind(config.data) == expected
-    given.data.background_color = (0.1, 0.2, 0.3)
+    assert config.scene.background == () and config.scene.color_behind(background) == expected
+    given.scene.background = (0.1, 0.2, 0.3)
     if background == "none":
-        assert dataset.color_behind(resolve(given, views).config.data) == (0.1, 0.2, 0.3)
+        assert resolve(given, views).config.scene.color_behind(background) == (0.1, 0.2, 0.3)
     else:
-        with pytest.raises(ValueError, match="set data.background to 'none', or data.background_color to"):
+        with pytest.raises(ValueError, match="set data.background to 'none', or scene.background to"):
             resolve(given, views)
 
 
@@ -253,16 +253,15 @@ def test_the_mean_color_of_many_pixels_is_that_of_all_that_the_mask_includes(vie
 
 
 def test_an_unresolved_background_color_is_an_error():
-    data = DataOptions(background="none")
-    with pytest.raises(ValueError, match="data.background_color is 'auto'; resolve the config"):
-        dataset.color_behind(data)
+    with pytest.raises(ValueError, match="scene.background is 'auto'; resolve the config"):
+        SceneOptions().color_behind("none")
 
 
 @pytest.mark.parametrize("color", [(0.5, 0.5), (0.5, 1.5, 0.5), (0.5, "red", 0.5)])
 def test_a_background_color_is_red_green_and_blue(views, color):
     config = auto_config()
-    config.data.background_color = color
-    with pytest.raises(ValueError, match="data.background_color is .*expected red, green and blue"):
+    config.scene.background = color
+    with pytest.raises(ValueError, match="scene.background is .*expected red, green and blue"):
         resolve(config, views)
 
 
@@ -272,9 +271,10 @@ def test_explicit_values_do_not_change(views):
     config = resolve(given, views).config
     assert as_json(given) == before and unresolved(given)
     changed = {name for name, value in fields(config).items() if value != fields(given)[name]}
-    names = ("contracted", "lower", "upper", "step_size", "resolution", "min_views")
-    expected = {"data.world", "hash_grid.resolutions", *(f"occupancy.{name}" for name in names)}
-    expected |= {"data.near", "data.background_color", "cameras.num_images", "losses.depth", "hash_grid.prefilter"}
+    expected = {f"occupancy.{name}" for name in ("step_size", "resolution", "min_views")}
+    expected |= {f"scene.{name}" for name in ("contracted", "lower", "upper")}
+    expected |= {"data.world", "hash_grid.resolutions"}
+    expected |= {"data.near", "scene.background", "cameras.num_images", "losses.depth", "hash_grid.prefilter"}
     assert changed == expected
 
 
@@ -293,7 +293,7 @@ def test_explicit_sizes_do_not_change(views, given):
     config = auto_config(**given)
     config.hash_grid.resolutions = (5, 6)
     got, _, lines = resolve(config, views)
-    assert {name: getattr(got.occupancy, name) for name in given} == given
+    assert {name: getattr(got.scene, name, getattr(got.occupancy, name, None)) for name in given} == given
     assert got.hash_grid.resolutions == (5, 6)
     assert not unresolved(got) and not any(line.startswith("hash grid") for line in lines)
 
@@ -319,10 +319,8 @@ def test_fields_that_nothing_infers_are_an_error(views, monkeypatch):
         resolve(config, views)
 
 
-@pytest.mark.parametrize(
-    "backend, chunk, cells, steps", [("cpu", 2**13, 8160, 1), ("gpu", 2**16, 2**18, 10), ("tpu", 2**16, 2**18, 10)]
-)
-def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_path, backend, chunk, cells, steps):
+@pytest.mark.parametrize("backend, chunk, steps", [("cpu", 2**13, 1), ("gpu", 2**16, 10), ("tpu", 2**16, 10)])
+def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_path, backend, chunk, steps):
     """They stay "auto" in config.json, so the same workdir continues on another device."""
     given = resolved.config
     assert set(auto_fields(given)) == set(DEVICE_FIELDS)
@@ -332,13 +330,13 @@ def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_pa
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     config, lines = resolve_for_device(read)
     assert not auto_fields(config) and len(lines) == len(DEVICE_FIELDS)
-    assert config.eval.chunk == chunk and config.occupancy.update_chunk == cells
+    assert config.eval.chunk == chunk
     # 10 divides the numbers of steps between which rows are logged, checkpoints saved and dead networks sought.
-    assert config.train.steps_per_dispatch == steps
+    assert steps_per_dispatch(config.train, backend) == steps
     assert config.hash_grid.compute_dtype == ("float32" if backend == "cpu" else "bfloat16")
     assert config.train.batch_size % config.train.microbatch_size == 0
     explicit = {"eval.chunk": 5, "eval.max_samples": 6, "train.microbatch_size": 64}
-    explicit |= {"train.steps_per_dispatch": 3, "occupancy.update_chunk": 7, "hash_grid.compute_dtype": "float32"}
+    explicit |= {"hash_grid.compute_dtype": "float32"}
     config, lines = resolve_for_device(changed(read, explicit))
     assert {name: flatten(config.to_dict())[name] for name in explicit} == explicit and not lines
 
@@ -427,7 +425,7 @@ def test_odd_cameras_are_resolved(name, sampler, field):
     config.sampler = sampler
     got = resolve(config, of_cameras(ODD_CAMERAS[name])).config
     assert not unresolved(got)
-    box = np.subtract(got.occupancy.upper, got.occupancy.lower)
+    box = np.subtract(got.scene.upper, got.scene.lower)
     assert (0.5 < box).all() and (box < 20).all() and 1e-3 < got.occupancy.step_size < 1
 
 
@@ -435,7 +433,7 @@ def test_odd_cameras_are_resolved(name, sampler, field):
 @pytest.mark.parametrize("name", ODD_CAMERAS)
 def test_a_far_away_end_of_rays_is_resolved(name, near, far):
     got = resolve(auto_config("mlp"), of_cameras(ODD_CAMERAS[name], near, far)).config
-    assert np.isfinite([*got.occupancy.lower, *got.occupancy.upper, got.occupancy.step_size]).all()
+    assert np.isfinite([*got.scene.lower, *got.scene.upper, got.occupancy.step_size]).all()
 
 
 def test_octaves_are_inferred(views):
@@ -521,8 +519,8 @@ def test_alpha_does_not_bound_the_box_of_a_scene_that_moves(views):
     """Each image shows the bodies where they are at one time; the intersection of all would cut them off."""
 
     def box(views, **options):
-        occupancy = resolve(auto_config(contracted=False, **options), views).config.occupancy
-        return occupancy.lower, occupancy.upper
+        scene = resolve(auto_config(contracted=False, **options), views).config.scene
+        return scene.lower, scene.upper
 
     pixels = views.pixels.reshape(-1, 24, 24, 4).copy()
     pixels[:, :9], pixels[:, 15:], pixels[:, :, :9], pixels[:, :, 15:] = 0, 0, 0, 0
@@ -540,7 +538,7 @@ def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):
         )
         config = auto_config(use_alpha=False, contracted=contracted)
         got = resolve(config, larger).config
-        longest = max(np.subtract(got.occupancy.upper, got.occupancy.lower))
+        longest = max(np.subtract(got.scene.upper, got.scene.lower))
         return got.hash_grid.resolutions, got.occupancy.resolution, round(longest / got.occupancy.step_size)
 
     for contracted, finest in ((False, (34, 69, 256, 512)), (True, (181, 362, 512, 512))):
@@ -584,7 +582,7 @@ def test_a_step_is_at_most_as_long_as_a_cell_of_any_size(views, cells, steps):
 def test_space_is_not_contracted_around_the_cameras(views, zoom, expected):
     cameras = dataclasses.replace(views.cameras, focal=np.float32(zoom * np.asarray(views.cameras.focal)))
     views = dataclasses.replace(views, cameras=cameras)
-    section = resolve(auto_config(use_alpha=False, contracted=True), views).config.occupancy
+    section = resolve(auto_config(use_alpha=False, contracted=True), views).config.scene
     lower, upper = np.float64(section.lower), np.float64(section.upper)
     inner = (upper - lower) / 4  # half the side of the part that is not contracted
     eyes, middle = np.asarray(cameras.to_world)[:, :, 3], (lower + upper) / 2
@@ -600,7 +598,7 @@ def test_space_is_not_contracted_around_the_cameras(views, zoom, expected):
 
 
 def test_box_holds_all_matter_of_the_embedded_scene(resolved):
-    lower, upper = (np.float32(bound) for bound in (resolved.config.occupancy.lower, resolved.config.occupancy.upper))
+    lower, upper = (np.float32(bound) for bound in (resolved.config.scene.lower, resolved.config.scene.upper))
     x = np.random.default_rng(0).uniform(-2, 2, (1, 300_000, 3)).astype(np.float32)
     density, _ = compiled(still_life.still_life)(x, x)
     outside = ((x < lower) | (x > upper)).any(-1)
@@ -610,12 +608,12 @@ def test_box_holds_all_matter_of_the_embedded_scene(resolved):
 def test_without_alpha_the_box_is_what_all_cameras_see(resolved, views):
     config, _, lines = resolve(auto_config(use_alpha=False), views)
     opaque = dataclasses.replace(views, pixels=views.pixels[:, :3])
-    assert resolve(auto_config(), opaque).config.occupancy.lower == config.occupancy.lower
+    assert resolve(auto_config(), opaque).config.scene.lower == config.scene.lower
     assert any("as large as the images" in line for line in lines)
     # The cameras are 4 units from the origin, look at it, and have a focal length of 1.36 images.
-    np.testing.assert_allclose(config.occupancy.upper, 3 * [4 / 1.36 / 2], atol=1e-3)
-    np.testing.assert_allclose(config.occupancy.lower, 3 * [-4 / 1.36 / 2], atol=1e-3)
-    assert (np.float64(resolved.config.occupancy.lower) >= np.float64(config.occupancy.lower) - 1e-4).all()
+    np.testing.assert_allclose(config.scene.upper, 3 * [4 / 1.36 / 2], atol=1e-3)
+    np.testing.assert_allclose(config.scene.lower, 3 * [-4 / 1.36 / 2], atol=1e-3)
+    assert (np.float64(resolved.config.scene.lower) >= np.float64(config.scene.lower) - 1e-4).all()
 
 
 def test_box_is_in_the_units_of_the_scene(resolved, views):
@@ -624,8 +622,8 @@ def test_box_is_in_the_units_of_the_scene(resolved, views):
     poses[:, :, 3] *= 1e-3
     small = dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, to_world=poses))
     got = resolve(auto_config(), small).config
-    for name in ("lower", "upper", "step_size"):
-        found, expected = (np.float64(getattr(each.occupancy, name)) for each in (got, resolved.config))
+    for section, name in (("scene", "lower"), ("scene", "upper"), ("occupancy", "step_size")):
+        found, expected = (np.float64(getattr(getattr(each, section), name)) for each in (got, resolved.config))
         np.testing.assert_allclose(1e3 * found, expected, rtol=2e-3)
     assert got.occupancy.resolution == resolved.config.occupancy.resolution
 
@@ -642,8 +640,8 @@ def test_ndc_box_holds_all_rays():
         rays = compiled(view_rays, "ndc")(views, index, np.float32(pixels), ndc=True)
         for t in (rays.near, rays.far):
             x = rays.origins + t[:, None] * rays.directions
-            assert (x >= np.float64(got.occupancy.lower) - 2e-4).all()
-            assert (x <= np.float64(got.occupancy.upper) + 2e-4).all()
+            assert (x >= np.float64(got.scene.lower) - 2e-4).all()
+            assert (x <= np.float64(got.scene.upper) + 2e-4).all()
 
 
 def test_workdir_gives_the_same_model(resolved, views, tmp_path):
@@ -669,26 +667,24 @@ def test_workdir_gives_the_same_model(resolved, views, tmp_path):
 def test_sizes_of_lego(scenes_dir):
     lego = captures.load_blender(scenes_dir / "lego", split="train", factor=8)  # with fewer views the box is larger
     config = resolve(lego_fast.get_config(), lego).config
-    occupancy = config.occupancy
-    assert (np.abs([occupancy.lower, occupancy.upper]) < 1.3).all()
+    occupancy, scene = config.occupancy, config.scene
+    assert (np.abs([scene.lower, scene.upper]) < 1.3).all()
     assert 0.015 < occupancy.step_size < 0.025
     assert 64 <= occupancy.resolution <= 128 and 64 <= config.hash_grid.resolutions[-1] <= 256
     build(resolve_for_device(config)[0])
     slow = resolve(lego_mlp_fast.get_config(), lego).config
-    assert slow.occupancy.lower == occupancy.lower and slow.occupancy.step_size == occupancy.step_size
+    assert slow.scene.lower == scene.lower and slow.occupancy.step_size == occupancy.step_size
     assert config.train.max_steps == config.train.lr_steps == 10000
     build(resolve_for_device(slow)[0])
 
 
-@pytest.mark.parametrize(
-    ("spread", "num_scales", "expected"), [(1.7, 1, "off"), (1.7, 2, "off"), (1, 3, "on"), (6, 1, "on")]
-)
-def test_features_are_damped_where_footprints_differ(views, spread, num_scales, expected):
+@pytest.mark.parametrize(("spread", "expected"), [(1.7, "off"), (6, "on")])
+def test_features_are_damped_where_footprints_differ(views, spread, expected):
     away = np.linspace(1, spread, len(views.size))[:, None]
     focal = np.asarray(views.cameras.focal) / away
     views = dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, focal=focal.astype(np.float32)))
     config = auto_config()
-    config.data.num_scales, config.fine.prefilter, config.coarse.prefilter = num_scales, "auto", "auto"
+    config.fine.prefilter, config.coarse.prefilter = "auto", "auto"
     config.coarse.encode = False
     resolved = resolve(config, views)
     assert resolved.config.hash_grid.prefilter is resolved.config.fine.prefilter is (expected == "on")
@@ -709,6 +705,6 @@ def test_footprints_are_those_of_the_points_that_views_show(views):
     found = dataclasses.replace(views, sparse=sparse)
     assert footprint_spread(found) == pytest.approx(2, rel=1e-5)
     focal = float(views.cameras.focal[0, 0])
-    assert footprint_radii(found, num_scales=3) == pytest.approx(np.array([3, 4 * 6]) / focal / 3**0.5, rel=1e-5)
+    assert footprint_radii(found) == pytest.approx(np.array([3, 6]) / focal / 3**0.5, rel=1e-5)
     behind = dataclasses.replace(sparse, positions=pose[:, :, 3] + pose[:, :, 2])  # as wrong matches are: not counted
     assert footprint_radii(dataclasses.replace(views, sparse=behind)) == footprint_radii(views)

@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("unoptimized")
 BOTH = {"cameras.exposure": True, "cameras.refine": True, "cameras.refine_start_step": 0}
 COUNT, SIZE = 6, 24
 TRAIN = {"lr_init": 1e-2, "lr_final": 1e-4, "lr_steps": 100, "warmup_steps": 0, "averaging_power": 0.0, "muon": 0.0}
-TRAIN |= {"beta1": 0.9, "beta2": 0.99, "epsilon": 1e-15}
+TRAIN |= {"beta2": 0.99, "epsilon": 1e-15}
 RATES = {"exposure_lr": 0.03, "refine_lr": 0.01, "refine_start_step": 0}
 
 

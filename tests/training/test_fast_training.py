@@ -62,7 +62,7 @@ class Tiny:
         views, test = (synthetic.load_synthetic(size=SIZE, split=split) for split in ("train", "test"))
         config = resolve_for_device(resolve(tiny_config(), views).config)[0]
         self.experiment = experiment = build(config)
-        self.field = from_options(config.hash_grid, (config.occupancy.lower, config.occupancy.upper))
+        self.field = from_options(config.hash_grid, (config.scene.lower, config.scene.upper))
         self.cells, data = experiment.prepare(views)
         self.data = jax.tree.map(jnp.asarray, data)
         self.train = jax.jit(self._train)
@@ -214,13 +214,13 @@ def toy():
     config = tiny_config()
     config.occupancy.update({"lower": (-1.5,) * 3, "upper": (1.5,) * 3, "resolution": 8})
     train = config.train
-    train.batch_size, train.microbatch_size, train.parallel = 64, 16, "sharded"
+    train.batch_size, train.microbatch_size = 64, 16
     train.log_every, train.save_every, train.max_steps = 3, 6, 12
     views = synthetic.load_synthetic(size=SIZE)
     experiment, field = build(resolve_for_device(resolve(config, views).config)[0]), toy_field()
     schedule = make_grid_schedule(
-        config.occupancy.lower,
-        config.occupancy.upper,
+        config.scene.lower,
+        config.scene.upper,
         resolution=8,
         step_size=0.5,
         field=field,
@@ -258,28 +258,27 @@ def toy():
 
 @pytest.fixture(scope="module")
 def toy_runs(unoptimized, toy):
-    """Twelve steps in each mode of parallelism."""
+    """Twelve steps on one device and on four."""
     views = toy.load_split("train")
     cells, data = toy.prepare(views)
     step = make_train_step(toy.model, toy.optimizer, toy.draw, toy.losses)
     return {
-        mode: run_steps(
+        count: run_steps(
             step,
             create_state(toy.model, toy.optimizer, 0, cells),
             data,
             12,
-            mode,
+            count,
             batch_size=64,
             microbatch_size=16,
         )
-        for mode in ("jit", "sharded", "pmap")
+        for count in (1, 4)
     }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["sharded", "pmap"])
-def test_devices_give_the_same_update_grid_and_counts(toy_runs, toy, mode):
-    (one, one_rows), (many, many_rows) = toy_runs["jit"], toy_runs[mode]
+def test_devices_give_the_same_update_grid_and_counts(toy_runs, toy):
+    (one, one_rows), (many, many_rows) = toy_runs[1], toy_runs[4]
     start = create_state(toy.model, toy.optimizer, 0)
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), one.params, start.params)
     assert min(jax.tree.leaves(moved)) > 1e-3, "the comparison needs parameters that moved"
@@ -294,7 +293,7 @@ def test_devices_give_the_same_update_grid_and_counts(toy_runs, toy, mode):
 
 @pytest.mark.slow
 def test_small_sample_buffer_drops_no_ray(toy_runs):
-    state, rows = toy_runs["jit"]
+    state, rows = toy_runs[1]
     assert all_finite((state.params, rows)) and int(state.counters["nonfinite"]) == 0
     assert [row["rays"] for row in rows] == [64] * len(rows)
     assert int(state.counters["rays_dropped"]) == 0
@@ -327,7 +326,7 @@ def test_workdir_restores_the_scene_and_its_images(unoptimized, tmp_path, capsys
     config.field, config.occupancy.step_size = "mlp", "auto"
     config.fine.update({"depth": 1, "width": 8, "num_freqs": "auto", "view_width": 8})
     config.fine.update({"density_activation": "softplus", "density_bias": 1.0})
-    config.train.update({"batch_size": 64, "max_steps": 20, "log_every": 10, "parallel": "jit"})
+    config.train.update({"batch_size": 64, "max_steps": 20, "log_every": 10})
     assert train_and_evaluate(config, tmp_path)
     said = capsys.readouterr().err
     assert all(word in said for word in ("box ", "step size ", "grid ", "octaves ", "valid"))

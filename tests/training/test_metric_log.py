@@ -6,8 +6,10 @@ import types
 import numpy as np
 import pytest
 
+from jaxnerf.runtime import stages
 from jaxnerf.training import metric_log
-from jaxnerf.training.options import UNLIMITED_STEPS
+from jaxnerf.training.options import UNLIMITED_STEPS, TrainOptions
+from jaxnerf.training.pace import Clock, Pace
 
 STEP = {
     "loss": 0.5,
@@ -26,10 +28,18 @@ EXPERIMENT = types.SimpleNamespace(
 )
 
 
+class StoppedClock(Clock):
+    def seconds(self):
+        return 5.0
+
+    def rate(self, rays):
+        return 100.0
+
+
 def row(steps, step=20):
-    return metric_log.row(
-        EXPERIMENT, step, [STEP | each for each in steps], seconds=5.0, rate=lambda rays: 100.0, compile_seconds=1.0
-    )
+    clock = StoppedClock(5.0, 0)
+    pace = Pace(TrainOptions(), clock, None)
+    return metric_log.row(EXPERIMENT, step, [STEP | each for each in steps], clock, pace, 1.0)
 
 
 def test_row_averages_errors_and_keeps_the_last_counters():
@@ -61,9 +71,9 @@ def test_a_note_is_a_line_above_the_bar():
             return True
 
     for stream, expected in ((Terminal(), "\r\033[Ka\n\r\033[Kb\n"), (io.StringIO(), "a\nb\n")):
-        metric_log.Progress(10, stream).note("a", "b")
+        stages.Progress(10, stream).note("a", "b")
         assert stream.getvalue() == expected
-        metric_log.Progress(10, stream, show=False).note("c")
+        stages.Progress(10, stream, show=False).note("c")
         assert stream.getvalue() == expected
 
 
@@ -71,7 +81,7 @@ def test_a_note_is_a_line_above_the_bar():
 def test_progress_of_a_run_of_limited_time(max_steps, shown, done):
     """Its part is that of the time, and the number of steps is shown only if it may end the run."""
     train, stream = types.SimpleNamespace(batch_size=64, max_steps=max_steps, max_seconds=10.0), io.StringIO()
-    metric_log.Progress(metric_log.all_steps(train), stream).show(20, "text", 0.5)
+    stages.Progress(metric_log.all_steps(train), stream).show(20, "text", 0.5)
     assert stream.getvalue() == shown
     assert metric_log.fraction_done(row([{}]), train) == done
     assert metric_log.of_all(20, train) == ("20 of 100" if max_steps == 100 else "20")

@@ -259,7 +259,7 @@ def test_averaged_params_returns_the_average_or_the_last_parameters():
 
 @pytest.mark.slow
 def test_run_renders_its_average(unoptimized, tmp_path):
-    config = smoke_config(averaging_power=10.0, max_steps=8, parallel="jit")
+    config = smoke_config(averaging_power=10.0, max_steps=8)
     config.sampling.num_fine = 0  # one network compiles faster
     config.fine.depth = 1
     assert train_and_evaluate(config, tmp_path)

@@ -6,15 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnerf.training.loop import _compile, _Pace
+from jaxnerf.training.compiled_step import compile_training
 from jaxnerf.training.optimizer import DecayData, learning_rate
 from jaxnerf.training.options import TrainOptions
+from jaxnerf.training.pace import Pace
 from jaxnerf.training.step import TrainData
 from runs import smoke_experiment
-
-
-def experiment_of(train):
-    return SimpleNamespace(config=SimpleNamespace(train=train))
 
 
 @pytest.mark.parametrize("power", [1.0, 4.0])
@@ -22,14 +19,14 @@ def experiment_of(train):
 def test_it_reaches_its_end_when_the_time_or_the_steps_do(seconds, step, fraction, power):
     options = TrainOptions(lr_init=1e-2, lr_final=1e-4, lr_steps=100, lr_decay_power=power, max_seconds=10.0)
     data = TrainData(None, None, None, None, decay=jax.device_put(DecayData(np.float32(100), np.float32(1))))
-    pace = _Pace(experiment_of(options), SimpleNamespace(seconds=lambda: seconds), data)
+    pace = Pace(options, SimpleNamespace(seconds=lambda: seconds), data)
     decay = pace.data_of(step).decay
     assert float(learning_rate(options, decay)(step - 1)) == pytest.approx(1e-2 * 0.01 ** (fraction**power), rel=1e-5)
 
 
 def test_without_a_limit_nothing_changes():
     data = TrainData(None, None, None, None)
-    pace = _Pace(experiment_of(TrainOptions()), None, data)
+    pace = Pace(TrainOptions(), None, data)
     assert pace.data_of(7) is data and pace.scale == 1.0
 
 
@@ -46,5 +43,5 @@ def test_runs_that_differ_in_their_length_have_the_same_compiled_step(monkeypatc
     lengths = [{"max_steps": 30, "lr_steps": 30}, {"max_steps": 70, "lr_steps": 50}, {"max_seconds": 9.0}]
     for length in [*lengths, {"lr_final": 1e-6}]:
         experiment = smoke_experiment(batch_size=64, **length)
-        _compile(experiment, experiment.load_split("train"))
+        compile_training(experiment, experiment.load_split("train"))
     assert programs[0] == programs[1] == programs[2] != programs[3]

@@ -21,8 +21,9 @@ from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.evaluation.supersampling import trained_footprint
 from jaxnerf.options import Device, Facts
 from jaxnerf.runtime import devices
-from jaxnerf.training import auto_config, build, loop
+from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.compiled_step import _gather_ahead
 from jaxnerf.training.options import TrainOptions
 from jaxnerf.training.pixel_rays import PixelRays
 from jaxnerf.training.state import create_state
@@ -157,17 +158,17 @@ def test_one_ray_a_pixel_leaves_the_program_as_it_is():
     assert len(set(texts)) == 1
 
 
-_SPLITS = [("jit", 16), ("sharded", 4), ("pmap", 16)]
+_SPLITS = [(1, 16), (4, 4)]
 
 
 @pytest.mark.parametrize(
-    ("mode", "size"), [("sharded", 16), *(pytest.param(*x, marks=pytest.mark.slow) for x in _SPLITS)]
+    ("num_devices", "size"), [(4, 16), *(pytest.param(*x, marks=pytest.mark.slow) for x in _SPLITS)]
 )
-def test_it_does_not_depend_on_how_the_batch_is_split(mode, size):
+def test_it_does_not_depend_on_how_the_batch_is_split(num_devices, size):
     experiment, _, cells, data = experiment_of()
     state = dataclasses.replace(create_state(experiment.model, experiment.optimizer, 0, cells), step=jnp.int32(7))
     _, expected = compiled_step()(state, data, positions_of())
-    options = {"batch_size": RAYS, "mode": mode, "microbatch_size": size}
+    options = {"batch_size": RAYS, "devices": jax.devices()[:num_devices], "microbatch_size": size}
     run, state, data = devices.compile_step(step_of(experiment), state, data, **options)
     _, metrics = run(state, data)
     for name in ("loss", "grad_norm", "rays"):
@@ -187,9 +188,10 @@ def uninterrupted(compiled_once, tmp_path_factory):
     [(4, 1), (8, 1), (STEPS, 5)],
 )
 def test_a_run_resumed_in_either_part_and_one_of_several_steps_a_dispatch_are_the_same(
-    uninterrupted, tmp_path, resumed_at, per_dispatch
+    uninterrupted, tmp_path, resumed_at, per_dispatch, monkeypatch
 ):
-    changes = {"eval.at_end": False, "train.steps_per_dispatch": per_dispatch, "train.log_every": per_dispatch}
+    monkeypatch.setattr("jaxnerf.training.compiled_step.steps_per_dispatch", lambda *_: per_dispatch)
+    changes = {"eval.at_end": False, "train.log_every": per_dispatch}
     for steps in sorted({resumed_at, STEPS}):
         assert train_and_evaluate(config_of(**changes, **{"train.max_steps": steps}), tmp_path / "run")
     template = create_state(*(getattr(experiment_of()[0], name) for name in ("model", "optimizer")), 0)
@@ -210,7 +212,7 @@ def test_pixels_that_are_sent_ahead_are_those_of_the_progress_with_which_they_we
 
     _, views, _, data = experiment_of()
     views = dataclasses.replace(views, pixels=BatchPixels(rows=jnp.zeros((4, 1), int), shape=(10, 1)))
-    step = loop._gather_ahead(run, ids, pixels)
+    step = _gather_ahead(run, ids, pixels)
     state = create_state(*(getattr(experiment_of()[0], name) for name in ("model", "optimizer")), 0)
     for passed in (0.3, 0.5, 0.8, 0.9):
         progress = ProgressData(np.float32(10), np.float32(passed))

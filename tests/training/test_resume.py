@@ -17,7 +17,7 @@ from jaxnerf.options import AUTO, Changes, values_of
 from jaxnerf.training import earlier_options, metric_log, workdir
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import read_config, to_config_dict
-from jaxnerf.training.earlier_options import Gone
+from jaxnerf.training.earlier_options import Gone, Renamed
 from jaxnerf.training.options import UNLIMITED_STEPS
 from runs import SMOKE_FLAGS, run_forked, smoke_config, start
 
@@ -122,7 +122,7 @@ def earlier(trained, tmp_path, monkeypatch):
         "eval.fog": Gone((1.0,), Changes.IMAGES, "give --fog"),
     }
     monkeypatch.setattr(earlier_options, "GONE", gone)
-    monkeypatch.setattr(earlier_options, "RENAMED", {"train.rate": "train.lr_init"})
+    monkeypatch.setattr(earlier_options, "RENAMED", {"train.rate": Renamed("train.lr_init", 5e-4)})
 
     def load(margin=0.0, fog=1.0):
         saved = json.loads((trained / "config.json").read_text())

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.data.geometry.poses import gaze_center
-from jaxnerf.data.images.image_files import image_form
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.data.readers.image_paths import ImageFinder, nearly
@@ -130,10 +129,8 @@ def _frames(content, source):
     times = read_times(entries)
     images = [_image_path(finder, frame, where) for where, frame in entries]
     poses, notes = read_poses(source, entries)
-    sized = [
-        (where, _with_size(frame, content, image), image) for (where, frame), image in zip(entries, images, strict=True)
-    ]
-    cameras, camera_notes = read_cameras([(source, content)], sized, poses)
+    shown = [(*entry, image) for entry, image in zip(entries, images, strict=True)]
+    cameras, camera_notes = read_cameras([(source, content)], shown, poses)
     frames = [
         Frame(image.stem, image, camera, time=time) for image, camera, time in zip(images, cameras, times, strict=True)
     ]
@@ -147,12 +144,6 @@ def _listed(content, source):
         found = "an empty list" if listed == [] else f"{str(listed)[:40]!r}"
         raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
     return [(f"{source}, frame {index}", frame) for index, frame in enumerate(listed)]
-
-
-def _with_size(frame, content, image):
-    """Returns the frame's entries with the size of its image where neither it nor the file states one."""
-    (height, width, _), _ = image_form(image)
-    return {key: side for key, side in (("h", height), ("w", width)) if key not in content} | frame
 
 
 def _image_path(finder, frame, where):

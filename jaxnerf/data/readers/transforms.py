@@ -23,7 +23,7 @@ _FILES = CameraFiles(
 _UNUSED = {  # facts of other programs that are no camera's, and what sets them instead
     "up": "data.up sets the axis that is up",
     "exposure": "cameras.exposure trains the exposure of each image",
-    "background_color": "data.background_color sets it",
+    "background_color": "scene.background sets it",
 }
 
 

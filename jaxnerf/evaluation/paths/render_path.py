@@ -25,7 +25,8 @@ from jaxnerf.evaluation.supersampling import MAX_RAYS, render_pixels, trained_fo
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.training.metric_log import Progress, minutes
+from jaxnerf.runtime.stages import Progress
+from jaxnerf.training.metric_log import minutes
 
 VIDEO_KINDS = ("auto", "mp4", "gif", "none")
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.data.geometry.poses import AXES
-from jaxnerf.options import Options, Range, between, is_auto, option, replaced
+from jaxnerf.options import Box, Options, Range, between, is_auto, option, replaced
 
 _PIXELS_PER_VOXEL = 1.25
 
@@ -101,7 +101,7 @@ class MeshOptions(SurfaceOptions):
         0.005, "connected pieces with fewer triangles than this fraction of all are dropped", range=between(0, 1)
     )
 
-    def check(self) -> None:
+    def check(self, box: Box | None = None) -> None:
         if self.texture and self.format == "ply":
             raise ValueError(
                 f"texture is {self.texture} and format is 'ply', expected 'glb' or 'obj'; give --format=glb or drop it"

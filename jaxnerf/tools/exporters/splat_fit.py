@@ -16,9 +16,9 @@ from jaxtyping import Array, Float
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera, Vector
 from jaxnerf.fields.hash_grid import harmonics
+from jaxnerf.runtime.stages import Progress
 from jaxnerf.tools.exporters.gaussians import LOW_PASS, MAX_ALPHA, MAX_SLOPE, Gaussians, visible_pairs
 from jaxnerf.tools.exporters.surfaces import DepthImage, inside
-from jaxnerf.training.metric_log import Progress
 
 RATES = {  # of Adam, for the first step; those of `mean` are in standard deviations along the surface
     "mean": 0.03,

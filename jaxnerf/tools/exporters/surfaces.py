@@ -19,11 +19,11 @@ from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.data.geometry.world import points_in_run, poses_in_file
+from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.output_images import to_8_bits
 from jaxnerf.evaluation.paths.camera_path import CameraPath, path_pixels, posed_views, resize
-from jaxnerf.runtime.memory import image_renderer
+from jaxnerf.runtime.stages import Progress
 from jaxnerf.tools.exporters.base import ExportSource
-from jaxnerf.training.metric_log import Progress
 
 _CHUNK = 8192  # points at which the field is evaluated at once
 _MIN_OPACITY = 0.6  # of a pixel that shows a surface

@@ -74,22 +74,19 @@ def network_of(run: TrainedRun) -> HashGrid:
     Raises:
         ValueError: if the shader cannot render the run: names the reason.
     """
-    config = run.experiment.config
-    reason = None
-    if config.field != "hash_grid":
-        reason = f"field is {config.field!r}, expected 'hash_grid'"
-    elif config.sampler != "occupancy":
-        reason = f"sampler is {config.sampler!r}, expected 'occupancy'"
+    config, model = run.experiment.config, run.experiment.model
+    field, reason = model.fields.get(model.image_networks[-1]), None
+    if field is None or not isinstance(field.network, HashGrid):
+        reason = f"field is {config.field!r}, expected a hash grid"
+    elif model.grid_schedule is None:
+        reason = f"sampler is {config.sampler!r}, expected one that trains with an occupancy grid"
     elif config.data.ndc:
         reason = "data.ndc is True, expected False: the page has no normalised device coordinates"
-    elif run.experiment.model.needs:
-        reason = f"the field asks for {', '.join(run.experiment.model.needs)}, expected position and direction"
+    elif model.needs:
+        reason = f"the field asks for {', '.join(model.needs)}, expected position and direction"
     if reason:
         raise ValueError(f"web: {reason}; export such a run as --kind=splats or --kind=mesh")
-    options, occupancy = config.hash_grid, config.occupancy
-    names = (*HashGrid.__dataclass_fields__,)
-    values = {name: getattr(options, name) for name in names if hasattr(options, name) and name != "compute_dtype"}
-    return HashGrid(lower=occupancy.lower, upper=occupancy.upper, **values)
+    return field.network
 
 
 def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:
@@ -98,7 +95,7 @@ def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:
     view = experiment.config.eval
     return web_scene.pack(
         network_of(run),
-        params["fine"],
+        params[experiment.model.image_networks[-1]],
         grid,
         precision=precision,
         step_size=experiment.model.grid_schedule.step_size / view.sample_multiplier,
@@ -110,7 +107,8 @@ def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:
 def measure(source: ExportSource, scene: WebScene, views: Views) -> Score:
     """Scores the run, and the run with the features that the textures hold."""
     params, grid = source.variables
-    decoded = {**params, "fine": scene.decoded(params["fine"])}
+    name = source.run.experiment.model.image_networks[-1]
+    decoded = {**params, name: scene.decoded(params[name])}
     squares = []
     count = min(_NUM_SCORED, len(views.size))
     for index in range(count):

@@ -1,4 +1,4 @@
-"""A trained hash grid as textures and a fragment shader of WebGL 2, and a twin of the shader's arithmetic in numpy."""
+"""A trained hash grid as textures and a fragment shader of WebGL 2."""
 
 import importlib.resources
 import math
@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid
-from jaxnerf.fields.hash_grid import FEATURE_SCALE, GEOMETRY_FEATURES, HashGrid, harmonics
+from jaxnerf.fields.hash_grid import FEATURE_SCALE, GEOMETRY_FEATURES, HashGrid
 from jaxnerf.fields.hash_interpolation import TableLevel
 
 TABLE_WIDTH, WEIGHTS_WIDTH, BITS_WIDTH, COARSE = 4096, 256, 1024, 4  # texels; cells along a coarse cube
 MAX_TEXTURE_SIDE = 4096  # of nearly all devices with WebGL 2
 PRECISIONS = ("8 bits", "16 bits")  # of a feature; smaller first
 _LARGEST_HALF = 65504.0
-_PRIMES = np.uint32([1, 2654435761, 805459861])  # of the spatial hash
 _LARGEST_EXPONENT = 15.0
 _SLOT_SAMPLES, _HIGH_EPS = (4, 2), 0.01  # after which core/occupancy/packed.py tests whether a ray is opaque
 
@@ -176,68 +175,9 @@ def _padded(kernel, bias):
     return Layer(np.pad(kernel, more), np.pad(bias, more[1]))
 
 
-def evaluate(
-    scene: WebScene, x: Float[np.ndarray, "N 3"], viewdirs: Float[np.ndarray, "N 3"]
-) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
-    """Evaluates a scene as the shader does, from the same textures: density [N] in 1 / world unit and rgb [N, 3].
-
-    Args:
-        scene: WebScene.
-        x: [N, 3] world units.
-        viewdirs: [N, 3] unit vectors.
-    """
-    x = np.float32(x)
-    lower, upper = np.float32(scene.grid.lower), np.float32(scene.grid.upper)
-    if scene.grid.contracted:
-        x = _contract((x - (lower + upper) / 2) / ((upper - lower) / 4)) * ((upper - lower) / 4) + (lower + upper) / 2
-    place = np.clip((x - lower) / (upper - lower), 0, 1)
-    features = [_interpolated(scene, index, place) for index in range(len(scene.levels))]
-    layers = scene.layers
-    hidden = np.maximum(_apply(layers["hidden"], np.concatenate(features, axis=-1)), 0)
-    hidden = _apply(layers["density"], hidden)
-    density = np.exp(np.minimum(hidden[:, 0], _LARGEST_EXPONENT))
-    names = [name for name in layers if name.startswith("view_")] + ["rgb"]
-    for name in names:
-        found = _apply(layers[name], hidden)
-        if name == names[0] and "ray" in layers:
-            found += _apply(layers["ray"], np.pad(np.asarray(harmonics(np.float32(viewdirs))), ((0, 0), (0, 3))))
-        hidden = found if name == "rgb" else np.maximum(found, 0)
-    return density, 1 / (1 + np.exp(-hidden[:, :3]))
-
-
-def _apply(layer, values):
-    return values @ layer.kernel + layer.bias
-
-
-def _contract(x):
-    largest = np.abs(x).max(axis=-1, keepdims=True)
-    safe = np.maximum(largest, 1)
-    return np.where(largest > 1, x / safe * (2 - 1 / safe), x)
-
-
-def _interpolated(scene, index, place):
-    level, features = scene.levels[index], scene.features(index)
-    size = np.int32(level.size)
-    spread = place * np.float32(size - 1)
-    low = np.minimum(spread.astype(np.int32), size - 2)
-    fraction, total = spread - low, 0.0
-    for corner in range(8):
-        offset = np.int32([corner >> 2, (corner >> 1) & 1, corner & 1])
-        vertex = low + offset
-        if is_hashed(level):
-            row = np.bitwise_xor.reduce(vertex.astype(np.uint32) * _PRIMES, axis=-1) % np.uint32(len(level.rows))
-        else:
-            row = (vertex[:, 0] * size[1] + vertex[:, 1]) * size[2] + vertex[:, 2]
-        total = total + np.where(offset, fraction, 1 - fraction).prod(axis=-1, keepdims=True) * features[row]
-    return total
-
-
 def is_hashed(level: TableLevel) -> bool:
     """Returns whether vertices of a level share rows."""
     return len(level.rows) < math.prod(level.size)
-
-
-# The shader
 
 
 def shader(scene: WebScene) -> str:

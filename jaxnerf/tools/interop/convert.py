@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.data import dataset
+from jaxnerf.fields.mlp import MlpOptions
+from jaxnerf.models.hierarchical import HierarchicalOptions
 from jaxnerf.options import is_auto
-from jaxnerf.registry import needs_folder
+from jaxnerf.registry import FIELDS, SAMPLERS, needs_folder
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.tools.interop.published_weights import Network, read_weights
@@ -60,7 +62,7 @@ def convert(
         raise ValueError(f"{folder}: exists and is not an empty folder; give a new --workdir")
     published = read_weights(paths, legacy_posenc_order=legacy_posenc_order)
     config = read_config(config)
-    build.check_released(config, published.origin)
+    _check_released(config, published.origin)
     config = _resolved(config)
     experiment = build.build(config)
     # Only shapes count: drawing initial parameters would take longer than everything else.
@@ -83,8 +85,8 @@ def _resolved(config: RunConfig) -> RunConfig:
         if needs_folder(config.data.format):
             dataset.dataset_folder(config.data.dir)
     except ValueError:
-        if is_auto(config.data.background_color):  # as it is inferred for all models without an occupancy grid
-            return changed(config, {"data.background_color": ()})
+        if is_auto(config.scene.background):  # as it is inferred for all models without an occupancy grid
+            return changed(config, {"scene.background": ()})
         return config
     return auto_config.resolve(config).config
 
@@ -160,3 +162,24 @@ def _write(folder, config, state, origin):
     except BaseException:  # a full disk or Ctrl-C: the same command must work afterwards
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+def _check_released(config, origin):
+    """Raises a ValueError if a config's networks differ from those of a released code."""
+    parts = config.options_of(SAMPLERS), config.options_of(FIELDS)
+    if not isinstance(parts[0], HierarchicalOptions) or not isinstance(parts[1], MlpOptions):
+        raise ValueError(
+            f"sampler is {config.sampler!r} and field {config.field!r}, expected 'hierarchical' and 'mlp' as in "
+            f"{origin}"
+        )
+    activations = ("relu", "softplus") if origin == "JaxNeRF" else ("relu",)
+    for name, network in (("coarse", config.coarse), ("fine", config.fine)):
+        if not network.encode:
+            raise ValueError(f"{name}.encode is False, expected True as in {origin}")
+        if network.density_bias:
+            raise ValueError(f"{name}.density_bias is {network.density_bias}, expected 0 as in {origin}")
+        if network.density_activation not in activations:
+            raise ValueError(
+                f"{name}.density_activation is {network.density_activation!r}, expected "
+                f"{' or '.join(map(repr, activations))} as in {origin}"
+            )

@@ -25,12 +25,11 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxnerf.core import contraction
 from jaxnerf.core.types import Rays, Vector
 from jaxnerf.data.ray_batches import draw_batch
+from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.fields.base import Field
-from jaxnerf.options import is_auto
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.runtime.memory import image_renderer
 from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource, fingerprint_of, folder_of
 
 RESOLUTION = 64  # cells of the deformation along each axis of the box
@@ -73,7 +72,7 @@ def estimate_laplace(source: UncertaintySource) -> Estimate:
 
     identity = f"laplace, {RESOLUTION} cells, {NUM_BATCHES} x {BATCH_SIZE} rays, {NUM_PROBES} probes"
     config = source.run.experiment.config
-    return Estimate(score, identity, std_at(posterior, *_box_of(config), config.occupancy.contracted))
+    return Estimate(score, identity, std_at(posterior, *_box_of(config), config.scene.contracted))
 
 
 def std_at(posterior: Deformation, lower: Vector, upper: Vector, contracted: bool) -> Partial:
@@ -97,7 +96,7 @@ def stored_uncertainty(run: TrainedRun, workdir: str | os.PathLike, step: int, p
     path = folder_of(workdir, step) / _FILE
     posterior = _stored(path, _key_of(fingerprint_of(run, params)))
     config = run.experiment.config
-    return None if posterior is None else std_at(posterior, *_box_of(config), config.occupancy.contracted)
+    return None if posterior is None else std_at(posterior, *_box_of(config), config.scene.contracted)
 
 
 def _contracted_std(std, lower, upper, x):
@@ -143,7 +142,7 @@ def _stored(path, key, say=lambda line: None):
 def fit_deformation(source: UncertaintySource) -> Deformation:
     """Computes the posterior in one pass over NUM_BATCHES batches of random training rays."""
     experiment = source.run.experiment
-    model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.occupancy.contracted))
+    model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.scene.contracted))
     params, grid = source.variables
     views = dataclasses.replace(source.views, mask=None, sparse=None)
     given, step = experiment.config.data, jnp.int32(2**30)
@@ -233,7 +232,7 @@ def interpolate(values: Float[ArrayLike, "X Y Z C"], place: Float[ArrayLike, "*b
 def _scored_rendering(source):
     """Returns the function ((variables, posterior), Rays [N]) -> Rendering [N] with the score in place of rgb."""
     experiment = source.run.experiment
-    model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.occupancy.contracted))
+    model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.scene.contracted))
 
     @jax.jit
     def render(variables, rays):
@@ -278,7 +277,6 @@ def _deformed(params, displacement):
 
 
 def _box_of(config):
-    corners = config.occupancy.lower, config.occupancy.upper
-    if any(map(is_auto, corners)):
-        raise ValueError("occupancy.lower or occupancy.upper is 'auto', expected the box of the scene; set both")
-    return corners
+    if config.scene.box is None:
+        raise ValueError("scene.lower or scene.upper is 'auto', expected the box of the scene; set both")
+    return config.scene.box

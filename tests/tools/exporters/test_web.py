@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnerf.core.contraction import contract
 from jaxnerf.core.occupancy.grid import create_grid
-from jaxnerf.fields.base import contract_field
-from jaxnerf.fields.hash_grid import HashGrid, hash_grid_field
+from jaxnerf.evaluation.restore import TrainedRun
+from jaxnerf.fields.base import Field, contract_field
+from jaxnerf.fields.hash_grid import HashGrid, harmonics, hash_grid_field
 from jaxnerf.tools.exporters import web, web_scene
-from jaxnerf.training.config import RunConfig, changed
 
 BOX = {"lower": (-1.0, -1.5, -0.5), "upper": (1.0, 1.0, 1.5)}
 SMALL = {"resolutions": (5, 9), "table_size": 2**12, "width": 12, "view_width": 8, **BOX}
@@ -58,6 +59,45 @@ def packed(options, precision="16 bits", contracted=False, as_scene=False):
     return evaluate, scene
 
 
+def shaded(scene, x, viewdirs):
+    """Evaluates a WebScene as the shader does, from the same textures: density [N] and rgb [N, 3]."""
+    lower, upper = np.float32(scene.grid.lower), np.float32(scene.grid.upper)
+    if scene.grid.contracted:
+        middle, quarter = (lower + upper) / 2, (upper - lower) / 4
+        x = middle + quarter * np.asarray(contract((x - middle) / quarter))
+    place = np.clip((x - lower) / (upper - lower), 0, 1)
+
+    def layer(name, values):
+        return values @ scene.layers[name].kernel + scene.layers[name].bias
+
+    features = np.concatenate([interpolated(scene, level, place) for level in range(len(scene.levels))], axis=-1)
+    hidden = layer("density", np.maximum(layer("hidden", features), 0))
+    density = np.exp(np.minimum(hidden[:, 0], 15.0))
+    names = [name for name in scene.layers if name.startswith("view_")] + ["rgb"]
+    for name in names:
+        found = layer(name, hidden)
+        if name == names[0] and "ray" in scene.layers:
+            found += layer("ray", np.pad(np.asarray(harmonics(viewdirs)), ((0, 0), (0, 3))))
+        hidden = found if name == "rgb" else np.maximum(found, 0)
+    return density, 1 / (1 + np.exp(-hidden[:, :3]))
+
+
+def interpolated(scene, index, place):
+    level, features = scene.levels[index], scene.features(index)
+    size = np.int32(level.size)
+    spread = place * np.float32(size - 1)
+    low = np.minimum(spread.astype(np.int32), size - 2)
+    fraction, total = spread - low, 0.0
+    for offset in np.ndindex(2, 2, 2):
+        vertex = low + np.int32(offset)
+        row = (vertex[:, 0] * size[1] + vertex[:, 1]) * size[2] + vertex[:, 2]
+        if web_scene.is_hashed(level):
+            hashes = vertex.astype(np.uint32) * np.uint32([1, 2654435761, 805459861])
+            row = np.bitwise_xor.reduce(hashes, axis=-1) % np.uint32(len(level.rows))
+        total = total + np.where(offset, fraction, 1 - fraction).prod(axis=-1, keepdims=True) * features[row]
+    return total
+
+
 def places(count=400, reach=1.2):
     rng = np.random.default_rng(3)
     directions = rng.standard_normal((count, 3))
@@ -68,13 +108,13 @@ def places(count=400, reach=1.2):
 @pytest.mark.parametrize("name, precision", [*((name, "16 bits") for name in FIELDS), ("hashed", "8 bits")])
 def test_the_twin_of_the_shader_is_the_field(name, precision):
     field, scene = packed(FIELDS[name], precision)
-    for found, expected in zip(web_scene.evaluate(scene, *places()), field(*places()), strict=True):
+    for found, expected in zip(shaded(scene, *places()), field(*places()), strict=True):
         np.testing.assert_allclose(found, expected, rtol=3e-4, atol=3e-5)
 
 
 def test_the_twin_contracts_as_the_field_does():
     field, scene = packed(FIELDS["hashed"], contracted=True)
-    for found, expected in zip(web_scene.evaluate(scene, *places(reach=30)), field(*places(reach=30)), strict=True):
+    for found, expected in zip(shaded(scene, *places(reach=30)), field(*places(reach=30)), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
     assert "#define CONTRACTED 1" in web_scene.shader(scene)
 
@@ -160,16 +200,23 @@ def test_parameters_that_are_not_finite_are_refused():
 
 
 @pytest.mark.parametrize(
-    "options, needs, message",
+    "change, message",
     [
-        ({"field": "mlp"}, (), "web: field is 'mlp', expected 'hash_grid'"),
-        ({"sampler": "hierarchical"}, (), "web: sampler is 'hierarchical', expected 'occupancy'"),
-        ({"data.ndc": True}, (), "web: data.ndc is True"),
-        ({}, ("time",), "web: the field asks for time, expected position and direction"),
+        ({"fields": {"fine": Field(None, None)}}, "web: field is 'other', expected a hash grid"),
+        ({"grid_schedule": None}, "web: sampler is 'other', expected one that trains with an occupancy grid"),
+        ({"ndc": True}, "web: data.ndc is True"),
+        ({"needs": ("time",)}, "web: the field asks for time, expected position and direction"),
     ],
 )
-def test_a_run_that_the_page_cannot_render_is_refused(options, needs, message):
-    config = changed(RunConfig(), {"field": "hash_grid", "sampler": "occupancy", "data.ndc": False, **options})
-    experiment = SimpleNamespace(config=config, model=SimpleNamespace(needs=needs))
+def test_a_run_that_the_page_cannot_render_is_refused(change, message):
+    model = {"fields": {"fine": hash_grid_field(**SMALL)}, "image_networks": ("fine",)}
+    model |= {"grid_schedule": (), "needs": ()}
+
+    def run_of(ndc=False, **change):
+        config = SimpleNamespace(field="other", sampler="other", data=SimpleNamespace(ndc=ndc))
+        experiment = SimpleNamespace(config=config, model=SimpleNamespace(**{**model, **change}))
+        return TrainedRun(*[None] * len(TrainedRun._fields))._replace(experiment=experiment)
+
+    assert isinstance(web.network_of(run_of()), HashGrid)
     with pytest.raises(ValueError, match=message):
-        web.network_of(SimpleNamespace(experiment=experiment))
+        web.network_of(run_of(**change))

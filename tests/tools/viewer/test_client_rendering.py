@@ -23,12 +23,11 @@ LOWER, UPPER = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
 def hash_grid_run():
     """Returns the parts of a run of a small hash grid that a Viewer reads, its Views, and its variables."""
     run, views = ball_runs.solid_run()
-    box = {"occupancy.lower": LOWER, "occupancy.upper": UPPER}
-    options = {f"hash_grid.{name}": value for name, value in SMALL.items()}
-    config = changed(RunConfig(), {"field": "hash_grid", "sampler": "occupancy", "data.ndc": False, **box, **options})
-    model = run.experiment.model._replace(grid_schedule=SimpleNamespace(step_size=0.1))
+    config, field = changed(RunConfig(), {"data.ndc": False}), hash_grid_field(**SMALL, lower=LOWER, upper=UPPER)
+    schedule = SimpleNamespace(step_size=0.1)
+    model = run.experiment.model._replace(grid_schedule=schedule, fields={"fine": field})
     experiment = SimpleNamespace(model=model, config=config, cameras=None, background=(1.0, 1.0, 1.0))
-    fine = hash_grid_field(**SMALL, lower=LOWER, upper=UPPER).init(jax.random.key(0))
+    fine = field.init(jax.random.key(0))
     grid = create_grid(np.float32(LOWER), np.float32(UPPER), np.ones((4, 4, 4), bool), initial_density=1.0)
     return run._replace(experiment=experiment), views, ({"radius": np.float32(0.7), "fine": fine}, grid)
 
