@@ -16,9 +16,8 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector
-from jaxnerf.fields.base import Field, apply_network, infer_prefilter
+from jaxnerf.fields.base import Dense, Field, apply_network, infer_prefilter
 from jaxnerf.fields.hash_interpolation import TableLevel, interpolate, stored, transposed_product
-from jaxnerf.fields.mlp import Dense
 from jaxnerf.options import Box, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
 

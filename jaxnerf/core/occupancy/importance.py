@@ -3,16 +3,18 @@
 This is the importance sampling of arXiv:2003.08934 (Section 5.2) with the grid in place of the coarse network.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxnerf.core.loops import short_loop, vary_like
 from jaxnerf.core.occupancy.grid import OccupancyGrid, estimate_optical_depth
-from jaxnerf.core.occupancy.sample_runs import RaysInRuns, SampleRuns, WholeRays
+from jaxnerf.core.occupancy.sample_runs import SampleRuns
 from jaxnerf.core.sampling import uniform
 from jaxnerf.core.types import Keys, PlacedSamples, Rays, Samples, check_shapes
+from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
 
 _PARTS = 2.0**16  # probabilities are multiples of its inverse: float32 then sums them exactly, in any order
 
@@ -56,11 +58,11 @@ def importance_samples(
         ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
     """
     # All sums below are along rays, whose candidates are one row of an array or several.
-    along, axes, shapes = WholeRays(), "B S", {"near": (rays.near, "B")}
+    along, axes, shapes = _WholeRays(), "B S", {"near": (rays.near, "B")}
     if isinstance(candidates, SampleRuns):
         shapes |= {"first": (candidates.first, "B"), "count": (candidates.count, "B")}
         shapes["ray_index"] = (candidates.ray_index, "U")
-        candidates, along, axes = candidates.samples, RaysInRuns(candidates), "U W"
+        candidates, along, axes = candidates.samples, _RaysInRuns(candidates), "U W"
     check_shapes("importance_samples", **shapes, t=(candidates.t, axes), delta=(candidates.delta, axes))
     if candidates.rule != "segments" or max_samples < 1 or not 0 < uniform_fraction <= 1:
         raise ValueError(
@@ -202,3 +204,87 @@ def _count_up_to(ascending, begin, size, value, most_runs):
 
     none = vary_like(jnp.zeros(value.shape, jnp.int32), ascending, begin, value)
     return short_loop(most.bit_length(), search, none)
+
+
+# Candidates are one row of an array for each ray, or several; both have sums along rays.
+
+
+class _WholeRays:
+    """Sums of values [B, S] along rays."""
+
+    most_runs = 1
+
+    def of_rows(self, tree: Any) -> Any:
+        """Returns what belongs to the ray of each row: arrays [B, ...] as they are."""
+        return tree
+
+    def total(self, values: Array) -> Array:
+        """Returns the sum [B] of one value [B] of each row."""
+        return values
+
+    def any(self, values: Bool[Array, " B"]) -> Bool[Array, " B"]:
+        """Returns whether any row of a ray is true."""
+        return values
+
+    def through(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
+        """Returns the running sum along each ray."""
+        return running_sum(values)
+
+    def before(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
+        """Returns the sum of what is in front of each value."""
+        return exclusive_sum(values)
+
+    def last(self, sums: Float[Array, "B S"]) -> Float[Array, " B"]:
+        """Returns the last of running sums."""
+        return sums[:, -1]
+
+    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
+        """Returns the flat index of the first value of each of some rays, and how many values it has."""
+        return ray * width, width
+
+
+class _RaysInRuns:
+    """Does what _WholeRays does, for values [U, W] of SampleRuns."""
+
+    def __init__(self, runs: SampleRuns):
+        self._runs, self.most_runs = runs, runs.max_count
+        self._starts = jnp.arange(runs.ray_index.size) == runs.first[runs.ray_index]
+        self._last = jnp.maximum(runs.first + runs.count - 1, 0)
+
+    def of_rows(self, tree: Any) -> Any:
+        """Returns what belongs to the ray of each run: arrays [B, ...] -> [U, ...]."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[self._runs.ray_index], tree)
+
+    def total(self, values: Array) -> Array:
+        """Returns the sum [B] of one value [U] of each run."""
+        return self._of_last(self._since_start(values))
+
+    def any(self, values: Bool[Array, " U"]) -> Bool[Array, " B"]:
+        """Returns whether any run of a ray is true."""
+        return self.total(values.astype(jnp.int32)) > 0
+
+    def through(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
+        """Returns the running sum along each ray."""
+        inside = running_sum(values)
+        return inside + self._in_front(inside)
+
+    def before(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
+        """Returns the sum of what is in front of each value."""
+        return exclusive_sum(values) + self._in_front(running_sum(values))
+
+    def last(self, sums: Float[Array, "U W"]) -> Float[Array, " B"]:
+        """Returns the last of running sums; 0 for a ray without runs."""
+        return self._of_last(sums[:, -1])
+
+    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
+        """Returns the flat index of the first value of each of some rays, and how many values it has."""
+        return self._runs.first[ray] * width, self._runs.count[ray] * width
+
+    def _of_last(self, values):
+        return jnp.where(self._runs.count > 0, values[self._last], 0)
+
+    def _since_start(self, values):
+        return running_sum_since(self._starts, values, self._runs.max_count)
+
+    def _in_front(self, inside):
+        return jnp.where(self._starts, 0, jnp.roll(self._since_start(inside[:, -1]), 1))[:, None]
