@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt32
 
 from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.fixed_order import segment_sums
@@ -276,9 +276,9 @@ def evaluate_samples(
     function: str,
     scene: SceneFn,
     rays: Rays,
-    t: Float[Array, " K"],
-    ray_index: Int[Array, " K"],
-    used: Bool[Array, " K"],
+    t: Float[ArrayLike, " K"],
+    ray_index: Int[ArrayLike, " K"],
+    used: Bool[ArrayLike, " K"],
     delta: Callable[[], Array],
 ) -> tuple[Float[Array, " K"], Float[Array, "K C"]]:
     """Evaluates the scene at samples t [K] of rays; delta: a function that returns their lengths [K] in t.
