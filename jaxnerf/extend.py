@@ -12,6 +12,7 @@ from jaxnerf.core.types import without_samples
 from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.models.base import Model, SamplerContext
+from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 from jaxnerf.options import (
     BELOW_ONE,
     FRACTION,
@@ -49,6 +50,7 @@ if not typing.TYPE_CHECKING:  # a type checker would accept every name
 __all__ = [
     # fields and samplers
     "Field", "Model", "SamplerContext", "field_scene", "needs_of_fields", "split_key", "without_samples",
+    "GridSchedule", "make_grid_schedule",
     # readers and exporters
     "Capture", "Frame", "CameraFiles", "ExportSource", "ExportOptions",
     # estimators of uncertainty

@@ -181,6 +181,8 @@ def test_the_page_of_options_is_what_the_program_prints():
 def test_commands_and_config_fields_exist(page):
     assert {command: found for command in commands(page) if (found := faults(command))} == {}
     fields = re.findall(r"`(\w+\.(?!(?:py|bin)`)\w+)(?:=\S+)?`", page.read_text())
+    if page.name == "what_moved.md":  # it has the names of before
+        return
     sections = {name for name, value in default.get_config().items() if isinstance(value, ConfigDict)}
     assert [f for f in fields if f.split(".")[0] in sections and _missing_field(f"config.{f}")] == []
 

@@ -15,7 +15,7 @@ from jaxnerf.data.images import downscaled_copies, image_files, load_images
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 from jaxnerf.data.scene import BACKGROUNDS
-from jaxnerf.data.shared_views import line_of, shared_views
+from jaxnerf.data.shared_views import found_by_split
 from jaxnerf.data.view_selection import select_views, selection
 from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, infer, is_auto, option, replaced, values_of
@@ -146,12 +146,14 @@ def resolve(data: DataOptions) -> tuple[DataOptions, list[str], Capture | None]:
         data: the options.
 
     Returns:
-        The options; one line per inferred value with its reason; and the Capture if it had to be read.
+        The options; one line per inferred value with its reason; and the Capture, None if there is none or it is
+        unreadable and nothing was inferred from it.
 
     Raises:
         ValueError: if the folder does not exist or holds no dataset.
     """
     data, lines, capture = _resolve(data)
+    capture = capture or _readable(data)
     notes = [found["note"] for found in views_shared_with_training(data, capture).values()]
     return data, lines + [f"note          {note}" for note in dict.fromkeys(notes)], capture
 
@@ -243,17 +245,10 @@ def views_shared_with_training(data: DataOptions, capture: Capture | None = None
         capture: of the dataset; None: it is read. If it cannot be read, nothing is known and {} is returned.
     """
     capture = capture or _readable(data)
-    if capture is None:
-        return {}
     try:
-        train, select = load_images.split_indices(capture, "train"), selection(data, "train")
-        train = train if select is None else train[select(len(train))]
-        found = {split: _shared_with(capture, split, train) for split in load_images.scored_splits(capture)}
+        return {} if capture is None else found_by_split(capture, selection(data, "train"))
     except (ValueError, OSError):
         return {}
-    if len(found) == 1:  # the one that is defined stands for the other
-        found |= dict.fromkeys(("test", "val"), *found.values())
-    return {split: shared for split, shared in found.items() if shared}
 
 
 def _readable(data):
@@ -262,14 +257,6 @@ def _readable(data):
         return base.read_capture(dataset_folder(data.dir), data.format) if needs_folder(data.format) else None
     except (ValueError, OSError):
         return None
-
-
-def _shared_with(capture, split, train):
-    shared = shared_views(capture, split, train)
-    if not shared:
-        return None
-    note = line_of(shared, split, len(load_images.split_indices(capture, split)))
-    return {"count": len(shared), "names": [view.name for view in shared], "note": note}
 
 
 def resolve_near(data: DataOptions, views: Views, *, fills_space: bool) -> tuple[DataOptions, Views, list[str]]:
@@ -337,9 +324,11 @@ def load_split(
             "split, and the world would differ; restore the dataset, or train again in another --workdir"
         )
     known = bounds.known_bounds(capture)
+    near = 0.0 if is_auto(data.near) else data.near  # it is resolved later, against the views
+    if near and data.far and data.world != "forward":  # which scales by the nearest bound
+        capture = capture._replace(bounds=(near, data.far))  # what the cameras see need not be found
     capture, to_file = _in_world(data, bounds.with_bounds(capture))
     nearest = {frame.name: frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)}
-    near = 0.0 if is_auto(data.near) else data.near  # it is resolved later, against the views
     capture = bounds.override_bounds(capture, near, data.far, to_file)
     background = background_of(data)
     views = load_images.load_capture(capture, split=source, factor=data.factor, background=background, select=select)

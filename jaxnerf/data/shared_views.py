@@ -3,15 +3,15 @@
 import filecmp
 import os
 from collections import defaultdict
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.images.image_files import read_image
-from jaxnerf.data.images.load_images import split_indices
+from jaxnerf.data.images.load_images import scored_splits, split_indices
 from jaxnerf.data.readers.base import Capture
 
 _SAMPLES, _SAMPLE = 3, 4096  # bytes of files of one size that are compared before the whole files are
@@ -60,16 +60,38 @@ def shared_views(capture: Capture, split: str, train: Sequence[int] | np.ndarray
     return [SharedView(names[index], names[other], reason) for index, (other, reason) in sorted(found.items())]
 
 
-def line_of(shared: Sequence[SharedView], split: str, count: int) -> str:
-    """Returns the line that reports the shared views of a split of `count` views."""
+def found_by_split(capture: Capture, select: Callable[[int], np.ndarray] | None) -> dict[str, dict[str, Any]]:
+    """Returns {split: {"count", "names", "note"}} of the splits "test" and "val" with views that are trained on.
+
+    Args:
+        capture: any.
+        select: the training views that are used, see `selection`; None: all.
+
+    Raises:
+        ValueError: if a split is empty.
+    """
+    train = split_indices(capture, "train")
+    train = train if select is None else train[select(len(train))]
+    found = {split: _summary(capture, split, train) for split in scored_splits(capture)}
+    if len(found) == 1:  # the one that is defined stands for the other
+        found |= dict.fromkeys(("test", "val"), *found.values())
+    return {split: summary for split, summary in found.items() if summary}
+
+
+def _summary(capture, split, train):
+    """Returns what `found_by_split` does of a split; None without shared views."""
+    shared = shared_views(capture, split, train)
+    if not shared:
+        return None
     first = shared[0]
     example = f"{first.name} is {first.training_name}, {first.reason}"
     if first.name == first.training_name:
         example = f"{first.name} is {first.reason}"
-    return (
-        f"{len(shared)} of {count} views of the split {split!r} are training views, too ({example}): their scores are "
-        "not those of held-out views"
+    note = (
+        f"{len(shared)} of {len(split_indices(capture, split))} views of the split {split!r} are training views, too "
+        f"({example}): their scores are not those of held-out views"
     )
+    return {"count": len(shared), "names": [view.name for view in shared], "note": note}
 
 
 def _same_file(capture, rest, train):

@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 import captures
-from jaxnerf import Camera, SparsePoints, Views, load_dataset
+from jaxnerf import Camera, SparsePoints, Views, load_dataset, register_reader
 from jaxnerf.configs import capture
 from jaxnerf.data import dataset
 from jaxnerf.data.dataset import DataOptions, load_split
-from jaxnerf.data.readers import transforms
+from jaxnerf.data.readers import blender, transforms
 from jaxnerf.data.view_selection import held_out, select_views
+from jaxnerf.extend import CameraFiles
 from jaxnerf.options import replaced
 from jaxnerf.registry import READERS, Reader
+from jaxnerf.tools.capture_check import findings
 from jaxnerf.training.config import read_config
 
 SIZES = [(2, 3), (1, 4), (3, 3), (2, 2)]
@@ -64,7 +66,7 @@ def test_at_most_some_views_are_read(split, number, names):
 
 def capture_data(**changes):
     """Returns the options of the dataset in configs/capture.py, with some changes."""
-    return DataOptions(**{**capture.get_config().data, **changes})
+    return replaced(read_config(capture.get_config()).data, **changes)
 
 
 def test_a_relative_folder_is_saved_as_an_absolute_one(tmp_path, monkeypatch):
@@ -262,3 +264,31 @@ def test_a_registered_format_is_detected_resolved_and_split(tmp_path, monkeypatc
     splits = {split: load_split(resolved, split).names for split in ("train", "held_out", "test")}
     assert splits == {"train": ("001", "002", "004", "005", "007"), "held_out": ("003", "006"), "test": ("000",)}
     assert load_dataset(tmp_path, split="test").names == ("000",)
+
+
+def test_what_a_registered_reader_states_of_its_format_is_followed(tmp_path, monkeypatch):
+    for split in ("train", "test"):
+        captures.write_blender(tmp_path, captures.noise(captures.orbit(3)), split=split)
+
+    def read(folder, *, split=None):
+        stated = {"format": "renders", "normalised": True, "rendered": True, "bounds": (1.5, 7.0)}
+        files = CameraFiles(focal="scene.json: focal to about {x:.4g}")
+        return blender.read_capture(folder, split=split)._replace(**stated, files=files)
+
+    monkeypatch.setattr(READERS, "_parts", dict(READERS._parts))
+    register_reader("renders", read)
+    resolved, _, capture = dataset.resolve(capture_data(dir=str(tmp_path), format="renders", factor="auto", width=10))
+    assert (resolved.world, resolved.factor) == ("file", 4)  # 3 is nearer, and would crop images of 32 x 24 px
+    assert dataset.fingerprint(resolved, capture) == ""
+    (tmp_path / "transforms_train.json").rename(tmp_path / "elsewhere.json")
+    with pytest.raises(ValueError, match=r"transforms_train\.json: no such file"):
+        load_split(resolved, "train")
+    (tmp_path / "elsewhere.json").rename(tmp_path / "transforms_train.json")
+    views = load_split(resolved, "test")
+    assert (views.names[0], views.near[0], views.far[0]) == ("000", 1.5, 7) and views.to_file is None
+    with pytest.raises(ValueError, match=r"factor 3 does not divide 32 x 24"):
+        load_split(replaced(resolved, factor=3), "test")
+    with pytest.raises(ValueError, match="data.world is 'around', expected one of file or auto"):
+        load_split(replaced(resolved, world="around"), "test")
+    x = np.asarray(capture.frames[0].camera.focal)[0]
+    assert findings.focal_change(capture, 2.0) == f"scene.json: focal to about {2 * x:.4g}"

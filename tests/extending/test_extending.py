@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 
+import cell_sampler  # noqa: F401
 import density_exporter
 import gabor_field  # noqa: F401
 import mask_loss  # noqa: F401
@@ -80,6 +81,36 @@ def test_a_sampler(tmp_path):
     train(tmp_path / "run", use_uniform)
     params, _ = jaxnerf.restore_run(tmp_path / "run").variables(STEPS)
     assert set(params) == {"fine"}
+
+
+def use_cells_and_gabor(config):
+    config.field, config.sampler, config.gabor.num_features = "gabor", "cells", 16
+
+
+def test_a_sampler_and_a_field_are_resolved_like_built_in_ones():
+    """The sampler's cells, the field's frequencies and the box are inferred, and rays start close to the cameras."""
+    config = smoke_config(batch_size="auto")
+    use_cells_and_gabor(config)
+    config.scene.contracted, config.data.near = True, "auto"
+    resolved = auto_config.resolve(config).config
+    assert resolved.train.batch_size == resolved.train.cpu_batch_size // 2
+    assert 0 < resolved.data.near < 0.2 and len(resolved.scene.background) == 0 and resolved.scene.box is not None
+    assert resolved.cells.resolution > 8 and resolved.gabor.max_frequency > 0
+
+
+@pytest.mark.slow
+def test_a_run_of_a_sampler_and_a_field_is_trained_and_exported_like_built_in_ones(tmp_path):
+    workdir = tmp_path / "run"
+    train(workdir, use_cells_and_gabor)
+    run = jaxnerf.restore_run(workdir)
+    schedule, (_, grid) = run.experiment.model.grid_schedule, run.variables(STEPS)
+    assert schedule.shape == grid.valid.shape and not grid.valid.all()  # the visual hull leaves some cells out
+    assert np.allclose([schedule.lower, schedule.upper], run.experiment.config.scene.box)
+    plugins = "--plugins=cell_sampler,gabor_field"
+    flags = [plugins, f"--workdir={workdir}", "--kind=points", "--num_views=4", "--size=16", "--num_points=50"]
+    process = start("export", *flags, PYTHONPATH=f"{ROOT / 'tests' / 'extending'}:{ROOT}")
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 0 and "points.ply" in out, err
 
 
 def test_losses(tmp_path):
@@ -173,7 +204,7 @@ def test_an_estimator(tmp_path):
 def test_the_export_program_restores_a_run_without_a_grid(trained, tmp_path):
     """Its grid is extracted; the second call finds the folder."""
     folder = shutil.copytree(trained, tmp_path / "run")
-    flags = ["--plugins=density_exporter", "--kind=density", "--resolution=16", f"--workdir={folder}"]
+    flags = ["--plugins=density_exporter", "--kind=density", "--num_cells=16", f"--workdir={folder}"]
     path = f"{ROOT / 'tests' / 'extending'}:{ROOT}"
     for code, want in ((0, "exports/density-20/density.npz"), (1, "exists already; give --overwrite")):
         process = start("export", *flags, PYTHONPATH=path)

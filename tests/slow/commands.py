@@ -55,7 +55,7 @@ def main() -> int:
 def run(line: str, folder: pathlib.Path) -> subprocess.CompletedProcess:
     """Runs a command line in a folder, at a small size."""
     program, *flags = shlex.split(line)
-    if "=DIR" in line:
+    if "=DIR" in line and not (folder / "DIR").exists():
         for kind in ("color", "gt-color"):
             shutil.copytree(next(folder.glob("runs/lego/eval/*")) / kind, folder / "DIR" / kind)
     flags = [flag.replace("/path/to/dataset", "lego").replace("/path/to/lego", "lego") for flag in flags]

@@ -19,13 +19,13 @@ _FARTHEST = 10.0  # far over the distance to what the cameras look at, if nothin
 def with_bounds(capture: Capture) -> Capture:
     """Returns the Capture with bounds in every frame, in world units along the camera's axis.
 
-    Existing bounds are kept, and else those that the format defines. Otherwise they come from the points that the frame
-    shows. Without points, near is the depth from which two other cameras see what the frame sees, and far is the end of
-    the dataset's box.
+    Existing bounds are kept. Otherwise they come from the points that the frame shows, or are those of the Capture.
+    Without either, near is the depth from which two other cameras see what the frame sees, and far is the end of the
+    dataset's box.
     """
     if all(frame.bounds is not None for frame in capture.frames):
         return capture
-    found = [frame.bounds or capture.bounds or _of_points(capture, frame) for frame in capture.frames]
+    found = [frame.bounds or _of_points(capture, frame) or capture.bounds for frame in capture.frames]
     unknown = [index for index, bounds in enumerate(found) if bounds is None]
     for index, bounds in zip(unknown, _shared_depths(capture, unknown), strict=True):
         found[index] = bounds

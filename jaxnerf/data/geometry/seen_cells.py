@@ -136,7 +136,7 @@ def _view_counter(views, schedule, cubes):
     def count(counts, seen_by, ids, num_chunks):
         def add(chunk, counts):
             chosen = jax.lax.dynamic_slice_in_dim(ids, chunk * _CHUNK_CUBES, _CHUNK_CUBES)
-            seen, behind, clear = map(_any_corner, _sees(*seen_by, _corners(schedule, cubes, chosen)))
+            seen, behind, clear = map(_any_corner, _sees(seen_by, _corners(schedule, cubes, chosen)))
             before = [each[chosen] for each in counts]
             after = before[0] + seen, before[1] + (seen & ~behind), before[2] | clear
             return tuple(each.at[chosen].set(new) for each, new in zip(counts, after, strict=True))
@@ -203,8 +203,9 @@ def _joined(parts, cubes, shape):
     return grid.reshape(x * _CUBE, y * _CUBE, z * _CUBE)[: shape[0], : shape[1], : shape[2]]
 
 
-def _sees(to_world, clear_radius, near, far, free_depth, least, scale, shown, x):
+def _sees(seen_by, x):
     """Returns which of the positions x [3, ...] a view sees, sees behind its free space, and has around its camera."""
+    to_world, clear_radius, near, far, free_depth, least, scale, shown = seen_by
     offset = [x[axis] - to_world[axis, 3] for axis in range(3)]
     right, up, back = (sum(to_world[i, axis] * offset[i] for i in range(3)) for axis in range(3))
     depth = -back
