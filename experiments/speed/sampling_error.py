@@ -56,8 +56,9 @@ def main(argv: list[str]) -> None:
         raise ValueError(f"{_WORKDIR.value}: trained cameras, too, which this program ignores; give another run")
     if step < first:
         raise ValueError(f"{_WORKDIR.value}: ends at step {step}, before samples are skipped at {first}; train longer")
-    _, data = run.experiment.prepare(run.experiment.load_split("train"))
-    draw = jax.jit(run.experiment.draw)
+    experiment = build.build(config)
+    _, data = experiment.prepare(experiment.load_split("train"))
+    draw = jax.jit(experiment.draw)
     batches = [draw(step + index, jnp.arange(_RAYS), data) for index in range(_BATCHES.value)]
     rows = []
     for limit in map(float, _LIMITS.value):

@@ -5,7 +5,7 @@ import math
 import os
 import pathlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -91,16 +91,19 @@ def read_results(target: pathlib.Path, remedy: str) -> dict[str, Any]:
 def merge(
     partial: pathlib.Path,
     target: pathlib.Path,
+    summarize: Callable[[list[dict[str, Any]]], dict[str, Any]],
     *,
-    run: TrainedRun,
-    workdir: str | os.PathLike,
-    views: Views,
-    variables: tuple,
-    provenance: Mapping[str, Any],
+    count: int,
+    errors: bool,
     overwrite: bool,
-    predictor: Any = None,
 ) -> dict[str, Any] | None:
-    """Writes results.json and moves the folder `partial` to `target`, which it replaces only with overwrite.
+    """Writes results.json and moves the folder `partial` to `target`.
+
+    Args:
+        partial, target: folders.
+        summarize: what `mark_finished` wrote of all views -> what results.json holds.
+        count, errors: see `view_files`.
+        overwrite: whether target is replaced.
 
     Returns:
         What results.json holds; None if a view is missing.
@@ -108,14 +111,11 @@ def merge(
     Raises:
         OSError: if another process does the same and was faster.
     """
-    count = len(views.names)
-    options = {"count": count, "errors": predictor is not None}
+    options = {"count": count, "errors": errors}
     if not all(file.is_file() for index in range(count) for file in view_files(partial, index, **options)):
         return None
     finished = [atomic_files.read_json(_row_file(partial, index), _AGAIN) for index in range(count)]
-    results = _results(run, workdir, views, variables, finished, provenance)
-    if predictor is not None:
-        results["uncertainty"] = predictor.summary(results["images"])
+    results = summarize(finished)
     rows = [read_stored(_contact_sheet_file(partial, index)) for index in _on_contact_sheet(count)]
     output_images.write_contact_sheet(partial / "contact_sheet.png", rows)
     with atomic_files.partial_file(partial / "results.json") as file:
@@ -132,7 +132,15 @@ def merge(
     return results
 
 
-def _results(run, workdir, views, variables, finished, provenance):
+def results_of(
+    run: TrainedRun,
+    workdir: str | os.PathLike,
+    views: Views,
+    variables: tuple,
+    finished: Sequence[Mapping[str, Any]],
+    provenance: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Returns what results.json holds about a checkpoint, from what `mark_finished` wrote of all views."""
     rows = [view["row"] for view in finished]
     timed = [view["row"] for view in finished if not view["first"]] or rows
     seconds = sum(row["seconds"] for row in timed) / len(timed)

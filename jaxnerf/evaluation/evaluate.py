@@ -174,9 +174,14 @@ def score_run(
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
             _score_views(run, functools.partial(render_pixels, run, variables, views), views, partial, shard, predictor)
-            options = {"run": run, "workdir": workdir, "views": views, "variables": variables, "provenance": provenance}
-            options |= {"predictor": predictor}
-            return aggregate.merge(partial, target, overwrite=overwrite, **options)
+
+            def summarize(finished):
+                results = aggregate.results_of(run, workdir, views, variables, finished, provenance)
+                found = {} if predictor is None else {"uncertainty": predictor.summary(results["images"])}
+                return results | found
+
+            options = {"count": len(views.names), "errors": predictor is not None, "overwrite": overwrite}
+            return aggregate.merge(partial, target, summarize, **options)
     except OSError as error:
         # Another process has finished and moved the folder, perhaps just now, which a later one may have made again.
         if overwrite or error.errno not in (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST) or not target.exists():

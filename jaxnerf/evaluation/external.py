@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxnerf.data.geometry.path_poses import natural_key
 from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden, read_image
 from jaxnerf.evaluation import protocol
 from jaxnerf.evaluation.aggregate import means
@@ -107,7 +108,7 @@ def score_predictions(
 
 def _unpaired(found, expected):
     """Returns which names have no reference, and which references no image, if most names agree."""
-    extra, missing = (sorted(set(a) - set(b), key=_natural) for a, b in ((found, expected), (expected, found)))
+    extra, missing = (sorted(set(a) - set(b), key=natural_key) for a, b in ((found, expected), (expected, found)))
     if len(missing) > len(expected) / 2:
         return ""
     parts = [(extra, "without a reference"), (missing, "missing")]
@@ -139,15 +140,9 @@ def _last_number(name):
     return int(numbers[-1]) if numbers else name
 
 
-def _natural(name):
-    """Returns a key for sorting names by their numbers."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
-
-
 def _image_paths(folder):
     found = [path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
-    paths = sorted((path for path in found if not is_hidden(path.name)), key=lambda path: _natural(path.stem))
+    paths = sorted((path for path in found if not is_hidden(path.name)), key=lambda path: natural_key(path.stem))
     if not paths:
         raise ValueError(
             f"{folder}: holds no images ({', '.join(IMAGE_SUFFIXES)}); correct the folder, or, if these are the "

@@ -18,7 +18,7 @@ from jaxnerf.registry import needs_folder
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
-from jaxnerf.training.state import create_state
+from jaxnerf.training.state import rendered_shapes
 from jaxnerf.training.workdir import load_config
 
 
@@ -66,23 +66,19 @@ def _restore(workdir, config, data_dir, settings, *, crop):
     if data_dir or is_auto(config.data.ndc):
         config = replaced(config, data=dataset.resolve(config.data)[0])
     config = _with_settings(config, settings)
-    config, _ = auto_config.resolve_for_device(config)
-    experiment = build.build(config)
+    config, _ = auto_config.resolve_for_device(config, training=False)
+    experiment = build.render_parts(config)
     checkpoints = Checkpoints(workdir)
-    trained, model, bake = experiment.model, experiment.model, None
+    model, bake = experiment.model, None
     if config.eval.bake_occupancy and model.grid_schedule is None:
         views = experiment.load_split("train")
         if auto_fields(config):  # of a run that was converted without its dataset
-            config = auto_config.resolve_for_device(auto_config.resolve(config, views).config)[0]
+            config = auto_config.resolve_for_device(auto_config.resolve(config, views).config, training=False)[0]
         options = {"view_rays": experiment.view_rays, "pixel_offset": config.data.pixel_offset}
         rays = functools.partial(random_rays, views, **options)
         model, bake = build.bake_model(config, model, rays, crop=crop)
 
-    @functools.cache
-    def template():
-        shapes = jax.eval_shape(lambda: create_state(trained, experiment.optimizer, config.seed))
-        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), shapes)
+    shapes = functools.cache(lambda: rendered_shapes(experiment.model))
 
     def render(variables, rays, **options):
         return model.view(*variables, rays, **options)
@@ -91,7 +87,7 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         return params, bake(params) if bake else grid
 
     def variables(step):
-        return variables_of(*checkpoints.load_rendered(step, template()))
+        return variables_of(*checkpoints.load_rendered(step, shapes(), averaged=config.train.averaging_power > 0))
 
     def model_with(settings, wrap=None):
         other = _with_settings(config, settings)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from jaxnerf.data.geometry.path_poses import natural_order
+from jaxnerf.data.geometry.path_poses import natural_key
 from jaxnerf.evaluation import aggregate
 from jaxnerf.runtime.atomic_files import partial_file
 from jaxnerf.training import metric_log, workdir
@@ -105,7 +105,7 @@ def _find(folder):
     if (folder / "config.json").is_file():
         return [folder]
     inside = [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
-    inside = [inside[index] for index in natural_order([child.name for child in inside])]
+    inside.sort(key=lambda child: natural_key(child.name))
     return [
         run for child in inside if not child.is_symlink() or (child / "config.json").is_file() for run in _find(child)
     ]

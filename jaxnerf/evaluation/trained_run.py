@@ -12,7 +12,7 @@ class TrainedRun(NamedTuple):
     """A run's experiment and the functions that read and render its checkpoints.
 
     Attributes:
-        experiment: what its config describes, see `build.Experiment`.
+        experiment: what its config describes for rendering, see `build.RenderParts`.
         steps: () -> the steps of the finished checkpoints, ascending.
         variables: step -> (params, grid) of that checkpoint; the grid is None where the model has none.
         render: (variables, Rays [...]) -> Rendering [...] without weights, jitted.
@@ -26,7 +26,7 @@ class TrainedRun(NamedTuple):
             by name, and what a tool has changed about the run.
     """
 
-    experiment: build.Experiment
+    experiment: build.RenderParts
     steps: Callable[[], list[int]]
     variables: Callable[[int], tuple]
     render: Callable[[tuple, Rays], Rendering]

@@ -98,12 +98,15 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     return Resolved(config, views, lines + more + near)
 
 
-def resolve_for_device(config: Config, platform: str | None = None) -> tuple[RunConfig, list[str]]:
+def resolve_for_device(
+    config: Config, platform: str | None = None, *, training: bool = True
+) -> tuple[RunConfig, list[str]]:
     """Resolves options of Changes.SPEED of an otherwise resolved config for the devices of this process.
 
     Args:
         config: of a run.
         platform: of the devices to resolve for in place of those of this process: "cpu", "gpu" or "tpu".
+        training: whether the section `train` is resolved, too; without, the config renders and does not train.
 
     Returns:
         The config, and one line per inferred value.
@@ -116,6 +119,8 @@ def resolve_for_device(config: Config, platform: str | None = None) -> tuple[Run
     device = device._replace(chunk=config.declared_by(SAMPLERS).rays_per_chunk(device))
     others = [name for name in config.sections() if name != "train"]
     config = _resolve_sections(config, others, None, device, lines)
+    if not training:
+        return config, lines
     if is_auto(config.train.microbatch_size) and not is_auto(config.train.batch_size):
         device = device._replace(samples_per_ray=build_model(config).samples_per_ray)
     config = _resolve_sections(config, ["train"], None, device, lines)

@@ -32,39 +32,55 @@ from jaxnerf.training.step import ProgressData, StepLoss, TrainData
 _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIELDS)
 
 
+class RenderParts(NamedTuple):
+    """A run's config, and the functions that it describes and that images are rendered with.
+
+    Attributes:
+        config: resolved.
+        model: the config's field and sampler; its parameters have those of the training images, too.
+        cameras: the parameters of the training images; None where the config has none.
+        load_split: split -> Views.
+        view_rays: (Views, index, pixels) -> Rays.
+        world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
+        background: [3] the colour behind the scene; None: black.
+    """
+
+    config: RunConfig
+    model: Model
+    cameras: CameraParameters | None
+    load_split: Callable[..., Views]
+    view_rays: Callable[..., Any]
+    world_depth: Callable[..., Any]
+    background: tuple[float, ...] | None
+
+
 class Experiment(NamedTuple):
     """A run's config, and the functions that it describes.
 
     Attributes:
-        config: resolved.
-        model: the config's field and sampler.
-        cameras: the parameters of the training images; None where the config has none.
+        config, model, cameras, load_split, view_rays, world_depth, background: see `RenderParts`.
         losses: those whose weight is not 0.
         optimizer: see `make_optimizer`.
         schedule: step -> learning rate.
-        load_split: split -> Views.
         draw: (step, positions, TrainData) -> (keys, Batch).
         pixel_ids: (step, positions, TrainData) -> ids [B] int32 of the pixels that draw takes.
-        view_rays: (Views, index, pixels) -> Rays.
-        world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
         prepare: Views -> (InitialCells, or None without a grid; TrainData).
-        background: [3] the colour behind the scene; None: black.
         pixel_rays: the several rays of a pixel that draw takes; None: each ray is a pixel.
     """
 
     config: RunConfig
     model: Model
     cameras: CameraParameters | None
+    load_split: Callable[..., Views]
+    view_rays: Callable[..., Any]
+    world_depth: Callable[..., Any]
+    background: tuple[float, ...] | None
     losses: tuple[StepLoss, ...]
     optimizer: optax.GradientTransformation
     schedule: Callable[[int], float]
-    load_split: Callable[..., Views]
     draw: Callable[..., tuple]
     pixel_ids: Callable[..., Any]
-    view_rays: Callable[..., Any]
-    world_depth: Callable[..., Any]
     prepare: Callable[..., tuple]
-    background: tuple[float, ...] | None
     pixel_rays: PixelRays | None
 
 
@@ -74,17 +90,15 @@ def build(config: Config) -> Experiment:
     Raises:
         ValueError: names the option that holds what cannot be built.
     """
-    config = read_config(config)
-    given, train = config.data, config.train
-    model = build_model(config)
-    losses, cameras = build_losses(config.losses, model), build_cameras(config, model.needs)
-    _filled(config.train, "train")
-    optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
-    if cameras is not None:
-        model = cameras.added_to(model)
+    parts = render_parts(config)
+    config, model, cameras = parts.config, parts.model, parts.cameras
+    given, train = config.data, _filled(config.train, "train")
+    losses = build_losses(config.losses, model)
     if train.deterministic and jax.default_backend() != "cpu":  # there all sums have a fixed order
         _check_fixed_order(losses, cameras)
         model = model._replace(render=build_model(config, fixed_order=True).render)
+        parts = parts._replace(model=model)
+    optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
     options = {"batching": train.batching, "extras": extras}
@@ -112,20 +126,36 @@ def build(config: Config) -> Experiment:
         return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **common)[1]
 
     return Experiment(
-        config=config,
-        model=model,
-        cameras=cameras,
+        **parts._asdict(),
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,
-        load_split=functools.partial(_load_views, config, model.needs),
         draw=draw,
         pixel_ids=pixel_ids,
+        prepare=functools.partial(_prepare, config, model, extras),
+        pixel_rays=pixel_rays,
+    )
+
+
+def render_parts(config: Config) -> RenderParts:
+    """Builds the RenderParts that a resolved config describes.
+
+    Raises:
+        ValueError: names the option that holds what cannot be built.
+    """
+    config = read_config(config)
+    given, model = config.data, build_model(config)
+    cameras = build_cameras(config, model.needs)
+    if cameras is not None:
+        model = cameras.added_to(model)
+    return RenderParts(
+        config=config,
+        model=model,
+        cameras=cameras,
+        load_split=functools.partial(_load_views, config, model.needs),
         view_rays=jax.jit(functools.partial(ray_batches.view_rays, ndc=given.ndc, needs=model.needs)),
         world_depth=jax.jit(functools.partial(ray_batches.world_depth, ndc=given.ndc)),
-        prepare=functools.partial(_prepare, config, model, extras),
         background=config.scene.color_behind(given.background),
-        pixel_rays=pixel_rays,
     )
 
 

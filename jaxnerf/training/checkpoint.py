@@ -15,7 +15,7 @@ from orbax.checkpoint import v1 as ocp
 from jaxnerf.runtime import atomic_files, processes
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training.optimizer import image_params
-from jaxnerf.training.state import TrainState
+from jaxnerf.training.state import PROGRESS, TrainState
 
 _WHOLE, _RENDERED = "fingerprint", "fingerprint_of_rendered"  # in the metadata of a checkpoint
 _SMALL = 2**25  # bytes of a state that is copied at once
@@ -66,21 +66,36 @@ class Checkpoints:
         """
         with self._reading(step) as saved:
             state = self._open().load(step, _abstract(like))
-            _check(step, state, state, saved[_WHOLE])
+            _check(step, state.step, state, saved[_WHOLE])
             return state
 
-    def load_rendered(self, step: int, like: TrainState) -> tuple[dict[str, Any], Any]:
+    def load_rendered(
+        self, step: int, like: tuple[dict[str, Any], Any], *, averaged: bool
+    ) -> tuple[dict[str, Any], Any]:
         """Returns what renders images at a step, `image_params` and the grid, and does not read the rest of the state.
 
-        Args and errors are those of `load`.
+        Args:
+            step: of the checkpoint.
+            like: the shapes of the result, see `rendered_shapes`.
+            averaged: whether training has averaged the parameters, see `with_averaging`.
+
+        Raises:
+            ValueError: as `load`.
         """
-        with self._reading(step) as saved:
-            abstract = _abstract(like)
-            numbers = jax.tree.unflatten(jax.tree.structure(abstract), range(len(jax.tree.leaves(abstract))))
-            read = {numbers.step, *jax.tree.leaves(_rendered(numbers))}
-            state = self._open().load(step, jax.tree.map(lambda n, x: x if n in read else ..., numbers, abstract))
-            _check(step, state, _rendered(state), saved[_RENDERED])
-            return _rendered(state)
+        (params, grid), step_shape = like, jax.ShapeDtypeStruct((), np.int32)
+        networks = {name: part for name, part in params.items() if name != PROGRESS}
+        part = {"step": step_shape, **({"opt_state": {"average": networks}} if averaged else {"params": networks})}
+        part |= {"counters": {PROGRESS: params[PROGRESS]}} if PROGRESS in params else {}
+        part |= {} if grid is None else {"grid": grid}
+        device, context = jax.sharding.SingleDeviceSharding(jax.devices()[0]), ocp.Context()
+        context.pytree.loading.partial_load = True
+        with self._reading(step) as saved, context:
+            part = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), part)
+            state = self._open().load(step, part)
+            params = state["opt_state"]["average"] if averaged else state["params"]
+            rendered = {**params, **state.get("counters", {})}, state.get("grid")
+            _check(step, state["step"], rendered, saved[_RENDERED])
+            return rendered
 
     @contextlib.contextmanager
     def _reading(self, step) -> Iterator[dict[str, str]]:
@@ -167,12 +182,12 @@ def _fingerprint(tree):
     return fingerprint(jax.tree.map(np.asarray, tree))
 
 
-def _check(step, state, read, saved):
+def _check(step, found, read, saved):
     """Raises a ValueError if what was read is not what was saved; orbax does not detect changed numbers."""
     if _fingerprint(read) != saved:
         raise ValueError("its numbers are not those that were saved")
-    if int(state.step) != step:
-        raise ValueError(f"it holds step {int(state.step)}")
+    if int(found) != step:
+        raise ValueError(f"it holds step {int(found)}")
 
 
 def _one_array_at_a_time(state):

@@ -45,18 +45,14 @@ def create_state(
         seed: int [], of the initial parameters.
         cells: of the grid; None: nothing is known of them. Ignored without a grid.
     """
-    schedule = model.grid_schedule
-    if schedule is not None and cells is None:
-        cells = InitialCells(jnp.ones(schedule.shape, bool))
+    if model.grid_schedule is not None and cells is None:
+        cells = _all_cells(model)
 
     @jax.jit  # op by op, initialization would take longer than its compilation
     def create(key, cells):
-        params = model.init(key)
+        params, grid = _create(model, key, cells)
         names = ["nonfinite", "nonfinite_in_a_row", "num_reinits", *(f"dead_{name}" for name in model.image_networks)]
-        grid = None
-        if schedule is not None:
-            names.append("rays_dropped")
-            grid = schedule.create(*cells)
+        names += [] if grid is None else ["rays_dropped"]
         zero = jnp.zeros((), jnp.int32)
         counters = dict.fromkeys(names, zero)
         if PROGRESS in model.needs:
@@ -64,3 +60,20 @@ def create_state(
         return TrainState(step=zero, params=params, opt_state=optimizer.init(params), grid=grid, counters=counters)
 
     return create(jax.random.key(seed), cells)
+
+
+def rendered_shapes(model: Model) -> tuple[dict[str, Any], OccupancyGrid | None]:
+    """Returns the shapes of what renders images, see `image_params`, and of the grid: trees of ShapeDtypeStruct."""
+    params, grid = jax.eval_shape(lambda: _create(model, jax.random.key(0), _all_cells(model)))
+    progress = {PROGRESS: jax.ShapeDtypeStruct((), jnp.float32)} if PROGRESS in model.needs else {}
+    return {**params, **progress}, grid
+
+
+def _create(model, key, cells):
+    """Returns parameters, and the grid or None, before training."""
+    return model.init(key), None if model.grid_schedule is None else model.grid_schedule.create(*cells)
+
+
+def _all_cells(model):
+    schedule = model.grid_schedule
+    return None if schedule is None else InitialCells(jnp.ones(schedule.shape, bool))

@@ -17,6 +17,7 @@ from jaxnerf.evaluation import evaluate
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.training import metric_log
+from jaxnerf.training.build import build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import read_config
 from jaxnerf.training.state import create_state
@@ -39,7 +40,7 @@ def variables(folder, step):
 
 
 def load_newest(folder, keep):
-    experiment = restore_run(folder).experiment
+    experiment = build(restore_run(folder).experiment.config)
     checkpoints = Checkpoints(folder, max_to_keep=keep)
     like = create_state(experiment.model, experiment.optimizer, experiment.config.seed)
     try:

@@ -165,9 +165,12 @@ def test_state_is_restored_from_a_checkpoint(tmp_path):
     like = jax.tree.map(jnp.zeros_like, state)
     assert_same(checkpoints.load(1, like), state, rtol=0, atol=0)
     read = {"fine": moved.average["fine"]}, None
-    assert_same(checkpoints.load_rendered(1, like), read, rtol=0, atol=0)
+    rendered = {"fine": like.params["fine"]}, None
+    assert_same(checkpoints.load_rendered(1, rendered, averaged=True), read, rtol=0, atol=0)
+    for others in ({"fine": like.params["fine"], "coarse": like.params["fine"]}, {"fine": {}}):
+        with pytest.raises(ValueError, match="checkpoints/1: cannot be read"):
+            checkpoints.load_rendered(1, (others, None), averaged=True)
     others = dataclasses.replace(like, params=jax.tree.map(lambda leaf: jnp.zeros(7), like.params))
-    assert_same(checkpoints.load_rendered(1, others), read, rtol=0, atol=0)  # does not read the last parameters
     with pytest.raises(ValueError, match="checkpoints/1: cannot be read"):
         checkpoints.load(1, others)
     metadata = tmp_path / "checkpoints" / "1" / "_CHECKPOINT_METADATA"
@@ -175,7 +178,7 @@ def test_state_is_restored_from_a_checkpoint(tmp_path):
     content["custom_metadata"]["fingerprint_of_rendered"] = content["custom_metadata"]["fingerprint"]
     metadata.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="checkpoints/1: .*its numbers are not those that were saved"):
-        checkpoints.load_rendered(1, like)
+        checkpoints.load_rendered(1, rendered, averaged=True)
 
 
 def test_negative_size_is_an_error():
@@ -264,7 +267,8 @@ def test_run_renders_its_average(unoptimized, tmp_path):
     config.fine.depth = 1
     assert train_and_evaluate(config, tmp_path)
     run = restore_run(tmp_path)
-    like = create_state(run.experiment.model, run.experiment.optimizer, run.experiment.config.seed)
+    experiment = build(run.experiment.config)
+    like = create_state(experiment.model, experiment.optimizer, experiment.config.seed)
     state = Checkpoints(tmp_path).load(8, like)
     params, _ = run.variables(8)
     assert_same(params, state.opt_state.average, rtol=0, atol=0)

@@ -207,11 +207,12 @@ def poses_through(
 
 def natural_order(names: Sequence[str]) -> Int[np.ndarray, " V"]:
     """Returns the indices that sort names with their numbers by value: img_2 before img_10."""
+    return np.array(sorted(range(len(names)), key=lambda index: natural_key(names[index])), int)
 
-    def parts(index):
-        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", names[index])]
 
-    return np.array(sorted(range(len(names)), key=parts), int)
+def natural_key(name: str) -> list[int | str]:
+    """Returns the key that sorts names with their numbers by value, see `natural_order`."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def _turntable(poses, num_frames, up):

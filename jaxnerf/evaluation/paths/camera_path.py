@@ -86,12 +86,18 @@ def make_path(
         raise ValueError(f"path is {kind!r}, expected one of {names}, or a file ending in .json")
     if kind == "interpolate":
         poses, focal = _through_views(views, num_frames, closed)
-    else:
-        poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames, up_direction(up, views))
-        focal = np.tile(np.float64(views.cameras.focal)[:1], (len(poses), 1))
+        return through_first_lens(kind, poses, views)._replace(focal=focal)
+    poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames, up_direction(up, views))
+    return through_first_lens(kind, poses, views)
+
+
+def through_first_lens(name: str, poses: Float[np.ndarray, "N 3 4"], views: Views) -> CameraPath:
+    """Returns the CameraPath of poses with the lens and the size of the first view, and its name as its source."""
     height, width = (int(side) for side in views.size[0])
-    center = np.tile(np.float64(views.cameras.center)[:1], (len(poses), 1))
-    return CameraPath(kind, kind, poses, focal, center, width, height)
+    focal, center = (
+        np.tile(np.float64(each)[:1], (len(poses), 1)) for each in (views.cameras.focal, views.cameras.center)
+    )
+    return CameraPath(name, name, poses, focal, center, width, height)
 
 
 def resize(path: CameraPath, width: int | None = None, height: int | None = None) -> CameraPath:
@@ -187,17 +193,9 @@ def _relative(poses, origin):
 
 def _from_file(file, views):
     found = read_path_file(file)
-    height, width = (int(side) for side in views.size[0])
-    same = CameraPath(
-        name=file.stem,
-        source=fingerprint(atomic_files.read_bytes(file)),
-        poses=poses_in_run(_relative(found.poses, views.file_origin), views.to_file),
-        focal=np.tile(np.float64(views.cameras.focal)[:1], (len(found.poses), 1)),
-        center=np.tile(np.float64(views.cameras.center)[:1], (len(found.poses), 1)),
-        width=width,
-        height=height,
-        fps=found.fps,
-    )
+    poses = poses_in_run(_relative(found.poses, views.file_origin), views.to_file)
+    same = through_first_lens(file.stem, poses, views)
+    same = same._replace(source=fingerprint(atomic_files.read_bytes(file)), fps=found.fps)
     same = resize(same, found.width, found.height)
     is_stated = np.isfinite(found.focal)
     middle = np.where(is_stated, [same.width / 2, same.height / 2], same.center)

@@ -109,6 +109,30 @@ def _frusta(cameras, length):
     return np.stack([_frustum(camera, camera.to_world, length) for camera in stack])
 
 
+def new_path(out: str | None, folder: pathlib.Path, *, is_run: bool, overwrite: bool) -> pathlib.Path:
+    """Returns the path of a plot to be written.
+
+    Args:
+        out: given by the user; None: check-FOLDER.png, here.
+        folder: of the dataset or the run.
+        is_run: whether it is that of a run, which may hold the plot.
+        overwrite: whether a file that is no plot of the folder is replaced.
+
+    Raises:
+        ValueError: if the plot would lie in the folder of a dataset, or replace another file.
+    """
+    path = pathlib.Path(out or f"check-{folder.resolve().name}.png")
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"--out is {str(path)!r}, expected a name that ends in .png; correct it")
+    if not path.parent.is_dir():
+        raise ValueError(f"--out is {str(path)!r}, but {path.parent} is not a folder; create it first")
+    if not is_run and folder.resolve() in path.resolve().parents:
+        raise ValueError(f"the plot {path} would be written into the dataset's folder; choose another path with --out")
+    if path.exists() and not overwrite and not is_plot_of(path, folder):
+        raise ValueError(f"{path} exists and is not a plot of {folder}; add --overwrite or choose another --out")
+    return path
+
+
 def save(figure: Figure, path: str | os.PathLike, folder: str | os.PathLike) -> None:
     """Writes a PNG that names the dataset's folder; see `is_plot_of`."""
     metadata = {"Software": _SOFTWARE, "Source": str(pathlib.Path(folder).resolve())}

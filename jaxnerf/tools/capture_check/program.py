@@ -102,21 +102,8 @@ def _plot_of(folder):
         from jaxnerf.tools.capture_check import camera_plot
     except ImportError as error:
         return None, f"none: matplotlib is unavailable ({error}); install it with `pip install matplotlib`"
-    return camera_plot, _plot_path(folder, camera_plot.is_plot_of)
-
-
-def _plot_path(folder, is_plot_of):
-    """Returns the path of the plot, outside the folder that is checked and where it replaces no other file."""
-    out = pathlib.Path(_OUT.value or f"check-{folder.resolve().name}.png")
-    if out.suffix.lower() != ".png":
-        raise ValueError(f"--out is {str(out)!r}, expected a name that ends in .png; correct it")
-    if not out.parent.is_dir():
-        raise ValueError(f"--out is {str(out)!r}, but {out.parent} is not a folder; create it first")
-    if _WORKDIR.value is None and folder.resolve() in out.resolve().parents:
-        raise ValueError(f"the plot {out} would be written into the dataset's folder; choose another path with --out")
-    if out.exists() and not _OVERWRITE.value and not is_plot_of(out, folder):
-        raise ValueError(f"{out} exists and is not a plot of {folder}; add --overwrite or choose another --out")
-    return out
+    is_run = _WORKDIR.value is not None
+    return camera_plot, camera_plot.new_path(_OUT.value, folder, is_run=is_run, overwrite=_OVERWRITE.value)
 
 
 def run():

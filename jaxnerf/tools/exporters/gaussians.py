@@ -3,21 +3,23 @@
 import gzip
 import os
 import struct
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.sparse import coo_matrix
 
+from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera, Vector
 from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.tools.exporters.points import write_ply
 
-LOW_PASS = 0.3  # px^2, added to each projected covariance: a Gaussian is at least about a pixel wide
-MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
+_LOW_PASS = 0.3  # px^2, added to each projected covariance: a Gaussian is at least about a pixel wide
+_MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
 _REACH = 3.0  # standard deviations at which a Gaussian is cut off
-MAX_SLOPE = 1.3  # of the ray to a Gaussian's center, over that to the image's edge, for its projection
+_MAX_SLOPE = 1.3  # of the ray to a Gaussian's center, over that to the image's edge, for its projection
 _NEAR = 1e-2  # of the largest depth: Gaussians closer to the camera are not drawn
 _MAX_PAIRS = 4_000_000  # of pixels and Gaussians that are held at once
 # The file's harmonics of degrees 0, 1 and 2 are those of `harmonics` in this order and with these signs.
@@ -133,15 +135,62 @@ def _bytes(values):
     return np.clip(np.rint(values), 0, 255).astype(np.uint8).tobytes()
 
 
-def rotation_matrices(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
-    """Returns the rotations of unit quaternions (w, x, y, z)."""
+def rotation_matrices(quaternions: Float[Any, "N 4"], xp: Any = np) -> Float[Any, "N 3 3"]:
+    """Returns the rotations of unit quaternions (w, x, y, z); xp: numpy or jax.numpy."""
     w, x, y, z = quaternions.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+class Projection(NamedTuple):
+    """Gaussians in an image, as `project` finds them.
+
+    Attributes:
+        depth: [N] along the camera's axis; the rest is meaningless where it is not positive.
+        center: [N, 2] px.
+        covariance: [N] each, its entries xx, xy and yy, px^2.
+        conic: [N, 3], the entries xx, xy and yy of its inverse.
+    """
+
+    depth: Any
+    center: Any
+    covariance: tuple[Any, Any, Any]
+    conic: Any
+
+
+def project(gaussians: Gaussians, camera: Sequence[Any], size: tuple[int, int], xp: Any = np) -> Projection:
+    """Projects Gaussians through a pinhole, linearized at their centers (arXiv:2308.04079, Eq. 5).
+
+    Args:
+        gaussians: of which mean, rotation and scale are read.
+        camera: pose [3, 4], focal length [2] and principal point [2].
+        size: height and width, px.
+        xp: numpy, or jax.numpy for derivatives.
+    """
+    pose, focal, middle = camera
+    axes = pose[:, :3] * np.float32([[1, -1, -1]])  # right, down, forward, in which depth is positive
+    local = (gaussians.mean - pose[None, :, 3]) @ axes
+    z = xp.where(local[:, 2:] > 1e-6, local[:, 2:], 1.0)
+    slope = local[:, :2] / z
+    limit = (_MAX_SLOPE * xp.maximum(middle, np.float32(size[::-1]) - middle) / focal)[None]
+    held = xp.clip(slope, -limit, limit)
+    turned = xp.einsum("wc,nwk->nck", axes, rotation_matrices(gaussians.rotation, xp) * gaussians.scale[:, None, :])
+    spread = (focal[None] / z)[:, :, None] * (turned[:, :2] - held[:, :, None] * turned[:, 2:])
+    xx, xy, yy = ((spread[:, i] * spread[:, j]).sum(axis=-1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    xx, yy = xx + _LOW_PASS, yy + _LOW_PASS
+    conic = xp.stack([yy, -xy, xx], axis=-1) / (xx * yy - xy * xy)[:, None]
+    return Projection(local[:, 2], focal[None] * slope + middle[None], (xx, xy, yy), conic)
+
+
+def colors_at(gaussians: Gaussians, eye: Float[Any, "3"]) -> Float[Array, "N 3"]:
+    """Returns the colours of Gaussians that are seen from a position."""
+    away = gaussians.mean - eye[None]
+    basis = harmonics(away / norm(away)[:, None])
+    return jnp.maximum(jnp.einsum("nk,nkc->nc", basis, gaussians.harmonics) + 0.5, 0)
 
 
 def rasterize(gaussians: Gaussians, camera: Camera, background: Vector | None = None) -> Float[np.ndarray, "H W 3"]:
@@ -160,7 +209,7 @@ def rasterize(gaussians: Gaussians, camera: Camera, background: Vector | None = 
     """
     rgb, image = None, []
     for pairs in visible_pairs(gaussians, camera):
-        rgb = _colors(gaussians, camera) if rgb is None else rgb
+        rgb = np.asarray(colors_at(gaussians, np.asarray(camera.to_world)[:, 3])) if rgb is None else rgb
         weight = pairs.alpha * pairs.transmittance
         rows = [np.bincount(pairs.pixel, weight * rgb[pairs.source, i], pairs.size) for i in range(3)]
         part = np.stack(rows, axis=-1).astype(np.float64)  # of integers where there is no pair
@@ -192,7 +241,7 @@ class Pairs(NamedTuple):
 
 def visible_pairs(gaussians: Gaussians, camera: Camera) -> Iterator[Pairs]:
     """Yields the Pairs of rows of a pinhole's image from the top, as many rows at once as fit into memory."""
-    drawn = _project(gaussians, camera)
+    drawn = _sorted_by_depth(gaussians, camera)
     step = max(1, _MAX_PAIRS // max(1, int(drawn.area.sum() // max(camera.height, 1))))
     for top in range(0, camera.height, step):
         yield _pairs_of_rows(drawn, top, min(top + step, camera.height), camera.width)
@@ -214,41 +263,23 @@ class _Drawn(NamedTuple):
         return np.prod(np.maximum(self.end - self.first, 0), axis=1)
 
 
-def _colors(gaussians, camera):
-    """Returns the colours [N, 3] that a camera sees."""
-    directions = gaussians.mean - np.float64(camera.to_world)[:, 3]
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
-    basis = np.asarray(harmonics(np.float32(directions)))
-    return np.maximum(np.einsum("nk,nkc->nc", basis, gaussians.harmonics) + 0.5, 0)
-
-
-def _project(gaussians, camera):
-    pose, focal = np.float64(camera.to_world), np.float64(camera.focal)
+def _sorted_by_depth(gaussians, camera):
+    """Returns the Gaussians in front of a camera as _Drawn."""
+    lens = (np.float64(each) for each in (camera.to_world, camera.focal, camera.center))
+    found = project(gaussians, [*lens], (camera.height, camera.width))
+    kept = np.flatnonzero(found.depth > _NEAR * max(found.depth.max(initial=0), 0))
+    kept = kept[np.argsort(found.depth[kept], kind="stable")]
+    center, conic, opacity = found.center[kept], found.conic[kept], gaussians.opacity[kept]
+    xx, xy, yy = (each[kept] for each in found.covariance)
+    half = (xx + yy) / 2
+    radius = _REACH * np.sqrt(half + np.sqrt(np.maximum(half**2 - (xx * yy - xy * xy), 0)))
+    # Beyond these sides of the ellipse, alpha is below _MIN_ALPHA.
+    sigmas = np.sqrt(2 * np.log(np.maximum(opacity / _MIN_ALPHA, 1)))
+    reach = np.minimum(sigmas[:, None] * np.sqrt(np.stack([xx, yy], axis=-1)), radius[:, None])
     size = np.array([camera.width, camera.height])
-    flip = np.array([1.0, -1.0, -1.0])  # to axes right, down, forward, in which depth is positive
-    local = (gaussians.mean - pose[:, 3]) @ (pose[:, :3] * flip)
-    depth = local[:, 2]
-    kept = np.flatnonzero(depth > _NEAR * max(depth.max(), 0))
-    kept = kept[np.argsort(depth[kept], kind="stable")]
-    x, y, z = local[kept].T
-    limit = MAX_SLOPE * np.maximum(camera.center, size - camera.center) / focal
-    slope = np.clip(np.stack([x / z, y / z], axis=-1), -limit, limit)
-    jacobian = np.zeros((len(kept), 2, 3))
-    jacobian[:, [0, 1], [0, 1]] = focal / z[:, None]
-    jacobian[:, :, 2] = -focal * slope / z[:, None]
-    axes = rotation_matrices(np.float64(gaussians.rotation[kept])) * gaussians.scale[kept, None, :]
-    spread = jacobian @ ((pose[:, :3] * flip).T @ axes)
-    covariance = spread @ spread.transpose(0, 2, 1) + LOW_PASS * np.eye(2)
-    center = focal * np.stack([x / z, y / z], axis=-1) + camera.center
-    conic = np.linalg.inv(covariance)
-    half = (covariance[:, 0, 0] + covariance[:, 1, 1]) / 2
-    radius = _REACH * np.sqrt(half + np.sqrt(np.maximum(half**2 - np.linalg.det(covariance), 0)))
-    # Beyond these sides of the ellipse, alpha is below MIN_ALPHA.
-    sigmas = np.sqrt(2 * np.log(np.maximum(gaussians.opacity[kept] / MIN_ALPHA, 1)))
-    reach = np.minimum(sigmas[:, None] * np.sqrt(covariance[:, [0, 1], [0, 1]]), radius[:, None])
     first = np.clip(np.floor(center - reach), 0, size).astype(np.int32)
     end = np.clip(np.ceil(center + reach), 0, size).astype(np.int32)
-    return _Drawn(kept, center, conic, gaussians.opacity[kept], first, end)
+    return _Drawn(kept, center, conic, opacity, first, end)
 
 
 def _pairs_of_rows(drawn, top, bottom, width):
@@ -260,11 +291,11 @@ def _pairs_of_rows(drawn, top, bottom, width):
     place = np.arange(len(source), dtype=np.int32) - np.repeat(np.cumsum(count, dtype=np.int32) - count, count)
     line, column = np.divmod(place, columns[source])
     x, y = first[source, 0] + column, first[source, 1] + line
-    shapes = np.column_stack([drawn.center - 0.5, drawn.conic.reshape(-1, 4)[:, [0, 1, 3]], drawn.opacity])
+    shapes = np.column_stack([drawn.center - 0.5, drawn.conic, drawn.opacity])
     across, down, a, b, c, opacity = np.float32(shapes).T[:, source]
     dx, dy = x - across, y - down
     alpha = np.minimum(opacity * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy), np.float32(MAX_ALPHA))
-    kept = np.flatnonzero(alpha >= MIN_ALPHA)
+    kept = np.flatnonzero(alpha >= _MIN_ALPHA)
     size, pixel = (bottom - top) * width, ((y - top) * width + x)[kept]
     # A sort by counting, which keeps the order of equal pixels: of each the nearest first, as the source is by depth.
     table = coo_matrix((np.ones(len(kept), bool), (pixel, np.arange(len(kept)))), shape=(size, len(kept))).tocsr()

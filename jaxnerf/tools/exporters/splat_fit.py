@@ -15,9 +15,8 @@ from jaxtyping import Array, Float
 
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera, Vector
-from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.runtime.stages import Progress
-from jaxnerf.tools.exporters.gaussians import LOW_PASS, MAX_ALPHA, MAX_SLOPE, Gaussians, visible_pairs
+from jaxnerf.tools.exporters.gaussians import MAX_ALPHA, Gaussians, colors_at, project, visible_pairs
 from jaxnerf.tools.exporters.surfaces import DepthImage, inside
 
 RATES = {  # of Adam, for the first step; those of `mean` are in standard deviations along the surface
@@ -149,8 +148,10 @@ def _listed(gaussians: Gaussians, camera: Camera) -> _Pairs:
 
 def _draw(gaussians: Any, camera: Any, pairs: _Pairs, shape: tuple[int, int], background) -> Float[Array, "pixels 3"]:
     """Draws the listed pairs as `rasterize` does, but for its cut-offs; camera: pose, focal length and center."""
-    center, conic, rgb = _project(gaussians, camera, shape)
-    each = jnp.concatenate([center, conic, gaussians.opacity[:, None], rgb], axis=1)[pairs.source]
+    # Those behind the camera are in no pair.
+    seen = project(gaussians, camera, shape, jnp)
+    columns = [seen.center, seen.conic, gaussians.opacity[:, None], colors_at(gaussians, camera[0][:, 3])]
+    each = jnp.concatenate(columns, axis=1)[pairs.source]
     x, y, a, b, c, opacity = each[:, :6].T
     dx, dy = pairs.pixel % shape[1] + 0.5 - x, pairs.pixel // shape[1] + 0.5 - y
     alpha = jnp.minimum(opacity * jnp.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy), MAX_ALPHA)
@@ -170,34 +171,3 @@ def _sums_within(values, first):
         return jnp.where(right[1], right[0], left[0] + right[0]), left[1] | right[1]
 
     return jax.lax.associative_scan(join, (values, first))[0]
-
-
-def _project(gaussians, camera, shape):
-    """Returns the centers [N, 2], the inverse covariances [N, 3] and the colours [N, 3] in an image."""
-    pose, focal, middle = camera
-    size = jnp.float32([shape[1], shape[0]])
-    axes = pose[:, :3] * jnp.float32([1, -1, -1])[None]  # right, down, forward
-    away = gaussians.mean - pose[:, 3][None]
-    local = away @ axes
-    z = jnp.where(local[:, 2:] > 1e-6, local[:, 2:], 1.0)  # those behind the camera are in no pair
-    slope = local[:, :2] / z
-    limit = MAX_SLOPE * jnp.maximum(middle, size - middle) / focal
-    held = jnp.clip(slope, -limit[None], limit[None])
-    turned = jnp.einsum("wc,nwk->nck", axes, _rotations(gaussians.rotation) * gaussians.scale[:, None, :])
-    spread = (focal[None] / z)[:, :, None] * (turned[:, :2] - held[:, :, None] * turned[:, 2:])
-    xx, xy, yy = ((spread[:, i] * spread[:, j]).sum(axis=-1) for i, j in ((0, 0), (0, 1), (1, 1)))
-    xx, yy = xx + LOW_PASS, yy + LOW_PASS
-    conic = jnp.stack([yy, -xy, xx], axis=-1) / (xx * yy - xy * xy)[:, None]
-    basis = harmonics(away / norm(away)[:, None])
-    rgb = jnp.maximum(jnp.einsum("nk,nkc->nc", basis, gaussians.harmonics) + 0.5, 0)
-    return focal[None] * slope + middle[None], conic, rgb
-
-
-def _rotations(quaternions):
-    w, x, y, z = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.metrics import psnr
 from jaxnerf.core.occupancy.grid import cell_inputs
+from jaxnerf.core.occupancy.seen_directions import spread_directions
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.metrics import pixel_mask
@@ -22,7 +23,7 @@ from jaxnerf.tools.exporters.base import ExportSource
 from jaxnerf.tools.exporters.gaussians import Gaussians, rasterize, read_spz, write_gaussians, write_spz
 from jaxnerf.tools.exporters.points import surface_points, thinned
 from jaxnerf.tools.exporters.splat_fit import fit_gaussians
-from jaxnerf.tools.exporters.surfaces import export_box, render_depth_images, sphere_directions
+from jaxnerf.tools.exporters.surfaces import export_box, render_depth_images
 
 _NUM_DIRECTIONS = 32  # from which the colour of a point is evaluated
 _NUM_NEIGHBORS = 4
@@ -93,7 +94,7 @@ def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) ->
     The fit is linear least squares over directions, weighted by the cosine at which they meet the normals.
     """
     rotation = poses_in_file(np.eye(3, 4)[None], source.views.to_file)[0, :, :3]
-    directions = np.float32(sphere_directions(_NUM_DIRECTIONS))
+    directions = np.float32(spread_directions(_NUM_DIRECTIONS))
     basis, in_world = harmonics(directions), jnp.float32(directions @ rotation)
     ridge = _RIDGE * jnp.diag(jnp.float32([1e-3, *[1.0] * 8]))
     params, grid = source.variables

@@ -13,6 +13,7 @@ from jaxtyping import Float, Num, UInt8
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.occupancy.grid import cell_inputs
+from jaxnerf.core.occupancy.seen_directions import spread_directions
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.rendering import points_on_rays
 from jaxnerf.core.safe_math import norm
@@ -21,7 +22,7 @@ from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.data.geometry.world import points_in_run, poses_in_file
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.output_images import to_8_bits
-from jaxnerf.evaluation.paths.camera_path import CameraPath, path_pixels, posed_views, resize
+from jaxnerf.evaluation.paths.camera_path import path_pixels, posed_views, resize, through_first_lens
 from jaxnerf.runtime.stages import Progress
 from jaxnerf.tools.exporters.base import ExportSource
 
@@ -214,30 +215,18 @@ def _poses_of(source, size, all_around):
     bounded = not source.variables[1].contracted and not source.run.experiment.config.data.ndc
     if all_around and bounded and not look_one_way(poses):
         poses = np.concatenate([poses, _around(poses, max(len(poses) // 2, 1))])
-    height, width = (int(side) for side in views.size[0])
-    focal, center = (
-        np.tile(np.float64(each)[:1], (len(poses), 1)) for each in (views.cameras.focal, views.cameras.center)
-    )
-    path = CameraPath("export", "export", poses, focal, center, width, height)
+    path = through_first_lens("export", poses, views)
     if size is None:
         return path
-    return resize(path, width=size) if width >= height else resize(path, height=size)
+    return resize(path, width=size) if path.width >= path.height else resize(path, height=size)
 
 
 def _around(poses, count):
     """Returns poses [N, 3, 4] on a sphere around what cameras look at, as far away as they are."""
     center, up = gaze_center(poses), up_of(np.float64(poses))
     radius = np.median(np.linalg.norm(poses[:, :, 3] - center, axis=1))
-    eyes = np.float32(center + radius * sphere_directions(count))
+    eyes = np.float32(center + radius * np.array(spread_directions(count)))
     return np.asarray(jax.vmap(look_at, in_axes=(0, None, None))(eyes, np.float32(center), np.float32(up)))
-
-
-def sphere_directions(count: int) -> np.ndarray:
-    """Returns unit vectors [N, 3] on a golden spiral over the sphere."""
-    steps = np.arange(count) + 0.5
-    height, angle = 1 - 2 * steps / count, np.pi * (1 + np.sqrt(5)) * steps
-    around = np.sqrt(1 - height**2)
-    return np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1)
 
 
 def _surface_function(source, posed):

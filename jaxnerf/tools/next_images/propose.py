@@ -165,7 +165,7 @@ def propose_images(
         for index in range(len(poses)):
             stage.update(index, len(poses))
             coverage.add(views, index)
-    posed = camera_path.posed_views(views, _path_of(found.poses, views))
+    posed = camera_path.posed_views(views, camera_path.through_first_lens(NAME, found.poses, views))
     with stages.stage("comparing places for further images"):
         own_angle = float(np.median([coverage.score(views, index).angle for index in range(len(poses))]))
         scores = {index: coverage.score(posed, index) for index in range(len(found.poses))}
@@ -193,7 +193,7 @@ def propose_images(
         directions=directions,
         counts=counts,
         proposals=tuple(proposals),
-        path=_path_of(np.stack([each.pose for each in proposals]), views),
+        path=camera_path.through_first_lens(NAME, np.stack([each.pose for each in proposals]), views),
     )
 
 
@@ -245,15 +245,6 @@ def _shown_cells(grid: OccupancyGrid, coverage, views, ndc):
     depth = 2 / (1 - positions[:, 2:])  # Eq. 25 of arXiv:2003.08934 with n = 1, solved for the position
     slopes = positions[:, :2] * views.size[0, ::-1] / (2 * np.float64(views.cameras.focal[0]))
     return np.concatenate([slopes * depth, -depth], axis=1), counts
-
-
-def _path_of(poses, views):
-    """Returns the CameraPath of cameras with the lens and the size of the first view, one frame a second."""
-    height, width = (int(side) for side in views.size[0])
-    focal, center = (
-        np.tile(np.float64(each)[:1], (len(poses), 1)) for each in (views.cameras.focal, views.cameras.center)
-    )
-    return CameraPath(NAME, NAME, poses, focal, center, width, height, fps=1.0)
 
 
 def _table(angles, candidates):

@@ -31,6 +31,22 @@ MATCHING = ("auto", "exhaustive", "sequential")
 _SECONDS = 10.0  # between two lines of progress
 
 
+class Settings(NamedTuple):
+    """How cameras are estimated.
+
+    Attributes:
+        camera_model: one of CAMERA_MODELS.
+        single_camera: whether all images of one size have one camera in common.
+        matching: see `image_pairs`; "auto": exhaustive for up to 200 images, otherwise sequential.
+        max_size: px, the longer side at which features are extracted. Cameras are those of the full images.
+    """
+
+    camera_model: str = "OPENCV"
+    single_camera: bool = True
+    matching: str = "auto"
+    max_size: int = 1600
+
+
 class Report(NamedTuple):
     """The result of `estimate_cameras`.
 
@@ -86,11 +102,8 @@ class Report(NamedTuple):
 def estimate_cameras(
     images: str | os.PathLike,
     out: str | os.PathLike,
+    settings: Settings | None = None,
     *,
-    camera_model: str = "OPENCV",
-    single_camera: bool = True,
-    matching: str = "auto",
-    max_size: int = 1600,
     num_threads: int | None = None,
     overwrite: bool = False,
     say: Callable[[str], None] = print,
@@ -105,10 +118,7 @@ def estimate_cameras(
     Args:
         images: the folder of the images of one static scene.
         out: the dataset's folder; it is created.
-        camera_model: one of CAMERA_MODELS.
-        single_camera: whether all images of one size have one camera in common.
-        matching: see `image_pairs`; "auto": exhaustive for up to 200 images, otherwise sequential.
-        max_size: px, the longer side at which features are extracted. Cameras are those of the full images.
+        settings: of COLMAP; its defaults when None.
         num_threads: None: one for each core.
         overwrite: whether an existing model, database and copies are replaced.
         say: receives lines about the progress.
@@ -116,9 +126,9 @@ def estimate_cameras(
     Raises:
         ValueError: names the file or setting, what was found, what is expected and what to do.
     """
-    images, out = Path(images), Path(out)
-    _check_choice("camera_model", camera_model, CAMERA_MODELS)
-    _check_choice("matching", matching, MATCHING)
+    images, out, settings = Path(images), Path(out), settings or Settings()
+    _check_choice("camera_model", settings.camera_model, CAMERA_MODELS)
+    _check_choice("matching", settings.matching, MATCHING)
     paths, others = images_module.find_images(images)
     _check_out(out, overwrite)
     in_place = images.resolve() == (out / "images").resolve()
@@ -130,16 +140,10 @@ def estimate_cameras(
         raise ValueError(
             "pycolmap is not installed, expected it for structure from motion; pip install 'jaxnerf[cameras]'"
         )
-    matching = images_module.resolve_matching(matching, len(paths))
-    settings = {
-        "camera_model": camera_model,
-        "single_camera": single_camera,
-        "matching": matching,
-        "max_size": max_size,
-        "images": {path.name: file_sha256(path) for path in paths},
-    }
+    matching = images_module.resolve_matching(settings.matching, len(paths))
+    used = {**settings._asdict(), "matching": matching, "images": {path.name: file_sha256(path) for path in paths}}
     say(f"images: {len(paths)} in {images}" + (f"; its other files are skipped: {others}" if others else ""))
-    stages = _Stages(out, settings, num_threads or -1, overwrite, say)
+    stages = _Stages(out, used, num_threads or -1, overwrite, say)
     names, notes = stages.prepare_images(paths, in_place)
     stages.extract(names)
     stages.match(names)
@@ -147,7 +151,7 @@ def estimate_cameras(
     notes += more
     _publish(models[0].folder, out / "sparse", stages.work)
     capture = colmap.read_capture(out)
-    cameras = _describe_cameras([frame.camera for frame in capture.frames], camera_model)
+    cameras = _describe_cameras([frame.camera for frame in capture.frames], settings.camera_model)
     return Report(out, tuple(names), cameras, tuple(models), stages.seconds, tuple(notes))
 
 

@@ -42,15 +42,12 @@ _OVERWRITE = flags.DEFINE_bool(
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.tools.structure_from_motion.estimate import estimate_cameras
+    from jaxnerf.tools.structure_from_motion.estimate import Settings, estimate_cameras
 
     report = estimate_cameras(
         _IMAGES.value,
         _OUT.value,
-        camera_model=_CAMERA_MODEL.value,
-        single_camera=_SINGLE_CAMERA.value,
-        matching=_MATCHING.value,
-        max_size=_MAX_SIZE.value,
+        Settings(_CAMERA_MODEL.value, _SINGLE_CAMERA.value, _MATCHING.value, _MAX_SIZE.value),
         num_threads=_NUM_THREADS.value,
         overwrite=_OVERWRITE.value,
         say=lambda line: print(line, flush=True),

@@ -28,6 +28,7 @@ from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.fields.base import Field
+from jaxnerf.models.base import with_field_input
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource, fingerprint_of, folder_of
@@ -154,7 +155,7 @@ def fit_deformation(source: UncertaintySource) -> Deformation:
         keys, batch = draw_batch(np.uint32(0), index, jnp.arange(BATCH_SIZE), views, **options)
 
         def colors(displacement):
-            rendered = model.render(keys, _deformed(params, displacement), grid, batch.rays, step)
+            rendered = model.render(keys, with_field_input(params, displacement), grid, batch.rays, step)
             return rendered[model.image_networks[-1]].rgb
 
         rgb, transpose = jax.vjp(colors, still)
@@ -241,7 +242,7 @@ def _scored_rendering(source):
         still = jnp.zeros_like(posterior.std)
 
         def view(displacement):
-            return model.view(_deformed(params, displacement), grid, rays)
+            return model.view(with_field_input(params, displacement), grid, rays)
 
         def change(key):
             probe = posterior.std * jax.random.rademacher(key, still.shape, still.dtype)
@@ -269,11 +270,6 @@ def _cull(source):
 
 def _with_score(rendering, score):
     return dataclasses.replace(rendering, rgb=jnp.broadcast_to(score[..., None], (*score.shape, 3)))
-
-
-def _deformed(params, displacement):
-    """Returns the params of a model whose field "fine" is deformed."""
-    return {**params, "fine": (params["fine"], displacement)}
 
 
 def _box_of(config):

@@ -23,6 +23,7 @@ from jaxnerf.data.ray_batches import with_needs
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.evaluation.supersampling import MAX_RAYS, trained_footprint
+from jaxnerf.models.base import with_field_input
 
 UNCERTAINTY = "uncertainty"
 MODES = ("colour", "depth", "opacity", "normals", UNCERTAINTY)
@@ -279,7 +280,7 @@ class FrameRenderer:
     def _grey_planes(self, fast, params, grid, arrays, ids):
         """Returns _planes with the mean uncertainty of what is seen in place of colour."""
         params, uncertainty_at = params
-        params = {**params, "fine": (params["fine"], uncertainty_at)}
+        params = with_field_input(params, uncertainty_at)
         planes = self._planes(self._uncertain(fast).view, params, grid, arrays, ids)
         opacity = planes[:, 3:4]
         mean = (planes[:, :3] - (1 - opacity) * self._background) / jnp.maximum(opacity, _SEEN)

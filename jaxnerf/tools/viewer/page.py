@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxnerf.core import contraction
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import axis_of, gaze_center
 from jaxnerf.data.geometry.world import direction_in_run
@@ -18,13 +17,13 @@ from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY, cleaned
 from jaxnerf.tools.viewer.frame_renderer import MAX_SIDE, MODES, UNCERTAINTY, FrameCamera, frame_image
 from jaxnerf.tools.viewer.keyframes import cameras_through, load_keyframes, save_path
+from jaxnerf.tools.viewer.occupied_cells import surface_cells
 from jaxnerf.tools.viewer.render_loop import Delivery, Request
 
 RESOLUTIONS = ("100", "200", "400", "800", "1600")  # px of the longer side
 _AXES = {"+x": (1, 0, 0), "+y": (0, 1, 0), "+z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 _MAX_FRUSTUMS, _THUMBNAIL, _BESIDE = 120, 64, 400  # views, px, px
 _NARROW = 0.75  # width over height of a window, below which the controls are folded at first: a phone's
-_MAX_CELLS = 30_000  # cells of the occupancy grid that are drawn
 _STATUS_EVERY = 0.25  # s between changes of the status while the camera moves
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # viser's cameras look along +z with y down
 
@@ -286,9 +285,8 @@ class Page:
         state = self._viewer.state
         if self._show_grid.value is not True or state is None or state.grid is None:
             return
-        points, cell = _surface_cells(state.grid)
-        if self._viewer.run.experiment.config.data.ndc:
-            points = _from_ndc(points, self._viewer.views)
+        in_ndc = self._viewer.run.experiment.config.data.ndc
+        points, cell = surface_cells(state.grid, self._viewer.views if in_ndc else None)
         if len(points):
             self._cells = self._client.scene.add_point_cloud(
                 "/cells", np.float32(points), (90, 140, 220), point_size=cell / 3, precision="float32"
@@ -471,35 +469,3 @@ def _view_image(views, index, longest):
     image = np.asarray(views.image(index))
     every = -(-max(image.shape[:2]) // longest)
     return output_images.to_8_bits(image[::every, ::every])
-
-
-def _surface_cells(grid):
-    """Returns the centres [N, 3] of occupied cells with an empty neighbour, in the grid's space, and a cell's size."""
-    occupied = np.asarray(grid.occupied)
-    around = np.pad(occupied, 1)
-    inside = np.ones_like(occupied)
-    for axis in range(3):
-        for start in (0, 2):
-            part = [slice(1, -1)] * 3
-            part[axis] = slice(start, start + occupied.shape[axis])
-            inside &= around[tuple(part)]
-    cells = np.argwhere(occupied & ~inside)
-    cells = cells[:: max(-(-len(cells) // _MAX_CELLS), 1)]
-    lower, upper = np.asarray(grid.lower, np.float64), np.asarray(grid.upper, np.float64)
-    size = (upper - lower) / occupied.shape
-    points = lower + (cells + 0.5) * size
-    if grid.contracted and len(points):
-        middle, quarter = (lower + upper) / 2, (upper - lower) / 4
-        local = (points - middle) / quarter
-        near = np.abs(local).max(axis=1) < 1.9  # farther cells are larger than the scene
-        points = middle + quarter * np.asarray(contraction.expand(np.float32(local[near])))
-    return points, float(size.min())
-
-
-def _from_ndc(points, views):
-    """Returns where points [N, 3] of NDC are in the world, see `ndc_rays`; the near plane is at z = -1."""
-    height, width = (float(side) for side in views.size[0])
-    focal = np.asarray(views.cameras.focal, np.float64)[0]
-    depth = 2 / (1 - np.minimum(points[:, 2], 1 - 1e-3))
-    across = points[:, :2] * depth[:, None] * [width, height] / (2 * focal)
-    return np.column_stack([across, -depth])

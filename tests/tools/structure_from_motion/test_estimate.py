@@ -22,7 +22,7 @@ from jaxnerf.data.readers.base import read_capture
 from jaxnerf.tools.structure_from_motion import colmap_process
 from jaxnerf.tools.structure_from_motion import images as images_module
 from jaxnerf.tools.structure_from_motion.colmap_process import Model
-from jaxnerf.tools.structure_from_motion.estimate import CAMERA_MODELS, Report, estimate_cameras
+from jaxnerf.tools.structure_from_motion.estimate import CAMERA_MODELS, Report, Settings, estimate_cameras
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_without_pycolmap_the_command_that_installs_it_is_named(images, tmp_path
 @pytest.mark.parametrize("setting, value", [("camera_model", "FOV"), ("matching", "all")])
 def test_wrong_settings_are_reported(images, tmp_path, pycolmap, setting, value):
     with pytest.raises(ValueError, match=f"--{setting} is '{value}', expected one of "):
-        estimate_cameras(images, tmp_path / "out", **{setting: value})
+        estimate_cameras(images, tmp_path / "out", Settings(**{setting: value}))
     assert not (tmp_path / "out").exists()
 
 
