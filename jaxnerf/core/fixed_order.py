@@ -3,41 +3,13 @@
 Float32 additions depend on their order, so that two runs with the same seed differ. Whole numbers do not.
 """
 
-import contextvars
 import functools
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxnerf.core.volume_rendering import running_sum_since
-
-_wanted = contextvars.ContextVar("in_fixed_order", default=False)
-
-
-def with_fixed_order(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a function whose sums, and those of its gradient, have a fixed order when it is traced.
-
-    On a CPU the function is unchanged: sums have a fixed order there. Forward-mode derivatives of a hash grid's
-    features are not defined in such a function.
-    """
-
-    @functools.wraps(function)
-    def traced(*arguments, **options):
-        token = _wanted.set(True)
-        try:
-            return function(*arguments, **options)
-        finally:
-            _wanted.reset(token)
-
-    return traced
-
-
-def in_fixed_order() -> bool:
-    """Returns whether sums that are traced now must have a fixed order; never on a CPU, where all have."""
-    return _wanted.get() and jax.default_backend() != "cpu"
 
 
 def add_rows(values: Float[ArrayLike, "M F"], rows: Int[ArrayLike, " M"], num_rows: int) -> Float[Array, "num_rows F"]:

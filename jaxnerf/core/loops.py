@@ -1,4 +1,9 @@
-"""What is compiled otherwise for a CPU than for an accelerator: short loops, and the layout of arrays."""
+"""Loops: what is compiled otherwise for a CPU than for an accelerator, and the type of what they carry.
+
+The carry of a loop must have one type. Inside jax.shard_map the type of an array tells over which axes of the mesh it
+may vary. What begins as constants, equal on all devices, does not have the type of what the loop computes from sharded
+arrays.
+"""
 
 import functools
 from collections.abc import Callable
@@ -52,3 +57,28 @@ def search_sorted(
         return functools.partial(jnp.searchsorted, side=side, method=method)
 
     return jax.lax.platform_dependent(ascending, values, cpu=search("scan"), default=search("scan_unrolled"))
+
+
+def vary_like(tree: _Tree, *others: object) -> _Tree:
+    """Marks arrays as varying over all mesh axes over which others vary; outside jax.shard_map nothing changes.
+
+    Args:
+        tree: of arrays.
+        *others: trees of arrays or of jax.ShapeDtypeStruct, such as the result of jax.eval_shape.
+
+    Returns:
+        The tree, with the same values.
+    """
+    axes = frozenset().union(*(_axes(leaf) for leaf in jax.tree.leaves(others)))
+
+    def mark(leaf):
+        missing = tuple(sorted(axes - _axes(leaf)))
+        return jax.lax.pcast(leaf, missing, to="varying") if missing else leaf
+
+    return jax.tree.map(mark, tree)
+
+
+def _axes(leaf):
+    kind = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
+    manual = getattr(kind, "manual_axis_type", None)
+    return getattr(manual or kind, "varying" if manual else "vma", None) or frozenset()  # vma: JAX 0.10.0

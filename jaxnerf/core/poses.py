@@ -1,4 +1,4 @@
-"""Camera poses: one that looks at a point, and paths of many.
+"""Camera poses: one that looks at a point, and paths of many; directions spread over the sphere.
 
 Camera axes are x right, y up, looking along -z. A path is poses [N, 3, 4], camera to world, in float32.
 """
@@ -176,6 +176,17 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Float[Array, "3 4"]:
     substitute = jnp.cross(jnp.roll(back, 1), back)
     right = normalize(jnp.where(norm(right) > 1e-6, right, substitute))  # a shorter one is rounding error
     return jnp.stack([right, jnp.cross(back, right), back, eye], axis=-1)
+
+
+def spread_directions(count: int) -> list[tuple[float, float, float]]:
+    """Returns unit vectors that are spread evenly over the sphere, on a golden spiral, from the top to the bottom."""
+    golden = math.pi * (3 - math.sqrt(5))
+    heights = [1 - (2 * step + 1) / count for step in range(count)]
+    around = [math.sqrt(1 - height**2) for height in heights]
+    return [
+        (radius * math.cos(golden * step), radius * math.sin(golden * step), height)
+        for step, (radius, height) in enumerate(zip(around, heights, strict=True))
+    ]
 
 
 def se3_exponential(twists: Float[ArrayLike, "*batch 6"]) -> Float[Array, "*batch 3 4"]:

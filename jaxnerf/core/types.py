@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TypeAlias, TypeVar, dataclass_transform
+from typing import NamedTuple, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -85,6 +85,24 @@ class Samples:
     t: Float[Array, "*batch samples"]
     delta: Float[Array, "*batch samples"]
     rule: str = "segments"
+
+
+class PlacedSamples(NamedTuple):
+    """Samples of many rays in one buffer of fixed size, ray after ray, near to far, before the scene is evaluated.
+
+    Attributes:
+        t: [K] in t of the sample's ray.
+        delta: [K] length in t.
+        ray_index: [K] int32, index of the sample's ray, ascending.
+        used: [K] bool, False for unused slots, which come last.
+        num_dropped: [B] int32, the number of a ray's samples that did not fit.
+    """
+
+    t: Float[Array, " K"]
+    delta: Float[Array, " K"]
+    ray_index: Int[Array, " K"]
+    used: Bool[Array, " K"]
+    num_dropped: Int[Array, " B"]
 
 
 @pytree(static=("rule",))

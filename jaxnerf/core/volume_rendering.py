@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from jaxnerf.core.loops import short_loop
+from jaxnerf.core.loops import short_loop, vary_like
 from jaxnerf.core.safe_math import at_least_float32, clamp, divide
 from jaxnerf.core.types import check_shapes
-from jaxnerf.core.varying import vary_like
 
 # Beyond this optical depth exp(-x) is 0 in every float type. Larger or infinite depths are replaced by it, so that
 # sums and products stay finite.

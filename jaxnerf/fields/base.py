@@ -1,4 +1,4 @@
-"""The interface of fields: parameters, and a function of them that is a scene."""
+"""The interface of fields, parameters and a function of them that is a scene, and the layers that networks share."""
 
 import functools
 import math
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen
 from jaxtyping import Array, ArrayLike, Float, Num
 
@@ -36,6 +37,8 @@ class Field(NamedTuple):
         color_layers: keys of params: the first layers that serve colour alone; empty: not checked. A field is dead,
             too, if no gradient reaches these layers.
         network: what has the parameters, for tools that write it in another form; None: they cannot.
+        apply_in_fixed_order: `apply`, with a gradient whose sums have a fixed order on an accelerator, too; None: those
+            of `apply` have.
     """
 
     init: Callable[[jax.Array], Any]
@@ -44,6 +47,7 @@ class Field(NamedTuple):
     regularizers: Mapping[str, Callable[[Any], jax.Array]] = {}
     color_layers: tuple[str, ...] = ()
     network: Any = None
+    apply_in_fixed_order: Callable[..., tuple[jax.Array, jax.Array]] | None = None
 
 
 def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
@@ -66,7 +70,7 @@ def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
                 options[name] = sizes * contraction.length_scale((x - center) / scale)
         return field.apply(params, center + scale * contraction.contract((x - center) / scale), viewdirs, **options)
 
-    return field._replace(apply=apply)
+    return field._replace(apply=apply, apply_in_fixed_order=None)
 
 
 def field_scene(field: Field, params: Mapping[str, Any], name: str = "fine", **options: Any) -> SceneFn:
@@ -125,6 +129,61 @@ def apply_network(
     padded = {name: pad(value[..., None])[..., 0] if jnp.ndim(value) else value for name, value in inputs.items()}
     outputs = network.apply({"params": params}, pad(x), pad(viewdirs), **padded)
     return tuple(value[:rays, :samples].reshape(*shape, *value.shape[2:]) for value in outputs)
+
+
+class Affine(linen.Module):
+    """The parameters of an affine layer."""
+
+    features: int
+
+    @linen.compact
+    def __call__(self, size: int) -> tuple[Float[Array, "size features"], Float[Array, " features"]]:
+        """Returns kernel [size, features] and bias [features]."""
+        kernel = self.param("kernel", linen.initializers.glorot_uniform(), (size, self.features))
+        return kernel, self.param("bias", linen.initializers.zeros_init(), (self.features,))
+
+
+class Dense(Affine):
+    """An affine layer on the concatenation of its inputs, which is never materialised.
+
+    The kernel has one row for each feature of the concatenation, so parameters and initialisation are those of
+    the plain layer.
+
+    Attributes:
+        dtype: of the output; None: that of the inputs.
+    """
+
+    dtype: Any = None
+
+    def __call__(
+        self,
+        *inputs: Float[ArrayLike, "..."],
+        before: tuple[Float[ArrayLike, "inputs E"], Float[ArrayLike, " E"]] | None = None,
+    ) -> Float[Array, "features ..."]:
+        """Returns [features, ...] for inputs [D_i, ...], whose axes of length 1 are broadcast.
+
+        Args:
+            *inputs: [D_i, ...].
+            before: kernel [D_0, E] and bias [E] of an affine layer that is applied to the first input. As there is
+                no activation between them, the two layers are multiplied into one, which costs less than
+                applying both to all samples.
+        """
+        sizes = [value.shape[0] for value in inputs]
+        if before:
+            sizes[0] = before[1].size
+        kernel, bias = super().__call__(sum(sizes))
+        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
+        if before:
+            first, highest = parts[0], jax.lax.Precision.HIGHEST
+            bias = bias + jnp.matmul(before[1], first, precision=highest)
+            parts[0] = jnp.matmul(before[0], first, precision=highest)
+        dtype = inputs[0].dtype if self.dtype is None else self.dtype
+        total = bias.astype(dtype).reshape(-1, *(1,) * (inputs[0].ndim - 1))
+        for rows, value in zip(parts, inputs, strict=True):
+            total = total + jnp.tensordot(
+                rows.astype(value.dtype), value, axes=(0, 0), preferred_element_type=self.dtype
+            )
+        return total
 
 
 def infer_prefilter(facts: Facts) -> tuple[bool, str]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.encoding import encode_planes, frustum_variance
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
-from jaxnerf.fields.base import Field, apply_network, infer_prefilter
+from jaxnerf.fields.base import Affine, Dense, Field, apply_network, infer_prefilter
 from jaxnerf.options import DTYPES, Box, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Part
 
@@ -207,61 +207,6 @@ class MLP(linen.Module):
             hidden = (jax.nn.relu(view).reshape(self.view_width, -1),)
         rgb = Dense(3, name="rgb")(*hidden).astype(dtype)
         return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
-
-
-class Affine(linen.Module):
-    """The parameters of an affine layer."""
-
-    features: int
-
-    @linen.compact
-    def __call__(self, size: int) -> tuple[Float[Array, "size features"], Float[Array, " features"]]:
-        """Returns kernel [size, features] and bias [features]."""
-        kernel = self.param("kernel", linen.initializers.glorot_uniform(), (size, self.features))
-        return kernel, self.param("bias", linen.initializers.zeros_init(), (self.features,))
-
-
-class Dense(Affine):
-    """An affine layer on the concatenation of its inputs, which is never materialised.
-
-    The kernel has one row for each feature of the concatenation, so parameters and initialisation are those of
-    the plain layer.
-
-    Attributes:
-        dtype: of the output; None: that of the inputs.
-    """
-
-    dtype: Any = None
-
-    def __call__(
-        self,
-        *inputs: Float[ArrayLike, "..."],
-        before: tuple[Float[ArrayLike, "inputs E"], Float[ArrayLike, " E"]] | None = None,
-    ) -> Float[Array, "features ..."]:
-        """Returns [features, ...] for inputs [D_i, ...], whose axes of length 1 are broadcast.
-
-        Args:
-            *inputs: [D_i, ...].
-            before: kernel [D_0, E] and bias [E] of an affine layer that is applied to the first input. As there is
-                no activation between them, the two layers are multiplied into one, which costs less than
-                applying both to all samples.
-        """
-        sizes = [value.shape[0] for value in inputs]
-        if before:
-            sizes[0] = before[1].size
-        kernel, bias = super().__call__(sum(sizes))
-        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
-        if before:
-            first, highest = parts[0], jax.lax.Precision.HIGHEST
-            bias = bias + jnp.matmul(before[1], first, precision=highest)
-            parts[0] = jnp.matmul(before[0], first, precision=highest)
-        dtype = inputs[0].dtype if self.dtype is None else self.dtype
-        total = bias.astype(dtype).reshape(-1, *(1,) * (inputs[0].ndim - 1))
-        for rows, value in zip(parts, inputs, strict=True):
-            total = total + jnp.tensordot(
-                rows.astype(value.dtype), value, axes=(0, 0), preferred_element_type=self.dtype
-            )
-        return total
 
 
 def cone_variance(

@@ -103,6 +103,8 @@ class SamplerContext(NamedTuple):
         background: [3] colour behind the scene; None: black.
         box: lower and upper corner of the scene, world units; None where the config has none yet.
         contracted: whether the box holds all of space.
+        fixed_order: whether the sums of training must have a fixed order on an accelerator, see `render_placed`; those
+            of the fields then have it.
     """
 
     options: Any
@@ -111,3 +113,4 @@ class SamplerContext(NamedTuple):
     background: Background | None
     box: Box | None
     contracted: bool = False
+    fixed_order: bool = False

@@ -160,7 +160,8 @@ def from_context(context: SamplerContext) -> Model:
     """Makes the model that the options describe."""
     field = context.make_field("fine")
     schedule = schedule_of(context.options, context.box, field, contracted=context.contracted)
-    return occupancy_model(field, schedule, context.options, context.view, background=context.background)
+    given = {"background": context.background, "fixed_order": context.fixed_order}
+    return occupancy_model(field, schedule, context.options, context.view, **given)
 
 
 SAMPLER = Part(from_context, OccupancyOptions, section="occupancy")
@@ -190,7 +191,13 @@ def schedule_of(options: OccupancyOptions, box: Box | None, field: Field | None,
 
 
 def occupancy_model(
-    field: Field, schedule: GridSchedule, options: OccupancyOptions, view: ViewOptions, *, background: Background | None
+    field: Field,
+    schedule: GridSchedule,
+    options: OccupancyOptions,
+    view: ViewOptions,
+    *,
+    background: Background | None,
+    fixed_order: bool = False,
 ) -> Model:
     """Makes the model of one field that is evaluated only in the occupied cells of its grid.
 
@@ -201,6 +208,7 @@ def occupancy_model(
             fewer, see `importance_samples`.
         view: of images.
         background: see `render_samples`.
+        fixed_order: see `render_placed`.
     """
 
     def scene(params):
@@ -234,7 +242,7 @@ def occupancy_model(
             samples, occluded = jax.lax.cond(complete, lambda: place(runs), anywhere)
         else:
             samples, occluded = anywhere()
-        rendering = render_placed(scene(params), rays, samples, longest=longest)
+        rendering = render_placed(scene(params), rays, samples, longest=longest, fixed_order=fixed_order)
         return {"fine": _over_background(rendering, occluded, background)}
 
     return Model(

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxnerf.core.fixed_order import with_fixed_order
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
@@ -95,8 +94,10 @@ def build(config: Config) -> Experiment:
     config, model, cameras = parts.config, parts.model, parts.cameras
     given, train = config.data, _filled(config.train, "train")
     losses = build_losses(config.losses, model)
-    if train.deterministic:
+    if train.deterministic and jax.default_backend() != "cpu":  # there all sums have a fixed order
         _check_fixed_order(losses, cameras)
+        model = model._replace(render=build_model(config, fixed_order=True).render)
+        parts = parts._replace(model=model)
     optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
@@ -147,8 +148,6 @@ def render_parts(config: Config) -> RenderParts:
     cameras = build_cameras(config, model.needs)
     if cameras is not None:
         model = cameras.added_to(model)
-    if config.train.deterministic:
-        model = model._replace(render=with_fixed_order(model.render), view=with_fixed_order(model.view))
     return RenderParts(
         config=config,
         model=model,
@@ -175,29 +174,30 @@ def _pixel_rays(train, cameras, extras):
 
 
 def _check_fixed_order(losses, cameras):
-    """Raises a ValueError if the sums of a gradient have no fixed order on this device."""
+    """Raises a ValueError if the gradient of what is trained has no fixed order on an accelerator."""
     others = {"cameras.exposure or cameras.refine": cameras is not None}
     others |= {f"losses.{loss.name}": not LOSSES.get(loss.name).fixed_order for loss in losses}
     found = [name for name, is_on in others.items() if is_on]
-    if found and jax.default_backend() != "cpu":
+    if found:
         raise ValueError(
             f"train.deterministic is True, and {' and '.join(found)} is on, whose gradient has no fixed order on an "
             "accelerator; set it to False, or turn the other off"
         )
 
 
-def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) -> Model:
+def build_model(config: Config, wrap: Callable[[Field], Field] | None = None, *, fixed_order: bool = False) -> Model:
     """Builds the Model: the config's field under the config's sampler.
 
     Args:
         config: resolved.
         wrap: changes the field that images show; None: it is as the config says.
+        fixed_order: whether the sums of training have a fixed order on an accelerator, too.
     """
     config = read_config(config)
     part, scene = SAMPLERS.get(config.sampler), config.scene
 
     def make_field(network):
-        field = _make_field(config, network)
+        field = _make_field(config, network, fixed_order)
         return wrap(field) if wrap is not None and network == FINAL_NETWORK else field
 
     return part.make(
@@ -208,6 +208,7 @@ def build_model(config: Config, wrap: Callable[[Field], Field] | None = None) ->
             background=scene.color_behind(config.data.background),
             box=scene.box,
             contracted=scene.contracted is True,
+            fixed_order=fixed_order,
         )
     )
 
@@ -302,7 +303,7 @@ def load_split(config: Config, split: str | None = None) -> tuple[Views, str, di
     return views, split, dataset.conventions(data, capture)
 
 
-def _make_field(config, network) -> Field:
+def _make_field(config, network, fixed_order) -> Field:
     """Makes the field of a network: the one that the config names, or that of a section of the network's name."""
     if network == FINAL_NETWORK:
         part, options = FIELDS.get(config.field), config.options_of(FIELDS)
@@ -312,6 +313,8 @@ def _make_field(config, network) -> Field:
     else:
         raise ValueError(f"make_field: no network {network!r}, expected one of {FINAL_NETWORK!r} and {[*config.parts]}")
     field = part.make(_filled(options, section), config.scene.box)
+    if fixed_order and field.apply_in_fixed_order is not None:
+        field = field._replace(apply=field.apply_in_fixed_order)
     # The paper's networks are not contracted; all other fields are defined in the box.
     declared = options if isinstance(options, Options) else Options()
     if (declared.needs_box or config.declared_by(SAMPLERS).needs_box) and config.scene.contracted is True:

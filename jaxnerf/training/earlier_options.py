@@ -47,6 +47,8 @@ _SCALES = "write the images at all sizes as experiments/multiscale does"
 GONE: dict[str, Gone] = {  # by "section.option"
     "data.num_scales": Gone((1,), Changes.TRAINING, _SCALES),
     **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
+    "hash_grid.geometry_features": Gone((15,), Changes.TRAINING | Changes.IMAGES, _DROP),
+    "hash_grid.feature_scale": Gone((4.0,), Changes.TRAINING | Changes.IMAGES, _DROP),
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay", "opaque")},
     "train.beta1": Gone((0.9,), Changes.TRAINING, "Adam's first moment always decays by 0.9; leave it out"),
     "train.max_nonfinite": Gone((20,), Changes.NOTHING, "a run fails after 20 such steps in a row; leave it out"),

@@ -151,20 +151,36 @@ def with_muon(
         schedule: step -> learning rate.
         size: root mean square of a matrix's update over the learning rate.
     """
-    muon = optax.contrib.muon(schedule, _ITERATIONS, consistent_rms=size, weight_decay=size / _MAX_RMS)
+    scale = optax.contrib.scale_by_muon(_ITERATIONS, weight_dimension_numbers=_sides_of_matrices)
     if not is_cpu():
-        muon = muon._replace(update=functools.partial(_update_together, schedule, size))
+        scale = scale._replace(update=_scale_together)
+    muon = optax.chain(
+        scale,
+        optax.stateless(lambda directions, _: jax.tree.map(functools.partial(_scaled_by_shape, size), directions)),
+        optax.add_decayed_weights(size / _MAX_RMS),
+        optax.scale_by_learning_rate(schedule),
+    )
+    # As in optax.contrib.muon, whose checkpoints have the state of an Adam for what is no matrix, here for nothing.
+    every = functools.partial(jax.tree.map, lambda _: "muon")
+    muon = optax.partition({"muon": muon, "adam": optax.adamw(schedule)}, every)
     return optax.partition({"muon": muon, "other": optimizer}, _labels)
 
 
-def _update_together(schedule, size, grads, state, params):
-    """Does what the update of optax.contrib.muon does, in products of all matrices at once.
+def _sides_of_matrices(params):
+    return jax.tree.map(lambda _: optax.contrib.MuonDimensionNumbers(), params)
+
+
+def _scaled_by_shape(size, direction):
+    """Returns the update by an orthogonal matrix with a root mean square of `size`, whatever its shape."""
+    return jnp.sqrt(jnp.maximum(*direction.shape)) * size * direction
+
+
+def _scale_together(grads, state, params=None):
+    """Does what the update of optax.contrib.scale_by_muon does, in products of all matrices at once.
 
     One by one, the products of small matrices take an accelerator longer to start than to compute. The matrices are
     padded with zeros to one shape; the padding of their singular vectors stays zero.
     """
-    masked = state.inner_states["muon"]
-    (first, *others, last) = masked.inner_state
     leaves, structure = jax.tree.flatten(grads)
     wide = [min(leaf.shape) for leaf in leaves], [max(leaf.shape) for leaf in leaves]
 
@@ -181,20 +197,9 @@ def _update_together(schedule, size, grads, state, params):
     # Without a loop: its iterations are launches, too.
     sides = optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2)
     once = optax.contrib.scale_by_muon(_ITERATIONS[0], len(_ITERATIONS), weight_dimension_numbers=sides)
-    stacked = first._replace(mu=stack(first.mu), ns_coeffs=first.ns_coeffs[0])
+    stacked = state._replace(mu=stack(state.mu), ns_coeffs=state.ns_coeffs[0])
     directions, stacked = once.update(stack(grads), stacked)
-    first = first._replace(mu=unstack(stacked.mu), count=stacked.count)
-    rate = schedule(last.count)
-
-    def change(direction, param):
-        return -rate * (size * max(param.shape) ** 0.5 * direction + size / _MAX_RMS * param)
-
-    updates = jax.tree.map(change, unstack(directions), params)
-    last = last._replace(count=optax.safe_increment(last.count))
-    # Its Adam has no parameters; only the numbers of steps change.
-    adam = jax.tree.map(optax.safe_increment, state.inner_states["adam"])
-    inner = {"muon": masked._replace(inner_state=(first, *others, last)), "adam": adam}
-    return updates, state._replace(inner_states=inner)
+    return unstack(directions), state._replace(mu=unstack(stacked.mu), count=stacked.count)
 
 
 def _labels(params):

@@ -14,11 +14,12 @@ from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compi
 from jaxnerf import Camera, Rays, Samples
 from jaxnerf.core.cameras import pixel_radius
 from jaxnerf.core.contraction import contract, length_scale
-from jaxnerf.core.occupancy.from_scene import visible_grid
-from jaxnerf.core.occupancy.grid import cell_inputs, drop_thin_density
-from jaxnerf.core.occupancy.packed import PlacedSamples, render_placed, visible_samples
+from jaxnerf.core.occupancy.from_scene import drop_thin_density, visible_grid, visible_samples
+from jaxnerf.core.occupancy.grid import cell_inputs
+from jaxnerf.core.occupancy.packed import render_placed
 from jaxnerf.core.occupancy.ray_culling import render_selected
 from jaxnerf.core.scene import NEEDS, needs_of
+from jaxnerf.core.types import PlacedSamples
 from jaxnerf.fields.base import Field, apply_network, contract_field, field_scene
 
 pytest_plugins = ["run_fixtures"]

@@ -12,9 +12,8 @@ import pytest
 
 from jaxnerf import Camera, load_scene, rays_from_pixels, render_image
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.evaluation import output_images
+from jaxnerf.evaluation import image_renderer, output_images
 from jaxnerf.evaluation.paths import render_path as render_path_module
-from jaxnerf.runtime import memory
 from runs import render_path, run_forked
 
 pytest_plugins = ["run_fixtures"]
@@ -129,8 +128,8 @@ def test_only_missing_frames_are_rendered(rendered, run, path_file, monkeypatch,
     os.remove(folder / "color" / "0001.png")
     (folder / "color" / "0001.png.tmp").write_bytes(pixels[:40])  # as a kill leaves it
     calls = []
-    render_image = memory.render_image
-    monkeypatch.setattr(memory, "render_image", lambda *a, **k: calls.append(1) or render_image(*a, **k))
+    render_image = image_renderer.render_image
+    monkeypatch.setattr(image_renderer, "render_image", lambda *a, **k: calls.append(1) or render_image(*a, **k))
     options = {"path": str(path_file), "rgba": True, "video": "none", "settings": {"chunk": 100}}
     assert render_path(run, **options) == [folder]
     assert len(calls) == 1 and (folder / "color" / "0001.png").read_bytes() == pixels

@@ -11,15 +11,14 @@ import pytest
 from helpers import all_finite, assert_batch_is_vmap_is_jit, assert_same, compiled
 from jaxnerf.core.scene import needs_of
 from jaxnerf.fields.hash_grid import (
-    TableLevel,
     color_activation,
     damping,
     harmonics,
     hash_grid_field,
-    interpolate,
     total_variation,
     vertices,
 )
+from jaxnerf.fields.hash_interpolation import TableLevel, interpolate
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from jaxnerf.core import contraction, volume_rendering
+from jaxnerf.core.loops import vary_like
 from jaxnerf.core.safe_math import at_least_float32
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.scene import inputs_of, needs_of
 from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, check_shapes, pytree
-from jaxnerf.core.varying import vary_like
 
 _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 _ABSORBED = 0.01  # the fraction of light that matter of the threshold's density absorbs between samples
@@ -296,17 +296,6 @@ def mark_cells(
     return marked.reshape(-1).at[index].max(chosen & inside).reshape(marked.shape)
 
 
-def keep_cells(grid: OccupancyGrid, marked: Bool[ArrayLike, "X Y Z"]) -> OccupancyGrid:
-    """Returns the grid in which only cells that are marked, or between two that are, stay occupied."""
-    between = marked
-    for axis in range(3):
-        around = jnp.pad(marked, [(1, 1) if i == axis else (0, 0) for i in range(3)])
-        before, after = (jax.lax.slice_in_dim(around, i, i + marked.shape[axis], axis=axis) for i in (0, 2))
-        between |= before & after
-    occupied = grid.occupied & between
-    return dataclasses.replace(grid, density_mean=jnp.where(occupied, grid.density_mean, -1), occupied=occupied)
-
-
 def widen(occupied: Bool[ArrayLike, "X Y Z"]) -> Bool[Array, "X Y Z"]:
     """Returns the cells that are occupied or share a side with one that is."""
     wide = occupied
@@ -455,27 +444,6 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
         return jnp.where(kept, density, 0), rgb
 
     return masked
-
-
-def drop_thin_density(
-    scene: SceneFn, grid: OccupancyGrid, threshold: Float[ArrayLike, ""] | Float[ArrayLike, "X Y Z"]
-) -> SceneFn:
-    """Makes a scene that is empty where its density is at most a threshold; NaN stays.
-
-    Args:
-        scene: see render_samples.
-        grid: OccupancyGrid, to whose cells the threshold belongs.
-        threshold: see update_grid.
-    """
-    threshold = jnp.asarray(threshold, jnp.float32)
-
-    @functools.wraps(scene)
-    def thinned(x, viewdirs, **inputs):
-        density, rgb = scene(x, viewdirs, **inputs)
-        least = threshold.reshape(-1)[cells_around(grid, x)[0]] if threshold.ndim else threshold
-        return jnp.where(density <= least, 0, density), rgb
-
-    return thinned
 
 
 def flat_index(places: Sequence[Int[Array, "*batch"]], shape: tuple[int, ...]) -> Int[Array, "*batch"]:

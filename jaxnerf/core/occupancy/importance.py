@@ -3,16 +3,18 @@
 This is the importance sampling of arXiv:2003.08934 (Section 5.2) with the grid in place of the coarse network.
 """
 
+from typing import Any, NamedTuple
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxnerf.core.loops import short_loop
+from jaxnerf.core.loops import short_loop, vary_like
 from jaxnerf.core.occupancy.grid import OccupancyGrid, estimate_optical_depth
-from jaxnerf.core.occupancy.packed import PlacedSamples
-from jaxnerf.core.occupancy.sample_runs import RaysInRuns, SampleRuns, WholeRays
+from jaxnerf.core.occupancy.sample_runs import SampleRuns
 from jaxnerf.core.sampling import uniform
-from jaxnerf.core.types import Keys, Rays, Samples, check_shapes
-from jaxnerf.core.varying import vary_like
+from jaxnerf.core.types import Keys, PlacedSamples, Rays, Samples, check_shapes
+from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
 
 _PARTS = 2.0**16  # probabilities are multiples of its inverse: float32 then sums them exactly, in any order
 
@@ -56,11 +58,11 @@ def importance_samples(
         ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
     """
     # All sums below are along rays, whose candidates are one row of an array or several.
-    along, axes, shapes = WholeRays(), "B S", {"near": (rays.near, "B")}
+    along, axes, shapes = _WholeRays(), "B S", {"near": (rays.near, "B")}
     if isinstance(candidates, SampleRuns):
         shapes |= {"first": (candidates.first, "B"), "count": (candidates.count, "B")}
         shapes["ray_index"] = (candidates.ray_index, "U")
-        candidates, along, axes = candidates.samples, RaysInRuns(candidates), "U W"
+        candidates, along, axes = candidates.samples, _RaysInRuns(candidates), "U W"
     check_shapes("importance_samples", **shapes, t=(candidates.t, axes), delta=(candidates.delta, axes))
     if candidates.rule != "segments" or max_samples < 1 or not 0 < uniform_fraction <= 1:
         raise ValueError(
@@ -77,55 +79,95 @@ def importance_samples(
     kept = occupied & ~(in_front > max_optical_depth)
     count = along.total(kept.sum(axis=-1, dtype=jnp.int32))
     number = divide_slots(count, max_samples)
-    # The probability of each candidate: a part in proportion to its estimated weight, only where the ray gets fewer
-    # samples than candidates, and the rest evenly, so that the sum is 1.
     transmittance = jnp.exp(-in_front)
     weights = jnp.where(kept, transmittance - transmittance * jnp.exp(-optical_depth), 0)
-    weights = jnp.where(along.of_rows(number < count)[:, None], (1 - uniform_fraction) * weights, 0)
-    even = (1 - along.total(weights.sum(axis=-1))) / jnp.maximum(count, 1)
-    probability = weights + along.of_rows(even)[:, None]
-    # As whole numbers of parts, whose sums are exact in float32 whatever the order; each candidate has at least one.
-    parts = jnp.where(kept, 1 + jnp.where(probability > 0, jnp.floor(_PARTS * probability), 0), 0)
+    parts = _parts(along, weights, kept, number, count, uniform_fraction)
     cumulative = along.through(parts)
     delta = jnp.where(kept, candidates.delta, 0)
     length = along.through(delta)
     all_parts, whole_length = along.last(cumulative), along.last(length)
-
-    # The ray of each slot: a cumulative sum of where rays end in the buffer takes the place of a search.
-    first = jnp.cumsum(number, dtype=jnp.int32) - number
-    slot = jnp.arange(max_samples, dtype=jnp.int32)
-    ended = jnp.zeros(max_samples, jnp.int32).at[first + number].add(1, mode="drop")
-    ray = jnp.minimum(jnp.cumsum(ended, dtype=jnp.int32), count.size - 1)
-    used = slot < number.sum()
-    # The parts of a ray are divided evenly among its slots; a random shift moves all inner bounds together.
-    row, total = slot - first[ray], all_parts[ray]
-    spacing = total / jnp.maximum(number[ray], 1)
-    shift = uniform(key, (*count.shape, 1))[ray, 0] - 0.5
-    lower = jnp.where(row == 0, 0, (row + shift) * spacing)
-    last = row == number[ray] - 1
-    upper = jnp.where(last, total, (row + 1 + shift) * spacing)
+    slots = _fill_slots(key, number, all_parts, max_samples)
+    ray = slots.ray
     begin, size = along.places_of(ray, candidates.t.shape[-1])
 
     def locate(at):
         """Returns the candidate that contains a place [K] on the scale of `cumulative`, and the fraction before it."""
-        found = _count_up_to(cumulative, begin, size, jnp.minimum(jnp.floor(at), total - 1), along.most_runs)
+        place = jnp.minimum(jnp.floor(at), all_parts[ray] - 1)
+        found = _count_up_to(cumulative, begin, size, place, along.most_runs)
         index = jnp.divmod(begin + found, cumulative.shape[-1])
         inside = parts[index]
         return index, jnp.clip((at - (cumulative[index] - inside)) / jnp.maximum(inside, 1), 0, 1)
 
     # A sample lies in the middle of its parts, and stands for the length between their bounds.
-    index, fraction = locate(lower)
+    index, fraction = locate(slots.lower)
     before = length[index] - (1 - fraction) * delta[index]
-    after = jnp.where(last, whole_length[ray], jnp.roll(before, -1))
-    index, fraction = locate((lower + upper) / 2)
+    after = jnp.where(slots.is_last, whole_length[ray], jnp.roll(before, -1))
+    index, fraction = locate((slots.lower + slots.upper) / 2)
     placed = PlacedSamples(
-        t=jnp.where(used, candidates.t[index] + (fraction - 0.5) * candidates.delta[index], 0),
-        delta=jnp.where(used, jnp.maximum(after - before, 0), 0),
+        t=jnp.where(slots.used, candidates.t[index] + (fraction - 0.5) * candidates.delta[index], 0),
+        delta=jnp.where(slots.used, jnp.maximum(after - before, 0), 0),
         ray_index=ray,
-        used=used,
+        used=slots.used,
         num_dropped=jnp.where(number == 0, count, 0),
     )
     return placed, along.any((occupied & (in_front > max_optical_depth)).any(axis=-1))
+
+
+def _parts(along, weights, kept, number, count, uniform_fraction):
+    """Returns the probability of each candidate as a whole number of parts; 0 where it is not kept.
+
+    A part of the probability is in proportion to the candidate's weight, only where the ray gets fewer samples than
+    candidates, and the rest is even, so that the sum is about 1. Sums of parts are exact in float32 whatever the order;
+    each candidate has at least one.
+
+    Args:
+        along: sums along rays.
+        weights, kept: of the candidates.
+        number, count: [B] samples and candidates of each ray.
+        uniform_fraction: see importance_samples.
+    """
+    weights = jnp.where(along.of_rows(number < count)[:, None], (1 - uniform_fraction) * weights, 0)
+    even = (1 - along.total(weights.sum(axis=-1))) / jnp.maximum(count, 1)
+    probability = weights + along.of_rows(even)[:, None]
+    return jnp.where(kept, 1 + jnp.where(probability > 0, jnp.floor(_PARTS * probability), 0), 0)
+
+
+class _Slots(NamedTuple):
+    """Which part of which ray each slot of the buffer gets.
+
+    Attributes:
+        ray: [K] int32, ascending.
+        used: [K] bool, False for unused slots, which come last.
+        is_last: [K] bool, whether it is the last of its ray.
+        lower, upper: [K], bounds on the scale of the ray's parts.
+    """
+
+    ray: Int[Array, " K"]
+    used: Bool[Array, " K"]
+    is_last: Bool[Array, " K"]
+    lower: Float[Array, " K"]
+    upper: Float[Array, " K"]
+
+
+def _fill_slots(key, number, all_parts, max_samples):
+    """Returns the _Slots of rays with number [B] samples: the parts of a ray are divided evenly among its slots."""
+    # The ray of each slot: a cumulative sum of where rays end in the buffer takes the place of a search.
+    first = jnp.cumsum(number, dtype=jnp.int32) - number
+    slot = jnp.arange(max_samples, dtype=jnp.int32)
+    ended = jnp.zeros(max_samples, jnp.int32).at[first + number].add(1, mode="drop")
+    ray = jnp.minimum(jnp.cumsum(ended, dtype=jnp.int32), number.size - 1)
+    # A random shift moves all inner bounds of a ray together.
+    row, total = slot - first[ray], all_parts[ray]
+    spacing = total / jnp.maximum(number[ray], 1)
+    shift = uniform(key, (*number.shape, 1))[ray, 0] - 0.5
+    is_last = row == number[ray] - 1
+    return _Slots(
+        ray=ray,
+        used=slot < number.sum(),
+        is_last=is_last,
+        lower=jnp.where(row == 0, 0, (row + shift) * spacing),
+        upper=jnp.where(is_last, total, (row + 1 + shift) * spacing),
+    )
 
 
 def divide_slots(count: Int[ArrayLike, " B"], num_slots: int) -> Int[Array, " B"]:
@@ -162,3 +204,87 @@ def _count_up_to(ascending, begin, size, value, most_runs):
 
     none = vary_like(jnp.zeros(value.shape, jnp.int32), ascending, begin, value)
     return short_loop(most.bit_length(), search, none)
+
+
+# Candidates are one row of an array for each ray, or several; both have sums along rays.
+
+
+class _WholeRays:
+    """Sums of values [B, S] along rays."""
+
+    most_runs = 1
+
+    def of_rows(self, tree: Any) -> Any:
+        """Returns what belongs to the ray of each row: arrays [B, ...] as they are."""
+        return tree
+
+    def total(self, values: Array) -> Array:
+        """Returns the sum [B] of one value [B] of each row."""
+        return values
+
+    def any(self, values: Bool[Array, " B"]) -> Bool[Array, " B"]:
+        """Returns whether any row of a ray is true."""
+        return values
+
+    def through(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
+        """Returns the running sum along each ray."""
+        return running_sum(values)
+
+    def before(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
+        """Returns the sum of what is in front of each value."""
+        return exclusive_sum(values)
+
+    def last(self, sums: Float[Array, "B S"]) -> Float[Array, " B"]:
+        """Returns the last of running sums."""
+        return sums[:, -1]
+
+    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
+        """Returns the flat index of the first value of each of some rays, and how many values it has."""
+        return ray * width, width
+
+
+class _RaysInRuns:
+    """Does what _WholeRays does, for values [U, W] of SampleRuns."""
+
+    def __init__(self, runs: SampleRuns):
+        self._runs, self.most_runs = runs, runs.max_count
+        self._starts = jnp.arange(runs.ray_index.size) == runs.first[runs.ray_index]
+        self._last = jnp.maximum(runs.first + runs.count - 1, 0)
+
+    def of_rows(self, tree: Any) -> Any:
+        """Returns what belongs to the ray of each run: arrays [B, ...] -> [U, ...]."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[self._runs.ray_index], tree)
+
+    def total(self, values: Array) -> Array:
+        """Returns the sum [B] of one value [U] of each run."""
+        return self._of_last(self._since_start(values))
+
+    def any(self, values: Bool[Array, " U"]) -> Bool[Array, " B"]:
+        """Returns whether any run of a ray is true."""
+        return self.total(values.astype(jnp.int32)) > 0
+
+    def through(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
+        """Returns the running sum along each ray."""
+        inside = running_sum(values)
+        return inside + self._in_front(inside)
+
+    def before(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
+        """Returns the sum of what is in front of each value."""
+        return exclusive_sum(values) + self._in_front(running_sum(values))
+
+    def last(self, sums: Float[Array, "U W"]) -> Float[Array, " B"]:
+        """Returns the last of running sums; 0 for a ray without runs."""
+        return self._of_last(sums[:, -1])
+
+    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
+        """Returns the flat index of the first value of each of some rays, and how many values it has."""
+        return self._runs.first[ray] * width, self._runs.count[ray] * width
+
+    def _of_last(self, values):
+        return jnp.where(self._runs.count > 0, values[self._last], 0)
+
+    def _since_start(self, values):
+        return running_sum_since(self._starts, values, self._runs.max_count)
+
+    def _in_front(self, inside):
+        return jnp.where(self._starts, 0, jnp.roll(self._since_start(inside[:, -1]), 1))[:, None]

@@ -12,35 +12,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt32
 
 from jaxnerf.core import rendering, volume_rendering
-from jaxnerf.core.fixed_order import in_fixed_order, segment_sums
+from jaxnerf.core.fixed_order import segment_sums
+from jaxnerf.core.loops import vary_like
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
 from jaxnerf.core.scene import needs_of
-from jaxnerf.core.types import Background, PackedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
-from jaxnerf.core.varying import vary_like
+from jaxnerf.core.types import Background, PackedSamples, PlacedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
 
-_OPAQUE = 1e-3  # transmittance below which a ray counts as opaque
 _HIGH_EPS = 0.01  # an early_stop_eps above which rays end so soon that long runs waste samples
-
-
-class PlacedSamples(NamedTuple):
-    """Samples of many rays in one buffer of fixed size, ray after ray, near to far, before the scene is evaluated.
-
-    Attributes:
-        t: [K] in t of the sample's ray.
-        delta: [K] length in t.
-        ray_index: [K] int32, index of the sample's ray, ascending.
-        used: [K] bool, False for unused slots, which come last.
-        num_dropped: [B] int32, the number of a ray's samples that did not fit.
-    """
-
-    t: Float[Array, " K"]
-    delta: Float[Array, " K"]
-    ray_index: Int[Array, " K"]
-    used: Bool[Array, " K"]
-    num_dropped: Int[Array, " B"]
 
 
 def render_packed(
@@ -87,17 +68,18 @@ def render_packed(
             "would end before their median depth"
         )
     shape, scene = rays.near.shape, _without_gradient_if_empty(scene, rays)
-    rays, samples = _flattened("render_packed", rays, samples, max_samples)
-    words = _occupied_words(grid, rays, samples)
+    rays, samples = flattened("render_packed", rays, samples, max_samples)
+    words = occupied_words(grid, rays, samples)
     if early_stop_eps > 0:
         options = {"max_samples": max_samples, "early_stop_eps": early_stop_eps, "median_depth": median_depth}
         sums = _march_until_terminated("render_packed", scene, rays, samples, words, **options)
         num_dropped, packed = jnp.zeros_like(rays.near, jnp.int32), None
     else:
-        occupied, slot = _count_occupied(words), jnp.arange(max_samples, dtype=jnp.int32)
-        buffer = _fill(occupied, slot, slot < occupied.ends[-1])
+        occupied, slot = count_occupied(words), jnp.arange(max_samples, dtype=jnp.int32)
+        buffer = fill_buffer(occupied, slot, slot < occupied.ends[-1])
         t, delta = (jnp.where(buffer.used, leaf[buffer.ray, buffer.source], 0) for leaf in (samples.t, samples.delta))
-        num_dropped = occupied.count - jnp.clip(max_samples - _first(occupied), 0, occupied.count)
+        first = jnp.cumsum(occupied.count, dtype=jnp.int32) - occupied.count  # of each ray among all occupied samples
+        num_dropped = occupied.count - jnp.clip(max_samples - first, 0, occupied.count)
         placed = PlacedSamples(t, delta, buffer.ray, buffer.used, num_dropped)
         options = {"rule": samples.rule, "longest": samples.t.shape[-1], "median_depth": median_depth}
         sums, packed = _composite("render_packed", scene, rays, placed, **options)
@@ -111,6 +93,7 @@ def render_placed(
     *,
     longest: int,
     background: Background | None = None,
+    fixed_order: bool = False,
 ) -> Rendering:
     """Renders samples that are in a buffer already, such as those of `importance_samples`.
 
@@ -120,6 +103,8 @@ def render_placed(
         placed: PlacedSamples [K] of these rays, of the rule "segments".
         longest: upper bound of the number of samples of a ray.
         background: see render_samples.
+        fixed_order: whether the samples of a ray are summed in a fixed order, for accelerators, whose own sums over
+            rays have none.
 
     Returns:
         Rendering [B] without weights; `samples` is PackedSamples [K], K being 0 if there are no rays.
@@ -127,85 +112,10 @@ def render_placed(
     check_shapes("render_placed", near=(rays.near, "B"), t=(placed.t, "K"), delta=(placed.delta, "K"))
     shape, scene = rays.near.shape, _without_gradient_if_empty(scene, rays)
     rays = _at_least_one(jax.tree.map(jnp.asarray, rays))
-    options = {"rule": "segments", "longest": longest}
+    options = {"rule": "segments", "longest": longest, "fixed_order": fixed_order}
     sums, packed = _composite("render_placed", scene, rays, placed, **options)
     num_dropped = _at_least_one(placed.num_dropped)
     return _rendering(sums, num_dropped, rays.far, shape, background, packed)
-
-
-def visible_samples(
-    scene: SceneFn,
-    grid: OccupancyGrid | None,
-    rays: Rays,
-    samples: Samples,
-    *,
-    error: float,
-    max_samples: int,
-    background: Background | None = None,
-) -> Bool[Array, "*batch samples"]:
-    """Finds the samples that a ray needs: dropping all others changes its colour by at most an error.
-
-    Samples are visited from back to front. A sample is dropped if the error of the ray's colour (Eq. 3 of
-    arXiv:2003.08934), including that of the samples dropped behind it, stays within the bound. White fog in front
-    of a white background is not needed, nor is the inside of a wall.
-
-    Args:
-        scene, rays, samples, background: see render_packed.
-        grid: OccupancyGrid, in whose occupied cells the scene is evaluated.
-        error: bound in each of the three channels, which are assumed to be in [0, 1].
-        max_samples: samples evaluated at once; all are evaluated, in as many rounds as that takes.
-
-    Returns:
-        [..., S] bool; False where the scene is not evaluated. A ray whose transmittance is below 1e-3 keeps
-        the samples that make it opaque, whatever their colours, as opacity and depth depend on them. A sample that
-        is NaN is needed, so that it is visible.
-
-    Raises:
-        ValueError: as render_packed.
-    """
-    name, shape = "visible_samples", samples.t.shape
-    rays, samples = _flattened(name, rays, samples, max_samples)
-    if not math.prod(shape):
-        return jnp.zeros(shape, bool)
-    occupied = _count_occupied(_occupied_words(grid, rays, samples))
-
-    def evaluate_round(index, outputs):
-        slot = index * max_samples + jnp.arange(max_samples, dtype=jnp.int32)
-        buffer = _fill(occupied, slot, slot < occupied.ends[-1])
-        t = samples.t[buffer.ray, buffer.source]
-        delta = lambda: samples.delta[buffer.ray, buffer.source]  # noqa: E731
-        density, rgb = _evaluate(name, scene, rays, t, buffer.ray, buffer.used, delta)
-        place = jnp.where(buffer.used, buffer.ray * shape[-1] + buffer.source, outputs.shape[0])
-        return outputs.at[place].set(jnp.concatenate([density[:, None], rgb], axis=-1), mode="drop")
-
-    rounds = -(-occupied.ends[-1] // max_samples)
-    outputs = jnp.zeros((samples.t.size, 4))
-    outputs = vary_like(outputs, jax.eval_shape(evaluate_round, jnp.zeros_like(rounds), outputs))
-    outputs = jax.lax.fori_loop(0, rounds, evaluate_round, outputs)
-    density, *rgb = jnp.moveaxis(outputs.reshape(*samples.t.shape, 4), -1, 0)
-    length = rendering.segment_lengths(jnp.maximum(samples.delta, 0), rays)
-    depth = volume_rendering.optical_depth(name, density, length)
-    before = jnp.exp(-volume_rendering.exclusive_sum(depth))
-    through = jnp.exp(-depth)
-
-    def drop(state, sample):
-        # [B, 3]: the colour behind the sample, and its error so far; [B]: the transmittance that the dropped
-        # samples of an opaque ray open behind it.
-        behind, wrong, opened = state
-        before, through, rgb = sample
-        transmitted = through[:, None]
-        change = wrong + (1 - transmitted) * (rgb - behind)
-        needed = ~(before * jnp.maximum(jnp.abs(change).max(axis=-1), opened) <= error)
-        wrong = jnp.where(needed[:, None], transmitted * wrong, change)
-        opened = jnp.where(needed, through * opened, opened)
-        return ((1 - transmitted) * rgb + transmitted * behind, wrong, opened), needed
-
-    behind = jnp.zeros(3) if background is None else jnp.asarray(background)
-    behind = jnp.broadcast_to(behind, (*rays.near.shape, 3))
-    opaque = before[:, -1:] * through[:, -1:] < _OPAQUE
-    start = vary_like((behind, jnp.zeros_like(behind), opaque[:, 0].astype(behind.dtype)), behind, outputs, length)
-    nearest_first = (before.T, through.T, jnp.stack(rgb, axis=-1).swapaxes(0, 1))
-    return jax.lax.scan(drop, start, nearest_first, reverse=True)[1].T.reshape(shape)
 
 
 class _Sums(NamedTuple):
@@ -240,7 +150,7 @@ def _without_gradient_if_empty(scene, rays):
     return constant
 
 
-def _flattened(function, rays, samples, max_samples):
+def flattened(function: str, rays: Rays, samples: Samples, max_samples: int) -> tuple[Rays, Samples]:
     """Returns Rays [B] and Samples [B, S] of any leading axes; ValueError on what cannot be packed.
 
     If there are no rays, B is 1: a ray of length 0, which `_rendering` removes.
@@ -289,7 +199,7 @@ def _rendering(sums, num_dropped, far, shape, background, samples):
 # words rather than samples.
 
 
-class _Occupied(NamedTuple):
+class Occupied(NamedTuple):
     """The occupied samples of all rays, ray after ray.
 
     Attributes:
@@ -303,7 +213,7 @@ class _Occupied(NamedTuple):
     count: Array
 
 
-def _occupied_words(grid, rays, samples):
+def occupied_words(grid: OccupancyGrid | None, rays: Rays, samples: Samples) -> UInt32[Array, "B W"]:
     """Returns [B, W] uint32, a bit for each sample: whether it is occupied."""
     kept = ~(samples.delta <= 0)
     return _pack_bits(kept if grid is None else kept & is_occupied(grid, rays, samples.t))
@@ -330,21 +240,14 @@ def _nth_bit(words, n):
     return place
 
 
-def _count_occupied(words):
+def count_occupied(words: UInt32[Array, "B W"]) -> Occupied:
+    """Counts the occupied samples of words, see occupied_words."""
     sizes = _count_bits(words)
     ends = jnp.cumsum(sizes.reshape(-1), dtype=jnp.int32)
-    return _Occupied(words.reshape(-1), ends, sizes.sum(-1, dtype=jnp.int32))
+    return Occupied(words.reshape(-1), ends, sizes.sum(-1, dtype=jnp.int32))
 
 
-def _first(occupied):
-    """Returns [B], where each ray's samples begin among all occupied samples."""
-    return jnp.cumsum(occupied.count, dtype=jnp.int32) - occupied.count
-
-
-# One buffer for all rays.
-
-
-class _Buffer(NamedTuple):
+class Buffer(NamedTuple):
     """Which sample each slot of the buffer holds.
 
     Attributes:
@@ -358,18 +261,26 @@ class _Buffer(NamedTuple):
     used: Array
 
 
-def _fill(occupied, place, used):
-    """Returns the _Buffer of the occupied samples with the indices place [K], which are consecutive."""
+def fill_buffer(occupied: Occupied, place: Int[Array, " K"], used: Bool[Array, " K"]) -> Buffer:
+    """Returns the Buffer of the occupied samples with the indices place [K], which are consecutive."""
     # The number of words that end before each index, by a cumulative sum instead of a search for each index.
     ended = jnp.zeros_like(place).at[jnp.maximum(occupied.ends - place[0], 0)].add(1, mode="drop")
     word = jnp.minimum(jnp.cumsum(ended, dtype=jnp.int32), occupied.words.size - 1)
     flags = occupied.words[word]
     before = occupied.ends[word] - _count_bits(flags)
     width = occupied.words.size // occupied.count.size
-    return _Buffer(word % width * 32 + _nth_bit(flags, place - before), word // width, used)
+    return Buffer(word % width * 32 + _nth_bit(flags, place - before), word // width, used)
 
 
-def _evaluate(function, scene, rays, t, ray_index, used, delta):
+def evaluate_samples(
+    function: str,
+    scene: SceneFn,
+    rays: Rays,
+    t: Float[ArrayLike, " K"],
+    ray_index: Int[ArrayLike, " K"],
+    used: Bool[ArrayLike, " K"],
+    delta: Callable[[], Array],
+) -> tuple[Float[Array, " K"], Float[Array, "K C"]]:
     """Evaluates the scene at samples t [K] of rays; delta: a function that returns their lengths [K] in t.
 
     Unused slots evaluate the scene where the first slot does, so that they add no place at which it may be undefined,
@@ -390,7 +301,7 @@ def _evaluate(function, scene, rays, t, ray_index, used, delta):
 
 
 def _packed_inputs(function, scene, sample_rays, t, used, delta: Callable[[], Array]):
-    """Returns what the scene asks for at samples [K] of Rays [K], each value [1, K]; see _evaluate."""
+    """Returns what the scene asks for at samples [K] of Rays [K], each value [1, K]; see evaluate_samples."""
     lengths = delta()
     lengths = jnp.where(used, lengths, jnp.where(used[0], lengths[0], 0))
     inputs = rendering.sample_inputs(function, scene, sample_rays, t[:, None], lengths[:, None])
@@ -398,10 +309,10 @@ def _packed_inputs(function, scene, sample_rays, t, used, delta: Callable[[], Ar
     return {name: jnp.where(used[None], value, jax.lax.stop_gradient(value)) for name, value in values.items()}
 
 
-def _composite(function, scene, rays, placed, *, rule, longest, median_depth=False):
+def _composite(function, scene, rays, placed, *, rule, longest, median_depth=False, fixed_order=False):
     """Evaluates the scene at PlacedSamples and composites them: _Sums [B], PackedSamples [K]."""
     t, ray = placed.t, placed.ray_index
-    density, rgb = _evaluate(function, scene, rays, t, ray, placed.used, lambda: placed.delta)
+    density, rgb = evaluate_samples(function, scene, rays, t, ray, placed.used, lambda: placed.delta)
     speed, unknown = (of_ray[ray] for of_ray in rendering.speeds(rays))
     length = jnp.where(placed.used, rendering.lengths_at_speeds(placed.delta, speed, unknown), 0)
     starts = ray != jnp.roll(ray, 1).at[0].set(-1)
@@ -409,7 +320,7 @@ def _composite(function, scene, rays, placed, *, rule, longest, median_depth=Fal
     colors = [rgb[:, channel] * weights for channel in range(rgb.shape[1])]
     moments = volume_rendering.multiply_or_zero(weights, t), volume_rendering.divide_or_zero(weights, t)
     parts = [optical_depth, *colors, *moments]
-    if in_fixed_order():
+    if fixed_order:
         sums = segment_sums(jnp.stack(parts, axis=-1), ray, starts, placed.used, rays.near.size, longest)
     else:
         sums = jax.ops.segment_sum(jnp.stack(parts, axis=-1), ray, rays.near.size, indices_are_sorted=True)
@@ -458,7 +369,7 @@ def _march_until_terminated(function, scene, rays, samples, words, *, max_sample
         scene: see render_samples; it is evaluated at [L, N, 3] positions with [L, 1, 3] directions.
         rays: Rays [B].
         samples: Samples [B, S].
-        words: [B, W] uint32, see _occupied_words.
+        words: [B, W] uint32, see occupied_words.
         max_samples: samples evaluated at once, L N at most.
         early_stop_eps: > 0.
         median_depth: whether it is computed.

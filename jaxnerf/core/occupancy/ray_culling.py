@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
+from jaxnerf.core.loops import vary_like
 from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, flat_index, has_nan
 from jaxnerf.core.types import Background, Rays, Rendering, without_samples
-from jaxnerf.core.varying import vary_like
 
 _COARSE = 2  # cells along a side of a coarse cell
 

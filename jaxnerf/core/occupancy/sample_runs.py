@@ -6,17 +6,15 @@ is faster to find out first which parts of a ray may cross occupied ones.
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, has_nan, near_occupied
 from jaxnerf.core.occupancy.ray_marching import num_steps, steps_in_t
 from jaxnerf.core.sampling import edges_after_steps, samples_from_edges
 from jaxnerf.core.types import Rays, Samples, check_shapes, pytree
-from jaxnerf.core.volume_rendering import exclusive_sum, running_sum, running_sum_since
+from jaxnerf.core.volume_rendering import running_sum
 
 WIDTH = 8  # steps of a run; march_rays has a multiple of 32 of them
 _PART = 64  # runs that are counted by one matrix product
@@ -87,84 +85,3 @@ def march_near_matter(
     samples = samples_from_edges(None, edges)
     found = SampleRuns(samples=samples, ray_index=ray, first=first, count=count, max_count=runs.size)
     return found, count.sum() <= max_runs
-
-
-class WholeRays:
-    """Sums of values [B, S] along rays."""
-
-    most_runs = 1
-
-    def of_rows(self, tree: Any) -> Any:
-        """Returns what belongs to the ray of each row: arrays [B, ...] as they are."""
-        return tree
-
-    def total(self, values: Array) -> Array:
-        """Returns the sum [B] of one value [B] of each row."""
-        return values
-
-    def any(self, values: Bool[Array, " B"]) -> Bool[Array, " B"]:
-        """Returns whether any row of a ray is true."""
-        return values
-
-    def through(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
-        """Returns the running sum along each ray."""
-        return running_sum(values)
-
-    def before(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
-        """Returns the sum of what is in front of each value."""
-        return exclusive_sum(values)
-
-    def last(self, sums: Float[Array, "B S"]) -> Float[Array, " B"]:
-        """Returns the last of running sums."""
-        return sums[:, -1]
-
-    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
-        """Returns the flat index of the first value of each of some rays, and how many values it has."""
-        return ray * width, width
-
-
-class RaysInRuns:
-    """Does what WholeRays does, for values [U, W] of SampleRuns."""
-
-    def __init__(self, runs: SampleRuns):
-        self._runs, self.most_runs = runs, runs.max_count
-        self._starts = jnp.arange(runs.ray_index.size) == runs.first[runs.ray_index]
-        self._last = jnp.maximum(runs.first + runs.count - 1, 0)
-
-    def of_rows(self, tree: Any) -> Any:
-        """Returns what belongs to the ray of each run: arrays [B, ...] -> [U, ...]."""
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[self._runs.ray_index], tree)
-
-    def total(self, values: Array) -> Array:
-        """Returns the sum [B] of one value [U] of each run."""
-        return self._of_last(self._since_start(values))
-
-    def any(self, values: Bool[Array, " U"]) -> Bool[Array, " B"]:
-        """Returns whether any run of a ray is true."""
-        return self.total(values.astype(jnp.int32)) > 0
-
-    def through(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
-        """Returns the running sum along each ray."""
-        inside = running_sum(values)
-        return inside + self._in_front(inside)
-
-    def before(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
-        """Returns the sum of what is in front of each value."""
-        return exclusive_sum(values) + self._in_front(running_sum(values))
-
-    def last(self, sums: Float[Array, "U W"]) -> Float[Array, " B"]:
-        """Returns the last of running sums; 0 for a ray without runs."""
-        return self._of_last(sums[:, -1])
-
-    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
-        """Returns the flat index of the first value of each of some rays, and how many values it has."""
-        return self._runs.first[ray] * width, self._runs.count[ray] * width
-
-    def _of_last(self, values):
-        return jnp.where(self._runs.count > 0, values[self._last], 0)
-
-    def _since_start(self, values):
-        return running_sum_since(self._starts, values, self._runs.max_count)
-
-    def _in_front(self, inside):
-        return jnp.where(self._starts, 0, jnp.roll(self._since_start(inside[:, -1]), 1))[:, None]

@@ -5,28 +5,17 @@ direction is 10 degrees away in the mean, and at most 20.
 """
 
 import functools
-import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, UInt32
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid, cells_around
+from jaxnerf.core.poses import spread_directions
 from jaxnerf.core.types import SceneFn, check_shapes
 
 NUM_DIRECTIONS = 64
 _BITS = 32  # of a word
-
-
-def spread_directions(count: int) -> list[tuple[float, float, float]]:
-    """Returns unit vectors that are spread evenly over the sphere, on a golden spiral, from the top to the bottom."""
-    golden = math.pi * (3 - math.sqrt(5))
-    heights = [1 - (2 * step + 1) / count for step in range(count)]
-    around = [math.sqrt(1 - height**2) for height in heights]
-    return [
-        (radius * math.cos(golden * step), radius * math.sin(golden * step), height)
-        for step, (radius, height) in enumerate(zip(around, heights, strict=True))
-    ]
 
 
 def nearest_direction(viewdirs: Float[ArrayLike, "*batch 3"]) -> Int[Array, "*batch"]:

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxnerf.core import poses as core_poses
-from jaxnerf.core.occupancy.seen_directions import spread_directions
+from jaxnerf.core.poses import spread_directions
 from jaxnerf.data.geometry.path_poses import coverage, default_kind, forward_frame, level_axes
 from jaxnerf.data.geometry.poses import up_of
 

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxnerf.core import poses as core_poses
-from jaxnerf.core.occupancy.seen_directions import spread_directions
+from jaxnerf.core.poses import spread_directions
 from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 
 # Six cameras that are placed around an object by hand are nowhere farther apart. Halfway between two cameras, the

@@ -108,7 +108,7 @@ def measure(source: ExportSource, scene: WebScene, views: Views) -> Score:
     """Scores the run, and the run with the features that the textures hold."""
     params, grid = source.variables
     name = source.run.experiment.model.image_networks[-1]
-    decoded = {**params, name: scene.decoded(params[name], network_of(source.run).feature_scale)}
+    decoded = {**params, name: scene.decoded(params[name])}
     squares = []
     count = min(_NUM_SCORED, len(views.size))
     for index in range(count):

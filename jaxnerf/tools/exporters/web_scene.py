@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid
-from jaxnerf.fields.hash_grid import HashGrid, TableLevel
+from jaxnerf.fields.hash_grid import FEATURE_SCALE, GEOMETRY_FEATURES, HashGrid
+from jaxnerf.fields.hash_interpolation import TableLevel
 
 TABLE_WIDTH, WEIGHTS_WIDTH, BITS_WIDTH, COARSE = 4096, 256, 1024, 4  # texels; cells along a coarse cube
 MAX_TEXTURE_SIDE = 4096  # of nearly all devices with WebGL 2
@@ -76,11 +77,11 @@ class WebScene(NamedTuple):
         stored = stored / np.float32(255) if self.table.dtype == np.uint8 else stored
         return stored * self.scale[level] + self.shift[level]
 
-    def decoded(self, params: Mapping[str, Any], feature_scale: float) -> dict[str, Any]:
+    def decoded(self, params: Mapping[str, Any]) -> dict[str, Any]:
         """Returns the parameters of the field with the table that the textures hold."""
         count = np.shape(params["table"])[1]
         table = np.concatenate([self.features(index)[:, :count] for index in range(len(self.levels))])
-        return {**params, "table": np.float32(table / feature_scale)}
+        return {**params, "table": np.float32(table / FEATURE_SCALE)}
 
 
 def pack(
@@ -124,10 +125,10 @@ def pack(
         if precision == "8 bits":
             low, extent = float(values.min()), max(float(np.ptp(values)), 1e-20)
             stored[rows, : table.shape[1]] = np.rint((values - low) * (255 / extent))
-            scale[index], shift[index] = network.feature_scale * extent, network.feature_scale * low
+            scale[index], shift[index] = FEATURE_SCALE * extent, FEATURE_SCALE * low
         else:
             stored[rows, : table.shape[1]] = np.clip(values, -_LARGEST_HALF, _LARGEST_HALF)
-            scale[index] = network.feature_scale
+            scale[index] = FEATURE_SCALE
     return WebScene(
         levels=levels,
         precision=precision,
@@ -160,12 +161,12 @@ def _layers(network, params, groups):
         "density": _padded(params["density"]["kernel"], params["density"]["bias"]),
     }
     names = [f"view_{index}" for index in range(network.view_depth)] + ["rgb"]
-    first, geometry = params[names[0]], network.geometry_features
+    first = params[names[0]]
     # The colour network does not read the density, which is the first output of the layer before.
-    kernel = np.concatenate([np.zeros((1, first["kernel"].shape[1]), np.float32), first["kernel"][:geometry]])
+    kernel = np.concatenate([np.zeros((1, first["kernel"].shape[1]), np.float32), first["kernel"][:GEOMETRY_FEATURES]])
     layers[names[0]] = _padded(kernel, first["bias"])
     if network.use_viewdirs:
-        layers["ray"] = _padded(first["kernel"][geometry:], np.zeros_like(first["bias"]))
+        layers["ray"] = _padded(first["kernel"][GEOMETRY_FEATURES:], np.zeros_like(first["bias"]))
     return layers | {name: _padded(params[name]["kernel"], params[name]["bias"]) for name in names[1:]}
 
 

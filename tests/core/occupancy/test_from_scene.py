@@ -7,8 +7,7 @@ import pytest
 
 from helpers import rays_past_origin
 from jaxnerf import render_packed
-from jaxnerf.core.occupancy.from_scene import visible_grid
-from jaxnerf.core.occupancy.grid import drop_thin_density
+from jaxnerf.core.occupancy.from_scene import drop_thin_density, visible_grid
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.fields.base import Field
 from jaxnerf.models.grid_schedule import make_grid_schedule

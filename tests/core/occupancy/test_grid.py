@@ -9,13 +9,12 @@ import pytest
 
 import jaxnerf
 from helpers import checked_grid, compiled, full_grid, rays_past_origin
+from jaxnerf.core.occupancy.from_scene import drop_thin_density, keep_cells
 from jaxnerf.core.occupancy.grid import (
     clip_rays_to_box,
     create_grid,
-    drop_thin_density,
     estimate_optical_depth,
     is_occupied,
-    keep_cells,
     mark_cells,
     update_grid,
 )

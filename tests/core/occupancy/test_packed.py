@@ -11,6 +11,7 @@ import pytest
 import jaxnerf
 from helpers import all_finite, assert_same, checked_grid, compiled, full_grid, rays_past_origin
 from jaxnerf.core import volume_rendering
+from jaxnerf.core.occupancy import from_scene
 from jaxnerf.core.occupancy import packed as packed_module
 from jaxnerf.core.occupancy.grid import is_occupied
 from jaxnerf.core.types import without_samples
@@ -290,7 +291,7 @@ def test_render_rays_accepts_it_as_its_renderer(rays):
 
 
 visible = compiled(
-    lambda scene, grid, rays, samples, error=0.02, background=BACKGROUND: packed_module.visible_samples(
+    lambda scene, grid, rays, samples, error=0.02, background=BACKGROUND: from_scene.visible_samples(
         scene, grid, rays, samples, error=error, max_samples=100, background=background
     ),
     "scene",
@@ -323,7 +324,7 @@ def visible_in_ball(density, color, rays, samples):
         return jnp.where(inside, density, 0.0), jnp.broadcast_to(color, x.shape)
 
     options = {"error": 0.002, "max_samples": 100, "background": jnp.ones(3)}
-    kept = packed_module.visible_samples(ball, full_grid(), rays, samples, **options)
+    kept = from_scene.visible_samples(ball, full_grid(), rays, samples, **options)
     fewer = dataclasses.replace(samples, delta=jnp.where(kept, samples.delta, 0))
     colors = [jaxnerf.render_samples(ball, rays, chosen, background=jnp.ones(3)).rgb for chosen in (samples, fewer)]
     return kept, *colors
@@ -353,7 +354,7 @@ def test_visible_samples_names_wrong_arguments(rays, samples, wrong):
     if given["samples"] == "gauss":
         given["samples"] = dataclasses.replace(samples, rule="gauss")
     with pytest.raises(ValueError, match="visible_samples"):
-        packed_module.visible_samples(scene, full_grid(), rays, error=0.1, **given)
+        from_scene.visible_samples(scene, full_grid(), rays, error=0.1, **given)
 
 
 @pytest.mark.parametrize("most", [7, 2**31 - 1])

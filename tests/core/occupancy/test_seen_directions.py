@@ -12,8 +12,8 @@ from jaxnerf.core.occupancy.seen_directions import (
     familiarity,
     familiarity_scene,
     nearest_direction,
-    spread_directions,
 )
+from jaxnerf.core.poses import spread_directions
 from jaxnerf.core.sampling import samples_from_edges, uniform_edges
 
 DIRECTIONS = np.array(spread_directions(NUM_DIRECTIONS))

@@ -11,10 +11,10 @@ from jax.sharding import PartitionSpec
 
 import jaxnerf
 from helpers import all_finite, assert_same, full_grid, rays_past_origin
-from jaxnerf.core.occupancy.from_scene import visible_grid
+from jaxnerf.core.occupancy.from_scene import visible_grid, visible_samples
 from jaxnerf.core.occupancy.grid import clip_rays_to_box, estimate_optical_depth, is_occupied
 from jaxnerf.core.occupancy.importance import importance_samples
-from jaxnerf.core.occupancy.packed import render_placed, visible_samples
+from jaxnerf.core.occupancy.packed import render_placed
 from jaxnerf.core.occupancy.ray_culling import rays_may_hit
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.types import without_samples

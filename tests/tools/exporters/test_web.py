@@ -25,10 +25,10 @@ FIELDS = {
     "dense": SMALL,
     "hashed": {**SMALL, "resolutions": (7, 20, 33), "table_size": 1000},
     "two features": {**SMALL, "features_per_level": 2},
-    "six features": {**SMALL, "features_per_level": 6, "feature_scale": 1.0},
-    "no directions": {**SMALL, "use_viewdirs": False, "geometry_features": 6},
+    "six features": {**SMALL, "features_per_level": 6},
+    "no directions": {**SMALL, "use_viewdirs": False},
     "no hidden colour layer": {**SMALL, "view_depth": 0},
-    "directions alone": {**SMALL, "geometry_features": 0, "view_depth": 3},
+    "three hidden colour layers": {**SMALL, "view_depth": 3},
 }
 
 
@@ -47,7 +47,7 @@ def packed(options, precision="16 bits", contracted=False, as_scene=False):
         network, params, grid, precision=precision, step_size=0.02, early_stop_eps=0.01, background=None
     )
     field = contract_field(field, lower, upper) if contracted else field
-    decoded = scene.decoded(params, network.feature_scale)
+    decoded = scene.decoded(params)
 
     if as_scene:
         return lambda x, viewdirs: field.apply(decoded, x, viewdirs), scene
