@@ -100,7 +100,8 @@ def make_train_step(
         `data` is TrainData; for a model without a grid it may be anything that `draw` accepts. `positions` is
         [N, B] int32, the positions of this device's rays in the whole batch, in N microbatches. These run one
         after the other and their gradients are summed, so the activations of only B rays must fit into the
-        cache or memory. With an `axis_name` all sums also run over that axis of devices.
+        cache or memory. With an `axis_name` all sums also run over that axis of devices, as under `jax.pmap` or
+        `jax.shard_map`.
 
         `metrics` are scalars: "loss", "mse_<name>" of each network that renders images, "loss_<name>" of
         each loss (unweighted) if there are several, "grad_norm", the number of "rays" that were not dropped,

@@ -1,5 +1,6 @@
-"""jit on one device and sharded jit on four: the same run."""
+"""jit on one device, sharded jit and pmap on four: the same run."""
 
+import functools
 import re
 
 import jax
@@ -72,6 +73,17 @@ def test_gradient_is_a_mean_over_devices(microbatch_size):
         states[count], rows = run_steps(step, state, data, 3, count, batch_size=16, microbatch_size=microbatch_size)
     assert rows[0]["loss"] > 2 * rows[2]["loss"] or rows[0]["grad_norm"] > 0.1
     assert_same(states[4], states[1], rtol=1e-6, atol=1e-6)
+
+
+def test_the_step_runs_under_pmap():
+    """Its sums run over the axis of any transformation that names one."""
+    optimizer, data = optax.sgd(0.1), (random_rays(0, (16,)), jnp.array([-1]))
+    step = make_train_step(toy_model(), optimizer, toy_draw, LOSSES)
+    pmapped = jax.pmap(functools.partial(step, axis_name="batch"), "batch", in_axes=(None, None, 0), out_axes=None)
+    state, metrics = pmapped(create_state(toy_model(), optimizer, 0), data, devices.split_positions(16, 4))
+    start = create_state(toy_model(), optimizer, 0)
+    expected, (row,) = run_steps(step, start, data, 1, 4, batch_size=16)
+    assert_same((state, metrics), (expected, row), rtol=1e-6, atol=1e-6)
 
 
 def test_batch_is_the_same_on_any_number_of_devices(experiment, views):
