@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.metrics import psnr
 from jaxnerf.core.occupancy.grid import cell_inputs
-from jaxnerf.core.occupancy.seen_directions import spread_directions
+from jaxnerf.core.poses import spread_directions
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.evaluation.metrics import pixel_mask

@@ -13,8 +13,7 @@ from jaxtyping import Float, Num, UInt8
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.occupancy.grid import cell_inputs
-from jaxnerf.core.occupancy.seen_directions import spread_directions
-from jaxnerf.core.poses import look_at
+from jaxnerf.core.poses import look_at, spread_directions
 from jaxnerf.core.rendering import points_on_rays
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera
