@@ -40,7 +40,8 @@ def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, t
     names = ("psnr", "ssim", "seconds_per_frame", "views", "parameters", "rays_seen", "compile_seconds")
     scores = {**dict.fromkeys(names, 1.0), "step": step, "training_seconds": 2.0}
     monkeypatch.setattr(training, "train_and_evaluate", train)
-    monkeypatch.setattr(training, "evaluate", lambda where, overwrite: scores)
+    monkeypatch.setattr(training, "restore_run", lambda where: None)
+    monkeypatch.setattr(training, "score_run", lambda run, where, overwrite: scores)
     monkeypatch.setattr(common, "matrix_gflops", lambda: 2 * common.REFERENCE_GFLOPS)
     point = training.run_to(3, config, tmp_path)
     assert (point["ended"], point["seconds"], point["comparable"]) == (ended, 2.0, 4.0)
