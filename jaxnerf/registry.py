@@ -76,6 +76,7 @@ class Registry:
             builtin: "module:attribute" by name.
         """
         self._kind, self._register, self._parts = kind, register, dict(builtin)
+        self.builtin = tuple(builtin)
 
     def add(self, name: str, part: Any) -> None:
         """Adds a part; raises a ValueError if another part has that name."""

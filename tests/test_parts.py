@@ -10,7 +10,7 @@ from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from runs import ROOT
 
 REGISTRIES = (FIELDS, SAMPLERS, LOSSES, READERS, EXPORTERS, ESTIMATORS)
-NAMES = {name for registry in REGISTRIES for name in registry.names()}
+NAMES = {name for registry in REGISTRIES for name in registry.builtin}
 # Variables whose values have some of the same names: the quadrature rule "points", and the viewer's mode "depth".
 OTHER = {"rule", "mode"}
 
