@@ -67,13 +67,13 @@ class Reader(NamedTuple):
 class Registry:
     """Parts of one kind by name."""
 
-    def __init__(self, kind: str, register: str, builtin: dict[str, str]):
+    def __init__(self, kind: str, register: str, builtin: dict[str, Any]):
         """Creates a registry of built-in parts.
 
         Args:
             kind: what the parts are, for messages.
             register: the public function that adds a part, for messages.
-            builtin: "module:attribute" by name.
+            builtin: the part, or its "module:attribute", by name.
         """
         self._kind, self._register, self._parts = kind, register, dict(builtin)
         self.builtin = tuple(builtin)

@@ -74,7 +74,7 @@ def make_cell_model(context):
         candidates = march_rays(None, grid, jax.lax.stop_gradient(rays), **steps)
         buffer = math.ceil(options.samples_per_ray * rays.near.size)
         placed, _ = importance_samples(keys, grid, rays, candidates, max_samples=buffer, uniform_fraction=1.0)
-        size = {"longest": num_steps(grid, **steps)}
+        size = {"longest": num_steps(grid, **steps), "fixed_order": context.fixed_order}
         return {"fine": render_placed(scene(params, grid), rays, placed, background=context.background, **size)}
 
     def view(params, grid, rays, median_depth=False):

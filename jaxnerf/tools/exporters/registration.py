@@ -35,15 +35,17 @@ def _on_demand(module, name):
     return lambda *args: getattr(importlib.import_module(f"jaxnerf.tools.exporters.{module}"), name)(*args)
 
 
-EXPORTERS = Registry("exporter", "jaxnerf.register_exporter", {})
-for _name, _options in {
-    "mesh": MeshOptions,
-    "points": PointsOptions,
-    "depth": ExportOptions,
-    "splats": SplatsOptions,
-}.items():
-    EXPORTERS.add(_name, Exporter(_on_demand(_name, f"export_{_name}"), options=_options))
-EXPORTERS.add("web", Exporter(_on_demand("web", "export_web"), _on_demand("web", "network_of"), WebOptions))
+EXPORTERS = Registry(
+    "exporter",
+    "jaxnerf.register_exporter",
+    {
+        "mesh": Exporter(_on_demand("mesh", "export_mesh"), options=MeshOptions),
+        "points": Exporter(_on_demand("points", "export_points"), options=PointsOptions),
+        "depth": Exporter(_on_demand("depth", "export_depth"), options=ExportOptions),
+        "splats": Exporter(_on_demand("splats", "export_splats"), options=SplatsOptions),
+        "web": Exporter(_on_demand("web", "export_web"), _on_demand("web", "network_of"), WebOptions),
+    },
+)
 
 
 def register_exporter(
