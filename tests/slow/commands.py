@@ -25,7 +25,7 @@ PAGES += [DOCS / "guides" / f"{name}.md" for name in ("exporting", "resuming")]
 SHORT = {
     "train": ["max_steps=20", "max_seconds=0", "preview_every=0"],
     "render": ["--frames=2", "--width=32"],
-    "export": ["--num_views=4", "--size=32", "--resolution=32"],
+    "export": ["--num_views=4", "--size=32"],
 }
 SHORT["train"] = [f"--config.train.{field}" for field in SHORT["train"]]
 SKIPPED = ("...", "HOST", "--viewer", "jaxnerf-view", "jaxnerf-cameras", "jaxnerf-convert")
@@ -58,9 +58,15 @@ def run(line: str, folder: pathlib.Path) -> subprocess.CompletedProcess:
     if "=DIR" in line and not (folder / "DIR").exists():
         for kind in ("color", "gt-color"):
             shutil.copytree(next(folder.glob("runs/lego/eval/*")) / kind, folder / "DIR" / kind)
+    (folder / "DIR" / "results.json").unlink(missing_ok=True)  # of an earlier command
+    if "runs/fox" in line and not (folder / "runs" / "fox").exists():
+        shutil.copytree(folder / "runs" / "lego", folder / "runs" / "fox")
     flags = [flag.replace("/path/to/dataset", "lego").replace("/path/to/lego", "lego") for flag in flags]
     flags = [flag.replace("--error_budget=0.002", "--error_budget=0.1") for flag in flags]  # after 20 steps all is fog
-    command = [sys.executable, "-m", PROGRAMS[program], *flags, *SHORT.get(program.removeprefix("jaxnerf-"), [])]
+    short = SHORT.get(program.removeprefix("jaxnerf-"), [])
+    if {"--kind=mesh", "--kind=points", "--kind=splats"}.intersection(flags):
+        short = [*short, "--resolution=32"]
+    command = [sys.executable, "-m", PROGRAMS[program], *flags, *short]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
