@@ -62,6 +62,7 @@ def run(line: str, folder: pathlib.Path) -> subprocess.CompletedProcess:
     if "runs/fox" in line and not (folder / "runs" / "fox").exists():
         shutil.copytree(folder / "runs" / "lego", folder / "runs" / "fox")
     flags = [flag.replace("/path/to/dataset", "lego").replace("/path/to/lego", "lego") for flag in flags]
+    flags = [flag.replace("--data_dir=data/lego", "--data_dir=lego") for flag in flags]
     flags = [flag.replace("--error_budget=0.002", "--error_budget=0.1") for flag in flags]  # after 20 steps all is fog
     short = SHORT.get(program.removeprefix("jaxnerf-"), [])
     if {"--kind=mesh", "--kind=points", "--kind=splats"}.intersection(flags):
