@@ -42,6 +42,7 @@ def difference(folder, other, step=5):
     return max(jax.tree.leaves(jax.tree.map(lambda a, b: np.abs(np.float32(a) - np.float32(b)).max(), a, b)))
 
 
+@pytest.mark.slow
 def test_seeds_have_one_compiled_step_and_each_run_ends_as_it_does_alone(tmp_path, compiled_steps, monkeypatch):
     loaded, load_split = [], evaluate.load_split
     monkeypatch.setattr(evaluate, "load_split", lambda *args: loaded.append(args) or load_split(*args))
