@@ -43,7 +43,7 @@ class SceneOptions(Options):
     background: tuple[float, ...] = option(
         AUTO,
         "The colour behind the scene where `data.background` is `none`: red, green, blue in [0, 1], or () for black. "
-        "auto: the mean of the training images where a grid of all of space is skipped through, otherwise black.",
+        "auto: the mean of the training images where space is contracted and empty cells are skipped, otherwise black.",
         auto=True,
         check=_wrong_color,
     )
