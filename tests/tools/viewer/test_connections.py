@@ -335,7 +335,7 @@ def test_answers_to_pings_that_nobody_reads_do_not_pile_up(viewer):
             received += len(connection.recv(2**16))
 
 
-def test_the_17th_page_is_told_so(viewer, pages):
+def test_the_17th_page_is_refused_in_words(viewer, pages):
     first, *_ = [pages() for _ in range(connections.MAX_BROWSERS)]
     for target, headers in (("/frames/", {}), ("/", {}), ("/", UPGRADE)):
         status, answered, body = ask(viewer.port, target, headers)
