@@ -57,6 +57,7 @@ test-extra: $(BIN)/.dev
 
 # zensical prints what griffe finds in docstrings, but does not fail.
 docs: $(BIN)/.dev
+	@$(BIN)/python examples/notebooks/pages.py
 	@mkdir -p build
 	@$(BIN)/zensical build --clean --strict >build/site.log 2>&1 && ! grep -q griffe: build/site.log || (cat build/site.log; exit 1)
 	@tail -1 build/site.log
