@@ -41,6 +41,8 @@ test-slow: $(BIN)/.dev
 test-extra: $(BIN)/.dev
 	$(BIN)/pip install --quiet --editable '.[notebooks]'
 	$(PYTEST) -m "not slow"
+	rm -rf runs/extra/oldest_versions
+	$(BIN)/python tests/slow/oldest_versions.py runs/extra/oldest_versions
 	$(BIN)/python tests/slow/notebooks.py
 	$(BIN)/python tests/slow/minimal_nerf.py
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/commands.py
