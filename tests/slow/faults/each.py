@@ -37,7 +37,7 @@ VIEWS = ("--num_views=2", "--size=16")
 PROGRAMS = {
     "eval": ("eval", (), "eval/20"),
     "render": ("render", ("--frames=3", "--width=16", "--video=gif"), "renders/turntable-20"),
-    "mesh": ("export", ("--kind=mesh", "--resolution=24", "--texture=64", *VIEWS), "exports/mesh-20"),
+    "mesh": ("export", ("--kind=mesh", "--format=glb", "--resolution=24", "--texture=64", *VIEWS), "exports/mesh-20"),
     "points": ("export", ("--kind=points", "--num_points=500", *VIEWS), "exports/points-20"),
     "depth": ("export", ("--kind=depth", *VIEWS), "exports/depth-20"),
     "splats": ("export", ("--kind=splats", "--num_points=500", "--fit_steps=2", *VIEWS), "exports/splats-20"),
@@ -147,7 +147,7 @@ def read_only(out):
 
 
 def full_disks(out):
-    """Programs of a trained run on a disk with little space: one line, no half result, and success once there is more."""
+    """Programs of a run on a disk with little space: one line, no half result, and success once there is more."""
     run, held = trained_run(out), 0
     for name, (program, flags, written) in PROGRAMS.items():
         codes = []
