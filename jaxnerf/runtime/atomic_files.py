@@ -131,6 +131,14 @@ def check_tree(folder: str | os.PathLike, *, links: bool = False) -> None:
             raise ValueError(f"{path}: is {kind}, expected a folder or a regular file; remove it")
 
 
+def check_utf8(path: str | os.PathLike) -> None:
+    """Raises a ValueError if a path is not UTF-8, as the libraries that write checkpoints need it."""
+    try:
+        os.path.abspath(path).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{path}: is not UTF-8 with the folders that it lies in; rename them, or use others") from None
+
+
 def remove(path: str | os.PathLike) -> None:
     """Removes a file, or a folder as far as possible, if there is one; a link itself, not what it names."""
     path = pathlib.Path(path)

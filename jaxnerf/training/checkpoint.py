@@ -26,6 +26,7 @@ class Checkpoints:
 
     def __init__(self, workdir: str | os.PathLike, *, max_to_keep: int | None = None):
         """Opens the folder; max_to_keep: how many of the newest to keep, None for reading only."""
+        atomic_files.check_utf8(workdir)
         self._folder = pathlib.Path(workdir).absolute() / "checkpoints"
         policies = ocp.training.preservation_policies
         self._preservation = policies.LatestN(max_to_keep) if max_to_keep else None

@@ -156,6 +156,7 @@ def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
             what training writes to another place; names the folder or the link.
     """
     path = pathlib.Path(workdir) / "running"
+    atomic_files.check_utf8(workdir)
     for name in _FOLDERS:
         atomic_files.check_tree(path.with_name(name))
     try:

@@ -336,3 +336,20 @@ def test_partial_files_of_a_killed_run_are_removed_and_no_others(tmp_path):
         "folder.tmp",
         "config.json.folder.tmp",
     }
+
+
+def test_a_workdir_that_is_not_utf8_is_refused_before_training(tmp_path):
+    folder = os.fsdecode(os.fsencode(tmp_path) + b"/\xff")
+    for use in (Checkpoints, lambda folder: workdir_lock(folder).__enter__()):
+        with pytest.raises(ValueError, match="is not UTF-8 .* rename them"):
+            use(folder)
+    assert not os.path.exists(folder)
+
+
+def test_a_clock_that_goes_backwards_changes_nothing(folder, monkeypatch):
+    clock = iter(range(2**31, 0, -3600))
+    monkeypatch.setattr("time.time", lambda: float(next(clock)))
+    train_and_evaluate(smoke_config(max_steps=22), folder)
+    rows = metric_log.read_rows(folder)
+    seconds = [row["seconds"] for row in rows]
+    assert rows[-1]["step"] == 22 and seconds == sorted(seconds) and Checkpoints(folder).steps()[-1] == 22
