@@ -14,6 +14,7 @@ from jaxnerf.data.geometry.poses import AXES, axis_of
 from jaxnerf.data.images import downscaled_copies, image_files, load_images
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
+from jaxnerf.data.reading_notes import exif_line, rays_line
 from jaxnerf.data.scene import BACKGROUNDS
 from jaxnerf.data.shared_views import found_by_split
 from jaxnerf.data.view_selection import select_views, selection
@@ -186,7 +187,9 @@ def _resolve(data):
 def _facts_of(data, capture):
     """Returns lines about what the reader has chosen and skipped."""
     lines = [f"read          {choice}" for choice in capture.choices]
-    lines += [f"note          {note}" for note in capture.notes]
+    lines += [f"note          {note}" for note in (*capture.notes, exif_line(capture)) if note]
+    if rays := rays_line(capture):
+        lines.append(f"rays          {rays}")
     masks = [frame.mask for frame in capture.frames if frame.mask is not None]
     if masks:
         where = f"{len(masks)} of {len(capture.frames)} images have one, such as {masks[0]}"

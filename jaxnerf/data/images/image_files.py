@@ -57,7 +57,8 @@ def read_image(
         path: of one of the FORMATS: 8 bits, 16 bits in a PNG or grey, or in a grey TIFF floats in [0, 1] or whole
             numbers of 32 bits up to 65535. Of several pages the first is read.
         camera_size: (height, width) that the camera's intrinsics refer to, or a multiple of the image's size.
-            If only the stored, unrotated pixels fit it, the EXIF orientation is ignored.
+            EXIF orientation is followed if only the upright image fits it: programs that compute poses ignore it, so
+            where both fit, as at half a turn, the poses are those of the pixels as they are stored.
         follow_exif: whether EXIF orientation is followed at all.
 
     Returns:
@@ -109,8 +110,9 @@ def _upright(pixels, value, camera_size):
 
 def _is_rotated(size, value, camera_size):
     """Returns whether the EXIF orientation of an image [H, W] is followed."""
-    upright = size[::-1] if value >= 5 else size
-    return value in _UPRIGHT and not (camera_size and fits(size, camera_size) and not fits(upright, camera_size))
+    if value not in _UPRIGHT or camera_size is None:
+        return value in _UPRIGHT
+    return value >= 5 and fits(size[::-1], camera_size) and not fits(size, camera_size)
 
 
 def fits(found: tuple, declared: tuple) -> bool:
@@ -137,6 +139,25 @@ def image_size(path: str | os.PathLike, *, follow_exif: bool = True) -> tuple[in
     """Returns the (width, height) in px of an image file from its first bytes; see `read_image`."""
     size, value = _open(path, lambda image: (image.size, _orientation(image)))
     return size[::-1] if follow_exif and value >= 5 else size
+
+
+def size_around(path: str | os.PathLike, center: Float[np.ndarray, "2"]) -> tuple[int, int]:
+    """Returns the (width, height) of an image as it is stored, or upright if a principal point fits that better; px."""
+    size, value = _open(path, lambda image: (image.size, _orientation(image)))
+    if value < 5:
+        return size
+    return min(size, size[::-1], key=lambda each: np.abs(center - np.array(each) / 2).sum())
+
+
+def read_ignored(path: str | os.PathLike, *, camera_size: tuple | None = None) -> Bool[np.ndarray, "H W"]:
+    """Reads an image whose pixels other than black are ignored, whatever their alpha, as a mask like `read_mask`'s."""
+    ignored, value = _open(path, lambda image: (_decode(path, image)[..., :3].any(axis=-1), _orientation(image)))
+    return _upright(~ignored, value, camera_size)
+
+
+def exif_orientation(path: str | os.PathLike) -> int:
+    """Returns an image file's EXIF orientation; 1 without one."""
+    return _open(path, _orientation)
 
 
 def has_alpha(path: str | os.PathLike) -> bool:

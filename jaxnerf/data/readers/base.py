@@ -31,12 +31,14 @@ class Frame(NamedTuple):
         camera: float64. Height and width are those that the format states for the image, or None.
         mask: an existing image; pixels are ignored where it is at most half as bright as its brightest pixel. None: no
             pixel is ignored.
-        follow_exif: whether EXIF orientation is applied. COLMAP's pixel coordinates, for example, refer to the
-            pixels as they are stored.
+        follow_exif: whether EXIF orientation is applied where only the upright image has the camera's size. COLMAP's
+            pixel coordinates, for example, always refer to the pixels as they are stored.
         bounds: nearest and farthest matter along the camera's axis, world units; None: not known.
         seen: [M] indices into the Capture's points that this image shows; None: not known.
         seen_at: [M, 2] px, where it shows them.
         time: in [0, 1], when it was taken in a scene that moves; None: not stated, which holds for all frames or none.
+        ignored: an existing image; pixels are ignored where it is not black, too. None: none is.
+        crop_radius: px of the camera, around the image's middle, beyond which pixels are ignored, too; None: none is.
     """
 
     name: str
@@ -48,6 +50,8 @@ class Frame(NamedTuple):
     seen: Int[np.ndarray, " M"] | None = None
     seen_at: Float[np.ndarray, "M 2"] | None = None
     time: float | None = None
+    ignored: Path | None = None
+    crop_radius: float | None = None
 
 
 class CameraFiles(NamedTuple):
@@ -120,6 +124,11 @@ def fingerprint(capture: Capture) -> str:
         parts += [np.float32(array) for array in arrays if array is not None]
         if frame.mask is not None:
             parts.append(f"mask {frame.mask.name}")
+        parts += [
+            f"{name} {value}"
+            for name, value in (("ignored", frame.ignored and frame.ignored.name), ("crop", frame.crop_radius))
+            if value
+        ]
         if frame.time is not None:
             parts.append(f"time {frame.time}")
     return f"{len(capture.frames)} images, {content_fingerprint(*parts)[:8]}"
@@ -166,8 +175,8 @@ def read_capture(folder: str | os.PathLike, format: str = "auto", *, split: str 
     format = detect_formats(folder)[0] if format == "auto" else format
     read = READERS.get(format).read
     if has_split_files(format):
-        return read(Path(folder), split=split)
-    return moved_near(_with_masks(read(Path(folder)), Path(folder)))
+        return _with_ignored(read(Path(folder), split=split))
+    return moved_near(_with_masks(_with_ignored(read(Path(folder))), Path(folder)))
 
 
 def has_split_files(format: str) -> bool:
@@ -226,6 +235,24 @@ def _moved(frame, origin):
     pose = np.array(frame.camera.to_world, np.float64)
     pose[:, 3] -= origin
     return frame._replace(camera=dataclasses.replace(frame.camera, to_world=pose))
+
+
+def ignoring_name(stem: str) -> str:
+    """Returns the name of instant-ngp's mask beside an image: pixels where it is not black are ignored."""
+    return f"dynamic_mask_{stem}.png"
+
+
+def _with_ignored(capture):
+    """Returns the Capture with the images `ignoring_name` beside its own, unless its format states masks."""
+    if any(frame.mask is not None for frame in capture.frames):
+        return capture
+    paths = [frame.image.with_name(ignoring_name(frame.image.stem)) for frame in capture.frames]
+    paths = [path if os.path.isfile(path) else None for path in paths]
+    if not (found := [path for path in paths if path is not None]):
+        return capture
+    note = f"{found[0]}: pixels where it is not black are ignored; {len(found)} of {len(paths)} images have such a mask"
+    frames = [frame._replace(ignored=path) for frame, path in zip(capture.frames, paths, strict=True)]
+    return capture._replace(frames=tuple(frames), choices=(*capture.choices, note))
 
 
 def _with_masks(capture, folder):

@@ -152,7 +152,7 @@ def test_file_paths_may_lack_extension_or_begin_with_a_dot(tmp_path, shots, kind
 
 
 def test_the_size_is_the_images_if_it_is_needed_and_not_stated(tmp_path, shots):
-    """The size is that of the upright image."""
+    """The size is that of the stored image, or of the upright one if the centre fits that."""
     content = captures.write_transforms(tmp_path, shots, kind="jpg", orientation=6)
     with Image.open(tmp_path / "images" / "000.jpg") as image:
         assert image.size == (24, 32)
@@ -161,8 +161,8 @@ def test_the_size_is_the_images_if_it_is_needed_and_not_stated(tmp_path, shots):
     content["camera_angle_x"] = 0.8
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read_capture(tmp_path).frames[0].camera
-    assert (camera.height, camera.width) == (24, 32) and camera.center.tolist() == [16, 12]
-    np.testing.assert_allclose(camera.focal, 16 / math.tan(0.4))
+    assert (camera.height, camera.width) == (32, 24) and camera.center.tolist() == [12, 16]
+    np.testing.assert_allclose(camera.focal, 12 / math.tan(0.4))
     content |= {"fl_x": 50.0, "cx": 15.0, "cy": 11.0}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read_capture(tmp_path).frames[0].camera
