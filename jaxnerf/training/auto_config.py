@@ -96,7 +96,7 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     left = [name for name in auto_fields(config) if name not in device_fields(config)]
     if left:
         raise ValueError(f"{left[0]} is 'auto', which is not inferred for this field; set a value")
-    if views.time is not None and "time" not in build_model(config).needs:
+    if views.time is not None and "time" not in build_model(resolve_for_device(config, training=False)[0]).needs:
         lines.append(f"time          {TIME_UNUSED}")
     return Resolved(config, views, lines + more + near)
 

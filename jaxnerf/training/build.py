@@ -15,6 +15,7 @@ from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.facts import footprint_radii
 from jaxnerf.data.geometry.free_space import interpolated_depths
+from jaxnerf.data.images.pixel_rays import sees_sideways
 from jaxnerf.data.observations import confident_observations
 from jaxnerf.data.scene import bounded_by_alpha
 from jaxnerf.fields.base import Field, contract_field
@@ -361,7 +362,8 @@ def _prepare(config, model, extras, views):
             model.grid_schedule,
             # What is empty in one image of a scene that moves may hold matter in others.
             use_alpha=bounded_by_alpha(config.scene, views, ndc=config.data.ndc),
-            min_views=model.grid_schedule.min_views if views.time is None else 0,
+            # Nor does it where a lens sees beside it: its view is not that of a frustum.
+            min_views=0 if views.time is not None or sees_sideways(views) else model.grid_schedule.min_views,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
         )

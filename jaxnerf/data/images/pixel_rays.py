@@ -1,5 +1,6 @@
 """Which pixels of a lens's image have a ray: beyond its reach, or where its model folds, there is none."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ from jaxtyping import Bool
 
 from jaxnerf.core.cameras import rays_from_pixels
 from jaxnerf.core.types import Camera
+from jaxnerf.core.views import Views
 
 _CHUNK = 2**12  # pixels that are tested at a time
 _TILES = 32  # along each side of an image
@@ -26,6 +28,17 @@ def pixels_with_rays(cameras: Sequence[Camera]) -> list[Bool[np.ndarray, "H W"] 
 def fractions_of_pixels(cameras: Sequence[Camera]) -> tuple[float, float]:
     """Returns which fraction of the pixels of cameras has no ray, and which one 90 degrees or more from the axis."""
     return tuple(np.mean(_of_lenses(cameras, _fractions, (0.0, 0.0)), axis=0).tolist())
+
+
+def sees_sideways(views: Views) -> bool:
+    """Returns whether any view shows what is 90 degrees or more from its camera's axis."""
+    if views.cameras.lens != "fisheye":
+        return False
+    cameras = []
+    for index, (height, width) in enumerate(np.asarray(views.size).tolist()):
+        camera = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], views.cameras)
+        cameras.append(dataclasses.replace(camera, height=height, width=width))
+    return fractions_of_pixels(cameras)[1] > 0
 
 
 def _of_lenses(cameras: Sequence[Camera], function: Callable[[Camera], Any], pinhole: Any) -> list:
