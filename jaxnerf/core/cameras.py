@@ -51,8 +51,11 @@ def undistort(
 
     Returns:
         points [..., 2], x right and y down, focal length 1; and converged [...]. A pixel outside
-        the image of the lens has no preimage: its point is 0 and converged is False. So are those of a fisheye's pixel
-        at 90 degrees from the axis or beyond, whose ray, see `rays_from_pixels`, does not cross that plane.
+        the image of the lens, or that only points beyond a fold of the lens are seen in, has no preimage: its point
+        is 0 and converged is False. A lens folds where its image, on the way from the axis to the point, stops
+        growing, along the ray or across it: where the Jacobian's determinant is no longer positive. A fisheye's
+        pixel at 90 degrees from the axis or beyond is flagged, too: its ray, see `rays_from_pixels`, does not cross
+        that plane.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -234,7 +237,8 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
     Returns:
         pixels [..., 2] px, (x, y); and depth [...] in world units along the camera's axis, > 0 in front,
         the t of rays_from_pixels, also where this is not along the axis, beside a fisheye. A point that the camera
-        does not see, such as one behind it or beyond a fold of the lens, has pixels inf, with gradient 0.
+        does not see, behind it or beyond a fold of the lens, see `undistort`, or so near the camera that the gradient
+        of its pixel overflows, has pixels inf, with gradient 0.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -248,17 +252,18 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
     # Sums of products instead of a matmul, which may round the camera to ten bits.
     local = (to_world[:, :3].reshape(*lead, 3, 3) * offset[..., None]).sum(axis=-2)
     depth = -local[..., 2]
-    seen = depth > 0
     across = jnp.stack([local[..., 0], -local[..., 1]], axis=-1)
-    points = across / jnp.where(seen, depth, 1)[..., None]
+    steepest = focal * (1 + jnp.abs(across / depth[..., None])) / depth[..., None]
+    seen = (depth > 0) & jnp.isfinite(jax.lax.stop_gradient(steepest)).all(axis=-1)
+    points = divide(across, jnp.broadcast_to(jnp.where(seen, depth, 1)[..., None], across.shape))
     if camera.distortion is not None and camera.lens != "pinhole":
         distort, distortion = _lens("project", camera)
         if camera.lens == "fisheye":
             radius = norm(points)
             wide = radius > 1e-4  # below, the series is exact, and its derivative has no 0 / 0
             angle = jnp.where(wide, jnp.arctan(radius) / jnp.where(wide, radius, 1), 1 - radius**2 / 3)
-            points, depth = _beside(across, depth, points * angle[..., None])
-            seen = depth > 0
+            points, depth, beside = _beside(across, depth, points * angle[..., None])
+            seen |= beside
         flat = points.reshape(-1, 2)
 
         def has_image(point):
@@ -271,13 +276,14 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
 
 
 def _beside(across, depth, points):
-    """Returns points as long as the angle from the axis and t, given those in front and where points [..., 3] are."""
+    """Returns points as long as the angle from the axis and t, also where a fisheye sees beside itself; and where."""
     radius = norm(across)
-    angle = jnp.arctan2(radius, jnp.where(radius > 0, depth, 1))
-    beside = angle > _SIDEWAYS
+    near = radius < 1e-18  # of the type's smallest root: the gradient overflows there
+    angle = jnp.arctan2(radius, jnp.where(near, 1, depth))
+    beside = (angle > _SIDEWAYS) & ~near
     scale = jnp.where(beside, angle, 0) / jnp.where(beside, radius, 1)
     t = norm(jnp.stack([radius, depth], axis=-1)) * math.cos(_SIDEWAYS)
-    return jnp.where(beside[..., None], across * scale[..., None], points), jnp.where(beside, t, depth)
+    return jnp.where(beside[..., None], across * scale[..., None], points), jnp.where(beside, t, depth), beside
 
 
 def ndc_rays(rays: Rays, camera: Camera, *, near_plane: Num[ArrayLike, ""] = 1.0) -> Rays:
@@ -390,13 +396,12 @@ def _equidistant(distortion, point):
 
 def _growing(distort, distortion, point):
     """Returns whether the image grows monotonically from the axis to a point [2]; a lens folds where it does not."""
-    fractions = jnp.linspace(0, 1, 32, dtype=point.dtype)
-    _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),)))(
-        fractions
-    )
-    # Not a sum along the axis of length 2: XLA calls a library for that on a CPU, which is slow for so short an axis.
-    along = slopes[:, 0] * point[0] + slopes[:, 1] * point[1]
-    return (along[1:] > 0).all() | (norm(point) == 0)
+    way = jnp.linspace(0, 1, 32, dtype=point.dtype)[:, None] * point[None]
+    (a, b), (c, d) = jnp.moveaxis(jax.vmap(lambda at: jax.jacfwd(distort, argnums=1)(distortion, at))(way), 0, -1)
+    # Not sums along an axis of length 2: XLA calls a library for that on a CPU, which is slow for so short an axis.
+    x, y = normalize(point)
+    along = x * (a * x + b * y) + y * (c * x + d * y)
+    return ((along > 0) & (a * d - b * c > 0)).all() | (norm(point) == 0)
 
 
 def _invert(distort, distortion, goal):

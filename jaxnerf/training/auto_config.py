@@ -8,7 +8,7 @@ import jax
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.facts import dataset_facts
-from jaxnerf.data.reading_notes import TIME_UNUSED
+from jaxnerf.data.readers.base import TIME_UNUSED
 from jaxnerf.data.scene import bounded_by_alpha, resolve_background, resolve_scene
 from jaxnerf.options import Changes, Device, Facts, changing, is_auto, replaced
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS

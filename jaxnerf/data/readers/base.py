@@ -16,8 +16,10 @@ from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
 from jaxnerf.data.readers.colmap_model import check_complete
 from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.registry import READERS
+from jaxnerf.runtime.atomic_files import files_below
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
+TIME_UNUSED = "images state one, which is not used: the scene is trained as static; see docs/extending/moving_scene.md"
 _FAR_AWAY = 100.0  # distance of cameras from an origin over how far they are apart
 _MASK_FOLDERS = ("images_mask", "images_masks", "masks")
 
@@ -172,11 +174,25 @@ def read_capture(folder: str | os.PathLike, format: str = "auto", *, split: str 
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    format = detect_formats(folder)[0] if format == "auto" else format
+    if format == "auto":
+        format, *others = detect_formats(folder)
+        try:
+            return read_capture(folder, format, split=split)
+        except ValueError as error:
+            # Such as a COLMAP model beside a transforms.json with the paths of another machine.
+            works = next((name for name in others if _is_readable(folder, name, split)), None)
+            raise ValueError(f"{error}; --format={works} reads the folder" if works else str(error)) from None
     read = READERS.get(format).read
     if has_split_files(format):
         return _with_ignored(read(Path(folder), split=split))
     return moved_near(_with_masks(_with_ignored(read(Path(folder))), Path(folder)))
+
+
+def _is_readable(folder, format, split):
+    try:
+        return bool(read_capture(folder, format, split=split))
+    except ValueError:
+        return False
 
 
 def has_split_files(format: str) -> bool:
@@ -276,7 +292,7 @@ def _find_masks(folder, images):
     for place in (folder / name for name in _MASK_FOLDERS):
         if not place.is_dir():
             continue
-        paths = (path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        paths = (path for path in files_below(place) if path.suffix.lower() in IMAGE_SUFFIXES)
         paths = sorted(path for path in paths if not is_hidden(path.name))
         files = {fold(path.relative_to(place).with_suffix("").as_posix()): path for path in paths}
         masks = [files.get(fold(name)) or files.get(fold(name + suffix)) for name, suffix in images]

@@ -50,14 +50,10 @@ _SMALLEST_IMAGE = _POSE.size + 1 + _NUMBER.size  # bytes
 _MAX_NAME = 4096  # bytes, the limit of common operating systems
 
 
-def is_panorama(model: str) -> bool:
-    """Returns whether a camera model is by its name that of images all around the camera."""
-    return any(name in model.lower() for name in ("equirect", "spher", "latlong", "panorama", "omnidirect", "vr180"))
-
-
-def convert(model: str) -> str:
-    """Returns what to do with images of a camera model that is not read."""
-    return PANORAMA if is_panorama(model) else UNDISTORT
+def convert(model: str, otherwise: str = UNDISTORT) -> str:
+    """Returns what to do with images of a camera model that is not read; otherwise: if it is none of panoramas."""
+    names = ("equirect", "spher", "latlong", "panorama", "omnidirect", "vr180")
+    return PANORAMA if any(name in model.lower() for name in names) else otherwise
 
 
 class Intrinsics(NamedTuple):

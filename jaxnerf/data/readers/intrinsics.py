@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxnerf.core.types import Camera
 from jaxnerf.data.images.image_files import image_size, size_around
-from jaxnerf.data.readers.colmap_model import PANORAMA, is_panorama
+from jaxnerf.data.readers.colmap_model import convert
 from jaxnerf.data.readers.validation import is_number, short_repr
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
@@ -79,14 +79,13 @@ def _image_size(fields, image):
         return image_size(image, follow_exif=False)
     center = np.array([number_in(fields, key, "a number of px") for key in ("cx", "cy")])
     size = size_around(image, center)
-    middle = np.array(size) / 2
-    times = center / middle
+    times = 2 * center / size
     scaled = times.max() < _ALIKE * times.min() and not 1 / _CROPPED < times.mean() < _CROPPED
     if scaled or not ((times >= 0) & (times <= 2)).all():
-        found = f"cx, cy are {center[0]:.6g}, {center[1]:.6g} without w and h"
-        expected = f"{middle[0]:.6g}, {middle[1]:.6g} or so, the middle of {image} of {size[0]} x {size[1]} px"
+        expected = f"{size[0] / 2:g}, {size[1] / 2:g} or so, the middle of {image} of {size[0]} x {size[1]} px"
         raise ValueError(
-            f"{fields['cx'][1]}: {found}, expected {expected}; add w and h, the size in px that they and fl_x refer to"
+            f"{fields['cx'][1]}: cx, cy are {center[0]:.6g}, {center[1]:.6g} without w and h, expected {expected}; add "
+            "w and h, the size in px that they and fl_x refer to"
         )
     return size
 
@@ -186,8 +185,7 @@ def _lens(fields, where):
     if other or model not in (None, *_PERSPECTIVE, "OPENCV_FISHEYE"):
         found = f"has {other[0]}" if other else f"camera_model is {short_repr(model)}"
         expected = f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE"
-        panorama = is_panorama(other[0] if other else str(model))
-        todo = PANORAMA if panorama else "undistort the images to one of these and export the file again"
+        todo = convert(str(model or other), "undistort the images to one of these and export the file again")
         raise ValueError(f"{place}: {found}, expected {expected}; {todo}")
     if not isinstance(fisheye, bool) or (model is not None and fisheye != (model == "OPENCV_FISHEYE")):
         expected = "true or false" if model is None else f"the value that camera_model {model} implies"

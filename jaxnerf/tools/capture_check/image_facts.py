@@ -1,27 +1,57 @@
 """What image files and cameras state that may be wrong, although training reads them as they are."""
 
+import contextlib
 import io
 from collections import defaultdict
 
 import numpy as np
 from PIL import ImageCms
 
-from jaxnerf.data.images.image_files import open_image
-from jaxnerf.data.readers.base import Capture
-from jaxnerf.data.reading_notes import exif_line, rays_line, sized_frames
+from jaxnerf.data.images.downscaled_copies import with_size
+from jaxnerf.data.images.image_files import exif_orientation, open_image
+from jaxnerf.data.images.pixel_rays import rays_line
+from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.tools.capture_check.findings import Finding
 
 
 def judge_files(capture: Capture) -> list[Finding]:
     """Returns Findings about orientations, colour profiles, principal points, and pixels without rays."""
     frames = sized_frames(capture)
-    found = _profiles(frames) + _centers(frames)
-    if line := exif_line(capture):
-        found.append(Finding("warning", "skipped", line, "", ""))
-    if "no ray" in (line := rays_line(capture)) and any(frame.camera.lens != "fisheye" for frame in frames):
+    found = _turned(frames) + _profiles(frames) + _centers(frames)
+    if "no ray" in (line := rays_of(capture)) and any(frame.camera.lens != "fisheye" for frame in frames):
         change = "calibrate again with fewer coefficients, or crop the images"
         found.append(Finding("warning", "lens", f"{capture.source}: {line}", "a ray for each", change))
     return found
+
+
+def rays_of(capture: Capture) -> str:
+    """Returns the `rays_line` of all cameras."""
+    return rays_line([frame.camera for frame in sized_frames(capture)])
+
+
+def sized_frames(capture: Capture) -> list[Frame]:
+    """Returns the frames with the size of their camera, without unreadable images, which whoever reads them reports."""
+    frames = []
+    for frame in capture.frames:
+        with contextlib.suppress(ValueError):
+            frames.append(with_size(frame))
+    return frames
+
+
+def _turned(frames):
+    """Returns a Finding if images have an EXIF orientation that is not followed, as no size tells whether to."""
+    turned = []
+    for frame in frames:
+        with contextlib.suppress(ValueError):
+            orientation, camera = exif_orientation(frame.image) if frame.follow_exif else 1, frame.camera
+            if orientation > 1 and (orientation < 5 or camera.height == camera.width):
+                turned.append(f"{orientation} in {frame.image.name}")
+    if not turned:
+        return []
+    found = f"EXIF orientation of {len(turned)} of {len(frames)} images ({turned[0]}) is not followed, as programs that"
+    found += " find poses ignore it"
+    change = "turn the files if the poses are those of upright images, or else remove the orientation"
+    return [Finding("warning", "skipped", found, "poses of the pixels as stored", change)]
 
 
 def _profiles(frames):

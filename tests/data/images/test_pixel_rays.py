@@ -8,9 +8,8 @@ import pytest
 import captures
 from jaxnerf import Camera
 from jaxnerf.data.dataset import load_dataset
-from jaxnerf.data.images.pixel_rays import fractions_of_pixels, pixels_with_rays
+from jaxnerf.data.images.pixel_rays import fractions_of_pixels, pixels_with_rays, rays_line, sees_sideways
 from jaxnerf.data.readers.base import read_capture
-from jaxnerf.data.reading_notes import rays_line
 
 
 def camera(lens, distortion, focal, *, width=150, height=90, center=(70.0, 50.0)):
@@ -57,6 +56,10 @@ def test_pixels_without_rays_are_masked_in_views(tmp_path, lens, k, factor):
         mask = views.mask[views.offset[index] :][: rays.far.size].reshape(rays.far.shape)
         np.testing.assert_array_equal(mask, rays.far > rays.near)
     assert 0.1 < views.mask.mean() < 0.9
-    assert "of the pixels have no ray: " in rays_line(read_capture(tmp_path))
+    assert "of the pixels have no ray: " in rays_line([frame.camera for frame in read_capture(tmp_path).frames])
+    assert not sees_sideways(views)
     captures.write_transforms(tmp_path, captures.noise(stack))
-    assert load_dataset(tmp_path, split="train").mask is None and not rays_line(read_capture(tmp_path))
+    views = load_dataset(tmp_path, split="train")
+    assert views.mask is None and not rays_line([frame.camera for frame in read_capture(tmp_path).frames])
+    wide = dataclasses.replace(views.cameras, focal=views.cameras.focal / 4)
+    assert sees_sideways(dataclasses.replace(views, cameras=wide)) == (lens == "fisheye")
