@@ -7,15 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size, is_hidden, size_around
-from jaxnerf.data.readers.base import Capture, Frame, ignoring_name
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, image_size, is_hidden
+from jaxnerf.data.readers.base import Capture, Frame
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Returns the image files of a folder that are neither hidden nor `ignoring_name`s of others, sorted by name."""
-    paths = [path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
-    masks = {ignoring_name(path.stem) for path in paths}
-    return sorted(path for path in paths if not is_hidden(path.name) and path.name not in masks and path.is_file())
+    """Returns the image files of a folder that are not hidden, sorted by name."""
+    paths = (path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(path for path in paths if not is_hidden(path.name) and path.is_file())
 
 
 def downscaled_folders(folder: Path) -> dict[int, Path]:
@@ -70,10 +69,7 @@ def with_size(frame: Frame) -> Frame:
     """Returns the frame with a height and width in its camera: the image's if the format states none."""
     if None not in (frame.camera.height, frame.camera.width):
         return frame
-    if frame.follow_exif:
-        width, height = size_around(frame.image, frame.camera.center)
-    else:
-        width, height = image_size(frame.image, follow_exif=False)
+    width, height = image_size(frame.image, follow_exif=frame.follow_exif, center=np.asarray(frame.camera.center))
     return frame._replace(camera=dataclasses.replace(frame.camera, height=height, width=width))
 
 

@@ -18,6 +18,7 @@ from jaxnerf.runtime.atomic_files import open_regular
 # What Pillow decodes by itself. Left to choose by a file's content, it would start Ghostscript for an EPS.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+MASK_PREFIX = "dynamic_mask_"  # of instant-ngp's masks beside images: pixels where they are not black are ignored
 _GREY_MODES = ("I;16", "I;16B", "I;16L", "I", "F")  # Pillow's, of more than 8 bits
 _ROUNDING = 1e-4  # by which floats may leave [0, 1]
 _DARK = 16  # up to this brightest value, a mask of 8 bits with several levels holds class numbers or noise
@@ -44,8 +45,8 @@ class _WrongRangeError(ValueError):
 
 
 def is_hidden(name: str) -> bool:
-    """Returns whether a file's name is that of a hidden file, such as the ._ files that macOS writes beside images."""
-    return name.startswith(".")
+    """Returns whether a file is no image by its name: a mask of instant-ngp, or hidden as the ._ files of macOS."""
+    return name.startswith((".", MASK_PREFIX))
 
 
 def read_image(
@@ -135,17 +136,18 @@ def read_mask(path: str | os.PathLike, *, camera_size: tuple | None = None) -> B
     return _upright(values > values.max(initial=0) / 2, value, camera_size)
 
 
-def image_size(path: str | os.PathLike, *, follow_exif: bool = True) -> tuple[int, int]:
-    """Returns the (width, height) in px of an image file from its first bytes; see `read_image`."""
-    size, value = _open(path, lambda image: (image.size, _orientation(image)))
-    return size[::-1] if follow_exif and value >= 5 else size
+def image_size(
+    path: str | os.PathLike, *, follow_exif: bool = True, center: Float[np.ndarray, "2"] | None = None
+) -> tuple[int, int]:
+    """Returns the (width, height) in px of an image file from its first bytes; see `read_image`.
 
-
-def size_around(path: str | os.PathLike, center: Float[np.ndarray, "2"]) -> tuple[int, int]:
-    """Returns the (width, height) of an image as it is stored, or upright if a principal point fits that better; px."""
+    With a principal point it is the size upright only if that point fits it better than the size as stored.
+    """
     size, value = _open(path, lambda image: (image.size, _orientation(image)))
-    if value < 5:
+    if not follow_exif or value < 5:
         return size
+    if center is None:
+        return size[::-1]
     return min(size, size[::-1], key=lambda each: np.abs(center - np.array(each) / 2).sum())
 
 
@@ -153,11 +155,6 @@ def read_ignored(path: str | os.PathLike, *, camera_size: tuple | None = None) -
     """Reads an image whose pixels other than black are ignored, whatever their alpha, as a mask like `read_mask`'s."""
     ignored, value = _open(path, lambda image: (_decode(path, image)[..., :3].any(axis=-1), _orientation(image)))
     return _upright(~ignored, value, camera_size)
-
-
-def exif_orientation(path: str | os.PathLike) -> int:
-    """Returns an image file's EXIF orientation; 1 without one."""
-    return _open(path, _orientation)
 
 
 def has_alpha(path: str | os.PathLike) -> bool:

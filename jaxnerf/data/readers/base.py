@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, MASK_PREFIX, is_hidden
 from jaxnerf.data.readers.colmap_model import check_complete
 from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.registry import READERS
@@ -175,24 +175,22 @@ def read_capture(folder: str | os.PathLike, format: str = "auto", *, split: str 
         ValueError: names the file, what was found, what is expected and what to do.
     """
     if format == "auto":
-        format, *others = detect_formats(folder)
-        try:
-            return read_capture(folder, format, split=split)
-        except ValueError as error:
+        wrong = []
+        for name in detect_formats(folder):
+            try:
+                capture = read_capture(folder, name, split=split)
+            except ValueError as error:
+                wrong.append(error)
+                continue
+            if not wrong:
+                return capture
             # Such as a COLMAP model beside a transforms.json with the paths of another machine.
-            works = next((name for name in others if _is_readable(folder, name, split)), None)
-            raise ValueError(f"{error}; --format={works} reads the folder" if works else str(error)) from None
+            raise ValueError(f"{wrong[0]}; --format={name} reads this folder") from None
+        raise wrong[0]
     read = READERS.get(format).read
     if has_split_files(format):
         return _with_ignored(read(Path(folder), split=split))
     return moved_near(_with_masks(_with_ignored(read(Path(folder))), Path(folder)))
-
-
-def _is_readable(folder, format, split):
-    try:
-        return bool(read_capture(folder, format, split=split))
-    except ValueError:
-        return False
 
 
 def has_split_files(format: str) -> bool:
@@ -253,16 +251,11 @@ def _moved(frame, origin):
     return frame._replace(camera=dataclasses.replace(frame.camera, to_world=pose))
 
 
-def ignoring_name(stem: str) -> str:
-    """Returns the name of instant-ngp's mask beside an image: pixels where it is not black are ignored."""
-    return f"dynamic_mask_{stem}.png"
-
-
 def _with_ignored(capture):
-    """Returns the Capture with the images `ignoring_name` beside its own, unless its format states masks."""
+    """Returns the Capture with the masks of instant-ngp beside its images, unless its format states masks."""
     if any(frame.mask is not None for frame in capture.frames):
         return capture
-    paths = [frame.image.with_name(ignoring_name(frame.image.stem)) for frame in capture.frames]
+    paths = [frame.image.with_name(f"{MASK_PREFIX}{frame.image.stem}.png") for frame in capture.frames]
     paths = [path if os.path.isfile(path) else None for path in paths]
     if not (found := [path for path in paths if path is not None]):
         return capture

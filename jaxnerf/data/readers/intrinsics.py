@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxnerf.core.types import Camera
-from jaxnerf.data.images.image_files import image_size, size_around
+from jaxnerf.data.images.image_files import image_size
 from jaxnerf.data.readers.colmap_model import convert
 from jaxnerf.data.readers.validation import is_number, short_repr
 
@@ -78,7 +78,7 @@ def _image_size(fields, image):
     if not {"cx", "cy"} <= fields.keys():
         return image_size(image, follow_exif=False)
     center = np.array([number_in(fields, key, "a number of px") for key in ("cx", "cy")])
-    size = size_around(image, center)
+    size = image_size(image, center=center)
     times = 2 * center / size
     scaled = times.max() < _ALIKE * times.min() and not 1 / _CROPPED < times.mean() < _CROPPED
     if scaled or not ((times >= 0) & (times <= 2)).all():

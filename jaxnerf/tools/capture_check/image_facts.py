@@ -8,7 +8,7 @@ import numpy as np
 from PIL import ImageCms
 
 from jaxnerf.data.images.downscaled_copies import with_size
-from jaxnerf.data.images.image_files import exif_orientation, open_image
+from jaxnerf.data.images.image_files import open_image
 from jaxnerf.data.images.pixel_rays import rays_line
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.tools.capture_check.findings import Finding
@@ -42,9 +42,9 @@ def _turned(frames):
     """Returns a Finding if images have an EXIF orientation that is not followed, as no size tells whether to."""
     turned = []
     for frame in frames:
-        with contextlib.suppress(ValueError):
-            orientation, camera = exif_orientation(frame.image) if frame.follow_exif else 1, frame.camera
-            if orientation > 1 and (orientation < 5 or camera.height == camera.width):
+        with contextlib.suppress(Exception), open_image(frame.image) as image:  # reported where the image is read
+            orientation, camera = image.getexif().get(0x0112, 1), frame.camera
+            if frame.follow_exif and 1 < orientation <= (8 if camera.height == camera.width else 4):
                 turned.append(f"{orientation} in {frame.image.name}")
     if not turned:
         return []

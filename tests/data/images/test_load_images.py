@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from captures import write_image
 from jaxnerf import Camera
 from jaxnerf.data.images import load_images
-from jaxnerf.data.images.image_files import image_form, image_size, read_image, read_mask, size_around
+from jaxnerf.data.images.image_files import image_form, image_size, read_image, read_mask
 from jaxnerf.data.readers.base import Capture, Frame
 
 HEIGHT, WIDTH = 6, 8
@@ -203,8 +203,8 @@ def test_exif_orientation_is_followed_if_only_the_upright_size_fits_the_camera(t
     assert image_size(path) == upright.shape[1::-1]
     for size, expected in (((8, 14), stored), ((14, 8), upright if turn >= 5 else stored), ((7, 7), stored)):
         np.testing.assert_array_equal(read_image(path, camera_size=size), expected)
-    assert size_around(path, np.array([2.0, 3.6])) == (upright.shape[1::-1] if turn >= 5 else (7, 4))
-    assert size_around(path, np.array([3.4, 2.0])) == (7, 4)
+    assert image_size(path, center=np.array([2.0, 3.6])) == (upright.shape[1::-1] if turn >= 5 else (7, 4))
+    assert image_size(path, center=np.array([3.4, 2.0])) == (7, 4)
 
 
 @pytest.mark.parametrize("kind", ["png", "jpg", "webp"])
