@@ -36,8 +36,8 @@ def save(workdir: str | os.PathLike, config: RunConfig, views: Views) -> None:
     values["mask"] = None if views.mask is None else np.packbits(np.asarray(views.mask))
     arrays = {name: np.asarray(value) for name, value in values.items() if hasattr(value, "shape")}
     about = json.dumps({name: value for name, value in values.items() if name not in arrays})
-    with atomic_files.partial_file(pathlib.Path(workdir) / FILE, ".tmp.npz") as partial:
-        np.savez_compressed(partial, about=about, checksum=_checksum(about, arrays), **arrays)
+    with atomic_files.partial_file(pathlib.Path(workdir) / FILE) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, about=about, checksum=_checksum(about, arrays), **arrays)
 
 
 def training_views(workdir: str | os.PathLike, read: Callable[[], Views] | None = None) -> Views:
