@@ -80,7 +80,7 @@ class Views:
 
 def check_pixels(views: Views, user: str) -> None:
     """Raises a ValueError if only the cameras of views are known; user: what needs their pixels."""
-    if not len(views.pixels):
+    if jnp.shape(views.pixels)[:1] == (0,):
         raise ValueError(f"{user} needs images, and only their cameras are known here; give --data_dir")
 
 

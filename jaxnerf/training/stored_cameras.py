@@ -47,11 +47,15 @@ def training_views(workdir: str | os.PathLike, read: Callable[[], Views] | None 
     there is neither, from read().
 
     Raises:
-        ValueError: if the file is damaged or another run's; if there is neither file nor dataset, nor read.
+        ValueError: if the file is damaged, or of another run and the dataset is not there; if nothing is there.
     """
     config, path = load_config(workdir), pathlib.Path(workdir) / FILE
     if path.exists():
-        return _read(path, _key(config))
+        views, key = _read(path)
+        if key == _key(config):
+            return views
+        if not dataset.is_there(config.data):
+            raise ValueError(f"{path}: is of a run with other data or another scene than config.json; give --data_dir")
     if read is not None and not dataset.is_there(config.data):
         return read()
     views = dataset.load_split(config.data, "train", fingerprint=config.fingerprint)
@@ -75,7 +79,7 @@ def _fields(part):
 
 
 def _key(config):
-    parts = {**values_of(config.data), "dir": ""}, values_of(config.scene), config.fingerprint
+    parts = {**values_of(config.data), "dir": ""}, config.scene.lower, config.scene.upper, config.fingerprint
     return fingerprint(json.dumps(parts, sort_keys=True, default=str))
 
 
@@ -83,7 +87,7 @@ def _checksum(about, arrays):
     return fingerprint(about, *[each for name in sorted(arrays) for each in (name, arrays[name])])
 
 
-def _read(path, key):
+def _read(path):
     try:
         content = io.BytesIO(atomic_files.read_bytes(path))
         if sum(each.file_size for each in zipfile.ZipFile(content).infolist()) > _MAX_SIZE:
@@ -98,9 +102,7 @@ def _read(path, key):
     except Exception as error:  # a damaged zip file raises almost any exception
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise ValueError(f"{path}: is damaged ({reason}), expected what training writes; {_AGAIN}") from None
-    if about["key"] != key:
-        raise ValueError(f"{path}: is of a run with other data or another scene than config.json; {_AGAIN}")
-    return views
+    return views, about["key"]
 
 
 def _views_of(about, arrays):

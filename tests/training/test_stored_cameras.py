@@ -43,7 +43,7 @@ def alone(run, tmp_path):
     return folder
 
 
-def pictures(folder):
+def files_of_images(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.rglob("*")) if path.suffix in (".png", ".tiff")}
 
 
@@ -87,7 +87,7 @@ def test_frames_and_exports_are_the_same_without_the_dataset(run, alone):
         export_run(folder, "depth", size=16, overwrite=True, say=lambda line: None)
         export_run(folder, "points", size=16, overwrite=True, say=lambda line: None)
         files = {path.name: path.read_bytes() for path in (folder / "exports").rglob("*.ply")}
-        made[folder] = pictures(folder / "renders") | pictures(folder / "exports") | files
+        made[folder] = files_of_images(folder / "renders") | files_of_images(folder / "exports") | files
     assert len(made[run]) > 6 and made[run] == made[alone]
 
 
