@@ -33,7 +33,11 @@ _RUN = run_flags.define("scored", "uncertainty/NNN.tiff and compares it with the
 _SPLIT = flags.DEFINE_string("split", None, "The split of the dataset. It overrides config.eval.split.")
 _WATCH = flags.DEFINE_bool("watch", False, "Whether to score each new checkpoint until training ends.")
 _POLL = flags.DEFINE_float(
-    "poll_seconds", 10.0, "The time between two searches for a checkpoint with --watch.", lower_bound=0.01
+    "poll_seconds",
+    10.0,
+    "The time between two searches for a checkpoint with --watch.",
+    lower_bound=0.01,
+    upper_bound=86_400.0,
 )
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an earlier result.")
 _ERROR_BUDGET = flags.DEFINE_float(
@@ -42,6 +46,7 @@ _ERROR_BUDGET = flags.DEFINE_float(
     "The largest RMS colour error, against the model's own exact rendering. The program searches the fastest "
     "settings that stay within it, and scores with them.",
     lower_bound=0.0,
+    upper_bound=1.0,
 )
 _PREDICTIONS = flags.DEFINE_string(
     "predictions", None, "A folder of images, or of color/ with images, that are scored in place of a run."
@@ -132,7 +137,12 @@ def _reference_config():
 def run():
     """Runs the program."""
     prepare = functools.partial(cli.with_saved_config, only_for_fields=True)
-    cli.run(main, prepare=prepare, stopped="between two views; the same command continues from there")
+    cli.run(main, prepare=prepare, stopped=_stopped)
+
+
+def _stopped():
+    again = _PREDICTIONS.value or _OVERWRITE.value
+    return f"between two views; the same command {'begins again' if again else 'continues from there'}"
 
 
 if __name__ == "__main__":

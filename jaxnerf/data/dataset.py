@@ -18,7 +18,19 @@ from jaxnerf.data.scene import BACKGROUNDS
 from jaxnerf.data.shared_views import found_by_split
 from jaxnerf.data.view_selection import select_views, selection
 from jaxnerf.fields import still_life
-from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, infer, is_auto, option, replaced, values_of
+from jaxnerf.options import (
+    AUTO,
+    Changes,
+    Options,
+    at_least,
+    between,
+    declarations,
+    infer,
+    is_auto,
+    option,
+    replaced,
+    values_of,
+)
 from jaxnerf.registry import READERS, needs_folder
 
 WORLDS = {
@@ -50,12 +62,12 @@ class DataOptions(Options):
     factor: int = option(
         1,
         "images are shrunk by this whole number (area average); auto: the one whose images are nearest to `width`",
-        range=at_least(1),
+        range=between(1, 4096),
         auto=True,
         protocol=True,
     )
-    width: int = option(800, "see `factor`", unit="px", range=at_least(1))
-    size: int = option(100, "side of the embedded scene's images", unit="px", range=at_least(1))
+    width: int = option(800, "see `factor`", unit="px", range=between(1, 65_536))
+    size: int = option(100, "side of the embedded scene's images", unit="px", range=between(1, 1024))
     finish: str = option(
         "usual",
         "surfaces of the embedded scene; `matt` ones do not depend on the view direction",
@@ -92,7 +104,11 @@ class DataOptions(Options):
         protocol=True,
     )
     pixel_offset: float = option(
-        0.5, "rays pass through pixel centres (0.5) or pixel corners (0)", unit="px", protocol=True
+        0.5,
+        "rays pass through pixel centres (0.5) or pixel corners (0)",
+        unit="px",
+        range=between(-1, 1),
+        protocol=True,
     )
     world: str = option(
         AUTO,

@@ -4,7 +4,6 @@ import json
 import math
 import os
 import pathlib
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -137,13 +136,13 @@ def merge(
         file.write_text(json.dumps(results, indent=2) + "\n")
     old = target.with_name(target.name + ".old")
     if overwrite and target.exists():  # a process killed between the two moves loses neither result
-        shutil.rmtree(old, ignore_errors=True)  # left by such a process
+        atomic_files.remove(old)  # left by such a process
         os.replace(target, old)
     os.replace(partial, target)
     for name in _WORKING:
-        shutil.rmtree(target / name, ignore_errors=True)
+        atomic_files.remove(target / name)
     atomic_files.sweep(target)
-    shutil.rmtree(old, ignore_errors=True)
+    atomic_files.remove(old)
     return results
 
 

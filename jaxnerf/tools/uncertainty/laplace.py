@@ -135,10 +135,20 @@ def _stored(path, key, say=lambda line: None):
         try:
             with np.load(path, allow_pickle=False) as stored:
                 if str(stored["key"]) == key:
-                    return Deformation(jnp.asarray(stored["std"]), jnp.asarray(stored["noise"]))
+                    return _checked(stored["std"], stored["noise"])
         except Exception:  # a damaged zip file raises almost any exception
             say(f"{path}: is damaged, and computed again")
     return None
+
+
+def _checked(std, noise):
+    """Returns the posterior of two arrays of a file; ValueError if they cannot be one."""
+    shapes = std.shape == (RESOLUTION + 1,) * 3 + (3,) and noise.shape == ()
+    if not (shapes and std.dtype.kind == noise.dtype.kind == "f"):
+        raise ValueError("other arrays")
+    if not (std.min() >= 0 and std.max() <= 1 and 0 < noise < np.inf):  # not NaN either
+        raise ValueError("other numbers")
+    return Deformation(jnp.asarray(std, jnp.float32), jnp.asarray(noise, jnp.float32))
 
 
 def fit_deformation(source: UncertaintySource) -> Deformation:
