@@ -106,6 +106,8 @@ class Checkpoints:
             metadata = atomic_files.read_json(self._folder / str(step) / "_CHECKPOINT_METADATA", "it was changed")
             yield metadata["custom_metadata"]
         except Exception as error:  # orbax raises many kinds
+            if isinstance(_cause(error), KeyboardInterrupt):
+                raise _cause(error) from None
             raise ValueError(
                 f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
                 "remove it to continue from the previous checkpoint"
@@ -215,7 +217,13 @@ def _silence_orbax():
     sys.unraisablehook = hook
 
 
-def _reason(error):
-    while error.__cause__ is not None:  # the first error of orbax's chain says what went wrong
+def _cause(error):
+    """Returns the first error of orbax's chain, which says what went wrong."""
+    while error.__cause__ is not None:
         error = error.__cause__
+    return error
+
+
+def _reason(error):
+    error = _cause(error)
     return (str(error).splitlines() or [type(error).__name__])[0][:400]

@@ -128,6 +128,23 @@ def test_if_no_checkpoint_can_be_read_none_is_renamed(folder):
 
 
 @pytest.mark.extra
+def test_a_signal_while_a_checkpoint_is_read_does_not_rename_it(folder, monkeypatch):
+    """orbax reads in a loop of its own and raises an error of its own."""
+
+    class Interrupted:
+        def reload(self):
+            """Does nothing."""
+
+        def load(self, *_):
+            """Raises what orbax does."""
+            raise RuntimeError("cannot load") from KeyboardInterrupt(signal.SIGTERM)
+
+    monkeypatch.setattr(Checkpoints, "_open", lambda self: Interrupted())
+    with pytest.raises(KeyboardInterrupt) as raised:
+        load_newest(folder, keep=3)
+    assert raised.value.args == (signal.SIGTERM,) and (folder / "checkpoints" / "20").is_dir()
+
+
 def test_run_resumes_with_another_number_of_devices(folder, trained, monkeypatch):
     """It was trained on four; only the order in which gradients are summed differs."""
     shutil.rmtree(folder / "checkpoints" / "20")
