@@ -33,11 +33,7 @@ _RUN = run_flags.define("scored", "uncertainty/NNN.tiff and compares it with the
 _SPLIT = flags.DEFINE_string("split", None, "The split of the dataset. It overrides config.eval.split.")
 _WATCH = flags.DEFINE_bool("watch", False, "Whether to score each new checkpoint until training ends.")
 _POLL = flags.DEFINE_float(
-    "poll_seconds",
-    10.0,
-    "The time between two searches for a checkpoint with --watch.",
-    lower_bound=0.01,
-    upper_bound=86_400.0,
+    "poll_seconds", 10.0, "The time between two searches for a checkpoint with --watch.", lower_bound=0.01
 )
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an earlier result.")
 _ERROR_BUDGET = flags.DEFINE_float(
@@ -141,8 +137,8 @@ def run():
 
 
 def _stopped():
-    again = _PREDICTIONS.value or _OVERWRITE.value
-    return f"between two views; the same command {'begins again' if again else 'continues from there'}"
+    continues = not (_PREDICTIONS.value or _OVERWRITE.value)
+    return f"between two views; the same command {'continues from there' if continues else 'begins again'}"
 
 
 if __name__ == "__main__":

@@ -52,11 +52,7 @@ _MAX_RAYS = flags.DEFINE_integer(
     upper_bound=4096,
 )
 _FPS = flags.DEFINE_float(
-    "fps",
-    None,
-    "The frames per second. When it is not given, the path's file states them, or 24.",
-    lower_bound=0.1,
-    upper_bound=1000.0,
+    "fps", None, "Frames per second. When it is not given, those of the path, or 24.", lower_bound=0.1, upper_bound=1e3
 )
 _VIDEO = flags.DEFINE_string(
     "video", "auto", "The format of the video: mp4, gif, none, or auto: mp4 if imageio finds ffmpeg, otherwise gif."

@@ -18,19 +18,7 @@ from jaxnerf.data.scene import BACKGROUNDS
 from jaxnerf.data.shared_views import found_by_split
 from jaxnerf.data.view_selection import select_views, selection
 from jaxnerf.fields import still_life
-from jaxnerf.options import (
-    AUTO,
-    Changes,
-    Options,
-    at_least,
-    between,
-    declarations,
-    infer,
-    is_auto,
-    option,
-    replaced,
-    values_of,
-)
+from jaxnerf.options import AUTO, Changes, Options, between, declarations, infer, is_auto, option, replaced, values_of
 from jaxnerf.registry import READERS, needs_folder
 
 WORLDS = {
@@ -78,10 +66,10 @@ class DataOptions(Options):
         "Where rays start, along the camera's axis. 0: each image has its own, from the dataset. auto: one small "
         "distance where space is contracted and its empty cells are skipped, otherwise 0.",
         unit="of the dataset's files",
-        range=at_least(0),
+        range=between(0, 10**9),
         auto=True,
     )
-    far: float = option(0.0, "where rays end, as `near`", unit="of the dataset's files", range=at_least(0))
+    far: float = option(0.0, "where rays end, as `near`", unit="of the dataset's files", range=between(0, 10**9))
     background: str = option(
         "white",
         "The colour behind alpha and behind the scene. `none`: alpha is dropped, and `scene.background` is behind the "
@@ -91,10 +79,10 @@ class DataOptions(Options):
         protocol=True,
     )
     hold_out: int = option(
-        0, "every n-th training view belongs to the split `held_out` instead; 0: none", range=at_least(0), protocol=True
+        0, "every n-th training view belongs to the split `held_out`; 0: none", range=between(0, 10**6), protocol=True
     )
     num_views: int = option(
-        0, "number of training views to use, spread evenly over all of them; 0: all", range=at_least(0), protocol=True
+        0, "number of training views to use, spread evenly; 0: all", range=between(0, 10**6), protocol=True
     )
     view_indices: tuple[int, ...] = option(
         (),
@@ -104,11 +92,7 @@ class DataOptions(Options):
         protocol=True,
     )
     pixel_offset: float = option(
-        0.5,
-        "rays pass through pixel centres (0.5) or pixel corners (0)",
-        unit="px",
-        range=between(-1, 1),
-        protocol=True,
+        0.5, "rays pass through pixel centres (0.5) or corners (0)", unit="px", range=between(-1, 1), protocol=True
     )
     world: str = option(
         AUTO,

@@ -7,7 +7,6 @@ import difflib
 import gc
 import importlib
 import logging as std_logging
-import math
 import os
 import pathlib
 import re
@@ -179,7 +178,7 @@ def define_fraction(name: str, help: str) -> flags.FlagHolder:
 
 def define_step(help: str) -> flags.FlagHolder:
     """Defines --step, that of a checkpoint; None when it is not given."""
-    return flags.DEFINE_integer("step", None, help, lower_bound=0, upper_bound=MAX_INT)
+    return flags.DEFINE_integer("step", None, help, lower_bound=0)
 
 
 def define_option(name: str, declared: Option, kind: Any, help: str) -> flags.FlagHolder:
@@ -280,8 +279,9 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
     try:
         rest = flags.FLAGS(argv)
         for flag in (flags.FLAGS[name] for name in flags.FLAGS):
-            if isinstance(flag.value, float) and not math.isfinite(flag.value):  # NaN is in every range of absl
-                _leave(2, f"--{flag.name} is {flag.value}, expected a finite number; correct it")
+            number = isinstance(flag.value, int | float) and "." not in flag.name  # options have their own ranges
+            if number and not abs(flag.value) <= MAX_INT:  # nor NaN, which is in every range of absl
+                _leave(2, f"--{flag.name} is {str(flag.value):.40}, expected at most {MAX_INT:,}; correct it")
         verbosity = flags.FLAGS["verbosity"]
         if not verbosity.present or verbosity.value in (0, 1):
             level = std_logging.INFO if verbosity.present else std_logging.WARNING

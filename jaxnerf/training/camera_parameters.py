@@ -19,7 +19,7 @@ from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Batch, Camera, Rays, Rendering
 from jaxnerf.core.views import Views
 from jaxnerf.models.base import Model
-from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, between, infer, option
+from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
 
 CAMERAS = "cameras"  # the entry of the parameters; all other entries are networks
 
@@ -42,13 +42,7 @@ class CameraOptions(Options):
         range=POSITIVE,
     )
     refine_start_step: int = option(300, "training step before which cameras do not move", range=at_least(0))
-    num_images: int = option(
-        "auto",
-        "images of the split `train`; do not set it",
-        range=between(0, 10**7),
-        auto=True,
-        changes=Changes.NOTHING,
-    )
+    num_images: int = option("auto", "images of the split `train`; do not set it", auto=True, changes=Changes.NOTHING)
 
     def resolve(self, facts: Facts, device: Device) -> tuple["CameraOptions", list[str]]:
         """Infers the number of images."""

@@ -37,7 +37,7 @@ VIEWS = ("--num_views=2", "--size=16")
 PROGRAMS = {
     "eval": ("eval", (), "eval/20"),
     "render": ("render", ("--frames=3", "--width=16", "--video=gif"), "renders/turntable-20"),
-    "mesh": ("export", ("--kind=mesh", "--format=glb", "--resolution=24", "--texture=64", *VIEWS), "exports/mesh-20"),
+    "mesh": ("export", ("--kind=mesh", "--format=glb", "--resolution=24", "--texture=512", *VIEWS), "exports/mesh-20"),
     "points": ("export", ("--kind=points", "--num_points=500", *VIEWS), "exports/points-20"),
     "depth": ("export", ("--kind=depth", *VIEWS), "exports/depth-20"),
     "splats": ("export", ("--kind=splats", "--num_points=500", "--fit_steps=2", *VIEWS), "exports/splats-20"),
