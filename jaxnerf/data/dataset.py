@@ -358,6 +358,14 @@ def _in_world(data, capture):
     return capture, np.eye(4)
 
 
+def is_there(data: DataOptions) -> bool:
+    """Returns whether the dataset has a folder that exists, or needs none."""
+    try:
+        return not needs_folder(data.format) or dataset_folder(data.dir).is_dir()
+    except ValueError:
+        return False
+
+
 def dataset_folder(name: str) -> pathlib.Path:
     """Returns the folder of that path, or else of that name below $JAXNERF_SCENES.
 

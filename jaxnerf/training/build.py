@@ -40,7 +40,8 @@ class RenderParts(NamedTuple):
         config: resolved.
         model: the config's field and sampler; its parameters have those of the training images, too.
         cameras: the parameters of the training images; None where the config has none.
-        load_split: split -> Views.
+        load_split: (split, images=True) -> Views. With images=False they have no pixels, and of a restored run those
+            of the split "train" come from its workdir; None: they have pixels if the dataset is there.
         view_rays: (Views, index, pixels) -> Rays.
         world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
         background: [3] the colour behind the scene; None: black.
@@ -387,8 +388,9 @@ def _prepare(config, model, extras, views):
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)
 
 
-def _load_views(config, needs, split, **options):
+def _load_views(config, needs, split, *, images=True, **options):
     """Returns the Views of a split; a scene that asks for the image_index gets 0 for views that are not trained on."""
+    del images  # they are read
     views = dataset.load_split(config.data, split, fingerprint=config.fingerprint, **options)
     if split == "train" or "image_index" not in needs:
         return views
