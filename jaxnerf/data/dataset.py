@@ -11,7 +11,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.geometry.poses import AXES, axis_of
-from jaxnerf.data.images import downscaled_copies, image_files, load_images
+from jaxnerf.data.images import downscaled_copies, image_files, load_images, pixel_rays
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 from jaxnerf.data.scene import BACKGROUNDS
@@ -166,6 +166,7 @@ def _resolve(data):
     folder = dataset_folder(data.dir)
     if pathlib.Path(data.dir).is_dir():  # a name below $JAXNERF_SCENES stays a name
         data = replaced(data, dir=str(folder.absolute()))
+    read = data.format
     if is_auto(data.format):
         found = base.detect_formats(folder)
         others = f", of {', '.join(found)}: --format selects another" if len(found) > 1 else ""
@@ -173,7 +174,7 @@ def _resolve(data):
         data = replaced(data, format=found[0])
     # Reading the cameras takes a while, so they are only read to infer something from them.
     if any(map(is_auto, (data.factor, data.world, data.background))):
-        capture = base.read_capture(folder, data.format)
+        capture = base.read_capture(folder, read)
         data, more = infer(data, **_of_capture(data, capture))
         lines += [*_facts_of(data, capture), *more]
     if data.up:
@@ -187,6 +188,8 @@ def _facts_of(data, capture):
     """Returns lines about what the reader has chosen and skipped."""
     lines = [f"read          {choice}" for choice in capture.choices]
     lines += [f"note          {note}" for note in capture.notes]
+    if rays := pixel_rays.rays_line([downscaled_copies.with_size(frame).camera for frame in capture.frames]):
+        lines.append(f"rays          {rays}")
     masks = [frame.mask for frame in capture.frames if frame.mask is not None]
     if masks:
         where = f"{len(masks)} of {len(capture.frames)} images have one, such as {masks[0]}"
@@ -353,6 +356,14 @@ def _in_world(data, capture):
     if data.world == "around":
         return world.center(capture, up=axis_of(data.up) if data.up else None)
     return capture, np.eye(4)
+
+
+def is_there(data: DataOptions) -> bool:
+    """Returns whether the dataset has a folder that exists, or needs none."""
+    try:
+        return not needs_folder(data.format) or dataset_folder(data.dir).is_dir()
+    except ValueError:
+        return False
 
 
 def dataset_folder(name: str) -> pathlib.Path:

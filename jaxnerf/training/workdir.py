@@ -40,7 +40,7 @@ def save_config(workdir: str | os.PathLike, config: RunConfig) -> None:
     elif (path.parent / "checkpoints").exists():
         raise ValueError(f"{workdir}: has checkpoints but no config.json; give another --workdir")
     path.parent.mkdir(parents=True, exist_ok=True)
-    for name in ("config.json", "metrics.jsonl"):
+    for name in ("config.json", "metrics.jsonl", "cameras.npz"):
         for partial in path.parent.glob(f"{name}.*.tmp"):
             if not partial.is_dir():
                 partial.unlink(missing_ok=True)

@@ -24,6 +24,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxnerf.core import contraction
 from jaxnerf.core.types import Rays, Vector
+from jaxnerf.core.views import check_pixels
 from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
@@ -152,6 +153,7 @@ def _checked(std, noise):
 
 def fit_deformation(source: UncertaintySource) -> Deformation:
     """Computes the posterior in one pass over NUM_BATCHES batches of random training rays."""
+    check_pixels(source.views, "the uncertainty 'laplace', which is computed once for each checkpoint,")
     experiment = source.run.experiment
     model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.scene.contracted))
     params, grid = source.variables

@@ -57,7 +57,7 @@ def view_run(
     run = cleaned(restore_with_grid(workdir, data_dir=data_dir), workdir, max_uncertainty)
     first = newest_step(run, workdir, step)
     variables = run.variables(first)
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    views = refined_views(run, run.experiment.load_split("train", images=None), "train", variables[0])
     viewer = Viewer(workdir, run, views, data_dir=data_dir)
 
     def show(step, variables):

@@ -229,7 +229,7 @@ def stub_run(grid, hold_out=0):
     config = SimpleNamespace(data=data)
     views = Views(**dict.fromkeys(field.name for field in dataclasses.fields(Views)))
     model = SimpleNamespace(needs=())
-    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split: views, model=model)
+    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split, **options: views, model=model)
     fields = dict.fromkeys(TrainedRun._fields) | {"experiment": experiment, "identity": "fixed", "settings": {}}
     return TrainedRun(**fields | {"steps": lambda: [5], "variables": lambda step: (np.ones(3), grid)})
 
