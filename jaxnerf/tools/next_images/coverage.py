@@ -11,12 +11,12 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxnerf.core.occupancy.grid import cells_along
 from jaxnerf.core.occupancy.ray_marching import march_rays
-from jaxnerf.core.occupancy.seen_directions import familiarity_scene, nearest_direction
 from jaxnerf.core.types import Rays
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.models.occupancy import render_with_grid
+from jaxnerf.tools.next_images.seen_directions import familiarity_scene, nearest_direction
 
 _CHUNK = 2**13  # rays whose cells are listed at once
 _SIDE = 40  # rays along each side of an image that is scored

@@ -11,13 +11,13 @@ from jaxnerf.core import contraction
 from jaxnerf.core.occupancy.grid import OccupancyGrid
 from jaxnerf.core.types import Camera
 from jaxnerf.core.views import Views
-from jaxnerf.data.geometry.candidate_poses import Candidates, azimuth_to_right, candidate_poses, farthest_poses
 from jaxnerf.data.geometry.poses import gaze_center, up_of
 from jaxnerf.data.geometry.world import unit_of
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.paths.camera_path import CameraPath
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import stages
+from jaxnerf.tools.next_images.candidate_poses import Candidates, azimuth_to_right, candidate_poses, farthest_poses
 from jaxnerf.tools.next_images.coverage import ViewCoverage, choose_views
 
 NAME = "next_images"  # of the camera path

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import ball_runs
-from jaxnerf.data.geometry import candidate_poses
 from jaxnerf.evaluation.paths.camera_path import make_path
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.tools.next_images import propose
+from jaxnerf.tools.next_images import candidate_poses, propose
 from jaxnerf.tools.next_images.coverage import ViewCoverage, choose_views
 from jaxnerf.tools.next_images.propose import propose_images, save_path
 from runs import ROOT, run_forked

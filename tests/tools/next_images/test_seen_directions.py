@@ -7,14 +7,14 @@ import pytest
 
 from helpers import compiled, full_grid, random_rays
 from jaxnerf import render_packed, render_samples
-from jaxnerf.core.occupancy.seen_directions import (
+from jaxnerf.core.poses import spread_directions
+from jaxnerf.core.sampling import samples_from_edges, uniform_edges
+from jaxnerf.tools.next_images.seen_directions import (
     NUM_DIRECTIONS,
     familiarity,
     familiarity_scene,
     nearest_direction,
 )
-from jaxnerf.core.poses import spread_directions
-from jaxnerf.core.sampling import samples_from_edges, uniform_edges
 
 DIRECTIONS = np.array(spread_directions(NUM_DIRECTIONS))
 familiarity_of = compiled(familiarity)

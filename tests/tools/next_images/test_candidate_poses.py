@@ -5,7 +5,7 @@ import pytest
 
 import captures
 from jaxnerf.core.poses import look_at
-from jaxnerf.data.geometry.candidate_poses import azimuth_to_right, candidate_poses, farthest_poses
+from jaxnerf.tools.next_images.candidate_poses import azimuth_to_right, candidate_poses, farthest_poses
 
 UP = np.array([0.0, 0.0, 1.0])
 
