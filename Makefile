@@ -41,6 +41,8 @@ test-slow: $(BIN)/.dev
 test-extra: $(BIN)/.dev
 	$(BIN)/pip install --quiet --editable '.[notebooks]'
 	$(PYTEST) -m "not slow"
+	rm -rf runs/extra/oldest_versions
+	$(BIN)/python tests/slow/oldest_versions.py runs/extra/oldest_versions
 	$(BIN)/python tests/slow/notebooks.py
 	$(BIN)/python tests/slow/minimal_nerf.py
 	PYTHONPATH=.:tests $(BIN)/python tests/slow/commands.py
@@ -55,6 +57,7 @@ test-extra: $(BIN)/.dev
 
 # zensical prints what griffe finds in docstrings, but does not fail.
 docs: $(BIN)/.dev
+	@$(BIN)/python examples/notebooks/pages.py
 	@mkdir -p build
 	@$(BIN)/zensical build --clean --strict >build/site.log 2>&1 && ! grep -q griffe: build/site.log || (cat build/site.log; exit 1)
 	@tail -1 build/site.log

@@ -5,10 +5,12 @@ Importing this package needs jax and jaxtyping only. The functions that read dat
 are first used.
 """
 
+import jaxnerf.runtime.quiet_start as _quiet_start  # noqa: F401
+
+# isort: split
 import importlib as _importlib
 import typing as _typing
 
-import jaxnerf.runtime.quiet_start as _quiet_start  # noqa: F401
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, pixel_radius, project, rays_from_pixels, undistort
 from jaxnerf.core.encoding import (
     frustum_variance,

@@ -18,7 +18,9 @@ pytest_plugins = ["run_fixtures"]
 
 DOCS = ROOT / "docs"
 PUBLIC = r"^::: jaxnerf\.(\w+)$"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+# `make docs` writes these pages, see examples/notebooks/pages.py.
+OF_NOTEBOOKS = {DOCS / f"tutorials/notebooks/{each.stem}.md" for each in (ROOT / "examples/notebooks").glob("*.ipynb")}
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted({*DOCS.rglob("*.md")} - OF_NOTEBOOKS)]
 EXAMPLES = [
     pytest.param(found.group(1), id=f"{page.relative_to(ROOT)}:{page.read_text()[: found.start()].count(chr(10)) + 2}")
     for page in PAGES
@@ -32,7 +34,8 @@ EXAMPLES = [
 def test_links_and_included_files_exist(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
-        assert re.match(r"[a-z]+:", target) or (page.parent / target).exists(), target
+        path = page.parent / target
+        assert re.match(r"[a-z]+:", target) or path.exists() or path in OF_NOTEBOOKS, target
     for target, place in re.findall(r"\]\(([^)#:\s]*)#([^)\s]+)\)", text):
         headings = re.findall(r"^#+ (.*)$", (page.parent / target if target else page).read_text(), re.MULTILINE)
         assert place in {re.sub(r"[^\w -]", "", head).strip().lower().replace(" ", "-") for head in headings}, place
@@ -44,7 +47,7 @@ def test_links_and_included_files_exist(page):
 
 def test_every_page_is_in_the_navigation():
     listed = set(re.findall(r"\s(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
-    assert listed == {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
+    assert listed == {str(page.relative_to(DOCS)) for page in OF_NOTEBOOKS.union(DOCS.rglob("*.md"))}
 
 
 @pytest.mark.parametrize("page", sorted({*(DOCS / "results").glob("*.md")} - {DOCS / "results" / "index.md"}), ids=str)

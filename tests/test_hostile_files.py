@@ -5,6 +5,8 @@ import io
 import os
 import shutil
 import signal
+import subprocess
+import sys
 
 import pytest
 from PIL import EpsImagePlugin, Image
@@ -21,7 +23,7 @@ from jaxnerf.tools.structure_from_motion.estimate import estimate_cameras
 from jaxnerf.tools.structure_from_motion.images import is_rotated_jpeg
 from jaxnerf.training.metric_log import MetricLog, read_rows
 from jaxnerf.training.workdir import load_config, workdir_lock
-from runs import ROOT, evaluate, render_path
+from runs import ROOT, evaluate, module_of, render_path, run_forked
 from test_scenes.synthetic_capture import GROUND_TRUTH, read_ground_truth
 
 pytest_plugins = ["run_fixtures"]
@@ -119,6 +121,65 @@ def test_cameras_are_written_through_no_link(tmp_path, name):
     with pytest.raises(ValueError, match=f"out/{name}: is a symbolic link"):
         estimate_cameras(tmp_path / "photographs", tmp_path / "out", overwrite=True)
     assert not any((tmp_path / "precious").iterdir())
+
+
+_MODULES = ("multiprocessing", "numpy", "jax", "json", "pickle", "matplotlib", "cv2", "sitecustomize", "PIL", "scipy")
+
+
+def plant(folder):
+    """Puts modules and settings into a folder that a program must not use: they leave the file `used`."""
+    for name in _MODULES:
+        (folder / f"{name}.py").write_text(
+            f"open({str(folder / 'used')!r}, 'a').write('{name} ')\nraise SystemExit(9)\n"
+        )
+    for name in ("smoke", "default"):  # configs of this package, whose names win
+        shutil.copy(folder / "json.py", folder / name)
+    (folder / "matplotlibrc").write_text("text.usetex: True\nsavefig.dpi: nonsense\n")
+    return folder
+
+
+def test_python_that_a_program_starts_imports_nothing_of_the_working_folder(tmp_path):
+    program = tmp_path / "program" / "program.py"
+    program.parent.mkdir()
+    call = "subprocess.run([sys.executable, '-c', 'import json, multiprocessing, numpy'], check=True)"
+    program.write_text(
+        f"import subprocess, sys\nfrom jaxnerf.runtime import cli\ncli.run(lambda argv: {call} and print('done'))\n"
+    )
+    code, out, err = run_forked(program, folder=plant(tmp_path))
+    assert (code, out) == (0, "done\n"), err
+    assert not (tmp_path / "used").exists()
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("by_module", [False, True])
+def test_no_program_imports_from_the_working_folder(trained, tmp_path, by_module):
+    run = shutil.copytree(trained, tmp_path / "run")
+    working = tmp_path / "working"
+    working.mkdir()
+    plant(working)
+    for index in range(3):
+        Image.new("RGB", (8, 8)).save(working / f"{index}.png")
+    export = ["--num_points=9", "--num_views=1", "--size=16"]
+    calls = {
+        "train": ["--config=smoke", f"--workdir={run}", "--config.train.save_every=5"],
+        "eval": [f"--workdir={run}"],
+        "render": [f"--workdir={run}", "--frames=1", "--width=8", "--video=none"],
+        "report": [run, "--plot=a.png"],
+        "check": [f"--workdir={run}"],
+        "export": [f"--workdir={run}", "--kind=points", *export],
+        "cameras": ["--images=.", f"--out={tmp_path / 'out'}"],
+        "convert": ["--config=smoke", "--weights=none", f"--workdir={tmp_path / 'new'}"],
+        "view": ["--workdir=none"],
+    }
+    for program, flags in calls.items():
+        module = module_of(program)
+        what = ["-m", module] if by_module else ["-P", "-c", f"import {module}; {module}.run()"]
+        # As an installed program, whose folder is not the working folder; a package that is not installed needs a path.
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, *what, *map(str, flags)]
+        done = subprocess.run(command, cwd=working, capture_output=True, text=True, env=environment)
+        assert not (working / "used").exists(), (program, (working / "used").read_text())
+        assert done.returncode in (0, 1) and "Traceback" not in done.stderr, (program, done.stderr)
 
 
 def test_no_image_starts_ghostscript(tmp_path, monkeypatch):

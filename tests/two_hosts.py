@@ -15,6 +15,7 @@ from jaxnerf.runtime import processes
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import loop
 from jaxnerf.training.checkpoint import Checkpoints
+from jaxnerf.training.state import rendered_shapes
 from jaxnerf.training.step import TrainData
 from runs import smoke_experiment
 from toys import toy_draw, toy_model, toy_rendering
@@ -74,6 +75,15 @@ def train(folder, views):
         Checkpoints.save = save
 
 
+def rendered(folder):
+    """Returns what images of the last checkpoint are rendered with; each process that scores reads it by itself."""
+    experiment = toy_experiment()
+    averaged = experiment.config.train.averaging_power > 0
+    return Checkpoints(folder).load_rendered(STEPS, rendered_shapes(experiment.model), averaged=averaged)
+
+
 if __name__ == "__main__":
     with processes.cluster():
-        train(pathlib.Path(sys.argv[1]), toy_experiment().load_split("train"))
+        target = pathlib.Path(sys.argv[1])
+        train(target, toy_experiment().load_split("train"))
+        print("rendered", fingerprint(jax.tree.map(np.asarray, rendered(target))), file=sys.stderr)

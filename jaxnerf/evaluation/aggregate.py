@@ -18,6 +18,7 @@ from jaxnerf.data import dataset
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images, protocol
 from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.options import short_repr
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.training import metric_log
 
@@ -83,9 +84,22 @@ def read(target: pathlib.Path, provenance: Mapping[str, Any], remedy: str) -> di
 def read_results(target: pathlib.Path, remedy: str) -> dict[str, Any]:
     """Reads the results.json in a folder, of whatever provenance; raises ValueError if it is damaged."""
     results = atomic_files.read_json(target / "results.json", remedy)
-    if not isinstance(results, dict) or not all(type(results.get(key)) in (int, float) for key in (*_MEANS, "views")):
-        raise ValueError(f"{target / 'results.json'}: lacks metrics, expected the result of an evaluation; {remedy}")
+    found = {"lpips": 0.0, "seconds_per_frame": 0.0, **results} if isinstance(results, dict) else {}
+    # The mean PSNR of images that are exactly equal is infinite.
+    wrong = [key for key in (*_MEANS, "lpips", "seconds_per_frame") if type(found.get(key)) not in (int, float)]
+    wrong += ["views"] if type(found.get("views")) is not int or found["views"] < 1 else []
+    wrong += [key for key in ("conventions", "uncertainty") if not isinstance(found.get(key, {}), dict)]
+    if wrong:
+        raise ValueError(
+            f"{target / 'results.json'}: lacks metrics, as {wrong[0]} is {short_repr(found.get(wrong[0]))}, expected "
+            f"the result of an evaluation; {remedy}"
+        )
     return results
+
+
+def is_finite(value: Any) -> bool:
+    """Returns whether a value that a JSON file holds is a finite number of at least 0."""
+    return type(value) in (int, float) and 0 <= value < math.inf
 
 
 def merge(

@@ -14,12 +14,12 @@ from jaxtyping import UInt8
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.views import Views
-from jaxnerf.evaluation import output_images
+from jaxnerf.evaluation import aggregate, output_images
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.evaluation.trained_run import TrainedRun
-from jaxnerf.runtime import atomic_files, memory, processes, stages
+from jaxnerf.runtime import memory, processes, stages
 from jaxnerf.training import metric_log
 from jaxnerf.training.optimizer import image_params
 from jaxnerf.training.state import TrainState
@@ -124,9 +124,9 @@ class Previews:
                 lines.append(f"scores        none: {error}")
         if results.exists():
             try:
-                found = atomic_files.read_json(results, "score it again with --overwrite")
+                found = aggregate.read_results(results.parent, "score it again with --overwrite")
                 scored = f"PSNR {found['psnr']:.2f} dB over {found['views']} views, in {results.parent}"
-            except (*_FAILURES, KeyError, TypeError) as error:
+            except _FAILURES as error:
                 scored = f"none: {error}"
             lines.append(f"evaluation    {scored}")
         elif held_out is None:

@@ -13,9 +13,11 @@ from typing import Any, NamedTuple
 from jaxnerf.data.geometry.path_poses import natural_key
 from jaxnerf.evaluation import aggregate
 from jaxnerf.runtime.atomic_files import partial_file
+from jaxnerf.runtime.printed_text import printable, spreadsheet_cell
 from jaxnerf.training import metric_log, workdir
 
-_MAX_COLUMNS = 6  # of options that differ, in the table of a terminal
+_MAX_COLUMNS, _MAX_WIDTH = 6, 60  # of options that differ, in the table of a terminal
+_MAX_DEPTH = 100  # of folders in folders
 _HEADS = ("run", "steps", "seconds", "PSNR", "SSIM", "scored", "training PSNR")
 
 
@@ -100,15 +102,16 @@ def read_runs(folders: Iterable[str | os.PathLike]) -> list[Run]:
     return [_read(folder, folder.name if counts[folder.name] == 1 else str(given)) for folder, given in found.items()]
 
 
-def _find(folder):
+def _find(folder, depth=0):
     """Returns the workdirs in a folder, or the folder itself if it is one; links are followed to workdirs only."""
     if (folder / "config.json").is_file():
         return [folder]
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"{folder}: lies more than {_MAX_DEPTH} folders deep; name the folder of the runs")
     inside = [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
     inside.sort(key=lambda child: natural_key(child.name))
-    return [
-        run for child in inside if not child.is_symlink() or (child / "config.json").is_file() for run in _find(child)
-    ]
+    inside = [child for child in inside if not child.is_symlink() or (child / "config.json").is_file()]
+    return [run for child in inside for run in _find(child, depth + 1)]
 
 
 def _read(folder, name):
@@ -122,11 +125,11 @@ def _read(folder, name):
 
 def _score(results, path, remedy):
     step, seconds, views = (results.get(name) for name in ("step", "training_seconds", "views"))
-    if type(step) is not int or not (seconds is None or type(seconds) in (int, float)):
+    if type(step) is not int or step < 0 or not (seconds is None or aggregate.is_finite(seconds)):
         raise ValueError(f"{path}: lacks step and training_seconds, expected the result of an evaluation; {remedy}")
     conventions = results.get("conventions")
     split = conventions.get("split") if isinstance(conventions, Mapping) else None
-    return Score(step, seconds, str(split or "?"), int(views), float(results["psnr"]), float(results["ssim"]))
+    return Score(step, seconds, str(split or "?"), views, float(results["psnr"]), float(results["ssim"]))
 
 
 def differing_options(runs: Sequence[Run]) -> list[str]:
@@ -139,8 +142,9 @@ def table(runs: Sequence[Run]) -> str:
     """Returns the runs as lines of text in columns."""
     differing = differing_options(runs)
     shown = differing[:_MAX_COLUMNS]
-    rows = [(*_HEADS, *shown)]
-    rows += [(*_cells(run), *(_text(run.options.get(name)) for name in shown)) for run in runs]
+    values = ([_text(run.options.get(name))[:_MAX_WIDTH] for name in shown] for run in runs)
+    rows = [(*_HEADS, *shown), *((*_cells(run), *row) for run, row in zip(runs, values, strict=True))]
+    rows = [[printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     if len(differing) > len(shown):
@@ -167,18 +171,19 @@ def to_csv(runs: Sequence[Run]) -> str:
     heads = ("run", "workdir", "steps", "seconds", "training_psnr")
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow((*heads, *(f"scored_{name}" for name in Score._fields), *differing))
+    rows = [(*heads, *(f"scored_{name}" for name in Score._fields), *differing)]
     for run in runs:
         score = run.scores[-1] if run.scores else (None,) * len(Score._fields)
         options = ("" if run.options.get(name) is None else _text(run.options[name]) for name in differing)
-        writer.writerow((run.name, run.folder, run.steps, run.seconds, run.training_psnr, *score, *options))
+        rows.append((run.name, str(run.folder), run.steps, run.seconds, run.training_psnr, *score, *options))
+    writer.writerows(map(spreadsheet_cell, row) for row in rows)
     return file.getvalue()
 
 
 def require_matplotlib() -> None:
     """Raises a ValueError that says how to install matplotlib, if it is missing."""
     try:
-        import matplotlib.figure  # noqa: F401
+        from jaxnerf.runtime import plotting  # noqa: F401
     except ImportError as error:
         raise ValueError(
             f"--plot draws with matplotlib, which is unavailable ({error}); install it with `pip install matplotlib`"
@@ -196,7 +201,7 @@ def save_plot(runs: Sequence[Run], path: str | os.PathLike) -> None:
         ValueError: if matplotlib is missing.
     """
     require_matplotlib()
-    from matplotlib.figure import Figure
+    from jaxnerf.runtime.plotting import Figure
 
     path = pathlib.Path(path)
     figure = Figure(figsize=(13, 5), dpi=100, layout="constrained")
@@ -206,7 +211,8 @@ def save_plot(runs: Sequence[Run], path: str | os.PathLike) -> None:
         curve = [point for point in curve if point[2] is not None and math.isfinite(point[2])]
         dots = [(score.seconds, score.step, score.psnr) for score in run.scores if score.seconds is not None]
         for column, axis in enumerate(axes):
-            style = {"color": f"C{index % 10}", "label": run.name}
+            name = printable(run.name)
+            style = {"color": f"C{index % 10}", "label": f" {name}" if name.startswith("_") else name}  # _ hides it
             axis.plot([point[column] for point in curve], [point[2] for point in curve], linewidth=0.9, **style)
             style["label"] = None
             axis.plot([point[column] for point in dots], [point[2] for point in dots], "o", **style)
@@ -214,7 +220,8 @@ def save_plot(runs: Sequence[Run], path: str | os.PathLike) -> None:
         axis.set(xlabel=unit)
         axis.grid(alpha=0.3)
     axes[0].set(ylabel="PSNR, dB")
-    axes[1].legend(fontsize="small")
+    for label in axes[1].legend(fontsize="small").get_texts():
+        label.set_parse_math(False)
     figure.suptitle("Lines: batches of training. Dots: scored views", fontsize="medium")
     with partial_file(path) as partial:
         figure.savefig(partial, format=path.suffix.lower().removeprefix("."))

@@ -6,6 +6,7 @@ and a device such as /dev/zero has no end.
 
 import contextlib
 import errno
+import itertools
 import json
 import os
 import pathlib
@@ -20,7 +21,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-_MAX_DEPTH = 100  # of JSON; functions that call themselves for each level must not fail on a stranger's file
+_MAX_DEPTH = 100  # of JSON and of folders; functions that call themselves for each level must not fail
 _NO_LINK, _NO_WAIT = getattr(os, "O_NOFOLLOW", 0), getattr(os, "O_NONBLOCK", 0)
 
 
@@ -91,6 +92,24 @@ def read_json(path: str | os.PathLike, remedy: str) -> Any:
         raise ValueError(f"{path}: malformed JSON ({error}); {remedy}") from None
 
 
+def files_below(folder: str | os.PathLike) -> Iterator[pathlib.Path]:
+    """Yields all files and folders below a folder; nothing if it is missing. Links to folders are not followed.
+
+    Raises:
+        ValueError: if folders are nested too deeply for the functions that remove or copy them.
+    """
+    places = [(os.fspath(folder), 0)]
+    while places:
+        place, depth = places.pop()
+        if depth > _MAX_DEPTH:
+            raise ValueError(f"{folder}: holds folders that are nested more than {_MAX_DEPTH} levels deep; remove them")
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError), os.scandir(place) as entries:
+            for entry in entries:
+                yield pathlib.Path(entry.path)
+                if entry.is_dir(follow_symlinks=False):
+                    places.append((entry.path, depth + 1))
+
+
 def check_tree(folder: str | os.PathLike, *, links: bool = False) -> None:
     """Checks that a folder, if it exists, is no symbolic link, and holds only folders and regular files.
 
@@ -101,8 +120,7 @@ def check_tree(folder: str | os.PathLike, *, links: bool = False) -> None:
     Raises:
         ValueError: names the first link, pipe or device.
     """
-    below = (os.path.join(place, name) for place, *names in os.walk(folder) for name in sum(names, []))
-    for path in below if links else (folder, *below):
+    for path in itertools.chain(() if links else (folder,), files_below(folder)):
         try:
             mode = os.lstat(path).st_mode
             accepted = stat.S_ISREG(os.stat(path).st_mode) if links and stat.S_ISLNK(mode) else stat.S_ISDIR(mode)
@@ -253,8 +271,8 @@ def one_at_a_time(path: str | os.PathLike, waiting: Callable[[], None]) -> Itera
 
 def sweep(folder: pathlib.Path, pattern: str = "*.tmp") -> None:
     """Removes the partial files of killed processes below a folder in which everything is finished; folders stay."""
-    for path in folder.rglob(pattern):
-        if not path.is_dir() or path.is_symlink():
+    for path in files_below(folder):
+        if path.match(pattern) and (not path.is_dir() or path.is_symlink()):
             path.unlink(missing_ok=True)
 
 

@@ -22,7 +22,7 @@ from ml_collections import config_flags
 
 from jaxnerf.options import Option, at_least, is_auto, is_tuple
 from jaxnerf.registry import READERS, needs_folder
-from jaxnerf.runtime import signals, stages
+from jaxnerf.runtime import failed_imports, signals, stages
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 
@@ -49,6 +49,8 @@ def run(
         stopped: completes the message "stopped ..." after a signal: what was saved, and how to continue.
     """
     signals.keep_streams()
+    sys.excepthook = failed_imports.show
+    os.environ["PYTHONSAFEPATH"] = "1"  # of Python's own children, none imports from the working folder
     _keep_memory()
     # Tracing a step creates hundreds of thousands of objects, few of them in cycles. Python's default of one
     # collection per 700 objects takes a good part of the tracing time.
@@ -201,15 +203,15 @@ def config_names() -> list[str]:
 def config_path(value: str) -> str:
     """Returns the path of the config that a value of --config selects, with the value's `:argument`.
 
-    An existing file wins over a config of the same name.
+    The name of a config wins over a file without a suffix: it is code, and the working folder may be a stranger's.
 
     Raises:
         ValueError: if there is neither a file nor a config of this name.
     """
     name, colon, argument = value.partition(":")
-    if os.path.isfile(name):
-        return value
     if name not in config_names():
+        if os.path.isfile(name):
+            return value
         near = difflib.get_close_matches(name, config_names(), n=1)
         meant = f"; did you mean {near[0]}?" if near else ""
         raise ValueError(
@@ -288,22 +290,21 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         meant = _options_meant(error.flagname)
         hint = f"--{error.flagname}: no such flag; did you mean {' or '.join(meant)}?"
         _leave(2, hint if meant else error)
-    except (AttributeError, KeyError) as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        if "ml_collections" in pathlib.Path(place.filename).parts:
+    except Exception as error:
+        if failed := failed_imports.reason(error):
+            _leave(1, failed)
+        if isinstance(error, (flags.Error, TypeError, ValueError, OSError, ImportError, SyntaxError)):
+            _leave(2, error)
+        *_, place = trace = traceback.extract_tb(error.__traceback__)
+        if "ml_collections" in pathlib.Path(place.filename).parts and isinstance(error, AttributeError | KeyError):
             where = "--config=help:options lists all fields, those of registered parts with --plugins=MODULE, too"
             _leave(2, f"the config has no such field: {_unquoted(error)}; {where}")
-        _leave(2, f"--config: {place.filename}, line {place.lineno}: {type(error).__name__}: {error}; correct the file")
-    except (
-        flags.Error,
-        TypeError,
-        ValueError,
-        OSError,
-        ImportError,
-        SyntaxError,
-        NameError,
-    ) as error:
-        _leave(2, error)
+        file = given_flag("config", argv).partition(":")[0]
+        places = [each for each in trace if file and os.path.abspath(each.filename) == os.path.abspath(file)]
+        if not places:
+            raise
+        place = f"{file}, line {places[-1].lineno}"
+        _leave(2, f"--config: {place}: {type(error).__name__}: {error}; correct the file")
 
 
 def _options_meant(name):
@@ -351,7 +352,8 @@ def _import_plugins(names: Sequence[str]) -> None:
             importlib.import_module(name)
         except Exception as error:  # a plugin is the user's code: report any failure in one line
             raise ValueError(
-                f"--plugins: cannot import {name!r} ({type(error).__name__}: {error}); "
+                failed_imports.reason(error)
+                or f"--plugins: cannot import {name!r} ({type(error).__name__}: {error}); "
                 "correct the module, or set PYTHONPATH to its folder"
             ) from error
 

@@ -4,12 +4,15 @@ SIGHUP says that the terminal has been closed. A program whose output nobody rea
 """
 
 import errno
+import io
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TextIO
+
+from jaxnerf.runtime.printed_text import printable
 
 _GONE = (errno.EPIPE, errno.EIO, errno.EBADF)  # what writing to a closed pipe, terminal or file raises
 _HANGUP = getattr(signal, "SIGHUP", signal.SIGTERM)  # Windows has no SIGHUP
@@ -62,7 +65,7 @@ class Interrupt:
 
 
 class _Output:
-    """A stream that discards what is written after its reader has gone.
+    """A stream of text that is made `printable`, and discarded after its reader has gone.
 
     The first write that fails stops the program as SIGHUP does, unless a signal is already stopping it: Ctrl-C also
     ends the other programs of a pipeline. Messages that a full disk cannot hold are discarded, too, but stop nothing.
@@ -73,6 +76,14 @@ class _Output:
 
     def write(self, text: str) -> int:
         """Writes a text."""
+        return self.write_as_is(printable(text, "\n\t"))
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Writes several texts."""
+        self.write("".join(lines))
+
+    def write_as_is(self, text: str) -> int:
+        """Writes a text of the program's own, with sequences that a terminal obeys."""
         return self._try(self._stream.write, text)
 
     def flush(self) -> None:
@@ -101,6 +112,9 @@ def keep_streams() -> None:
         if getattr(sys, name) is None:  # otherwise the next file that is opened would receive what libraries print
             _discard(number)
             setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # whatever the encoding, no character ends the program
+            stream.reconfigure(errors="backslashreplace")
     sys.stdout, sys.stderr = _Output(sys.stdout), _Output(sys.stderr, messages=True)
 
 

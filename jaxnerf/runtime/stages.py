@@ -118,5 +118,7 @@ class Progress:
 def _write(stream, line, *, stays=False):
     """Writes a line in place of the one before on a terminal; stays: whether the next one leaves it there."""
     terminal = stream.isatty()
-    stream.write(("\r\033[K" if terminal else "") + line + ("" if terminal and not stays else "\n"))
+    if terminal:
+        getattr(stream, "write_as_is", stream.write)("\r\033[K")
+    stream.write(line + ("" if terminal and not stays else "\n"))
     stream.flush()

@@ -87,7 +87,7 @@ class Checkpoints:
         part = {"step": step_shape, **({"opt_state": {"average": networks}} if averaged else {"params": networks})}
         part |= {"counters": {PROGRESS: params[PROGRESS]}} if PROGRESS in params else {}
         part |= {} if grid is None else {"grid": grid}
-        device, context = jax.sharding.SingleDeviceSharding(jax.devices()[0]), ocp.Context()
+        device, context = jax.sharding.SingleDeviceSharding(jax.local_devices()[0]), ocp.Context()
         context.pytree.loading.partial_load = True
         with self._reading(step) as saved, context:
             part = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), part)

@@ -10,6 +10,9 @@ import imageio.v3 as iio
 import pytest
 
 from jaxnerf.evaluation import run_report
+from jaxnerf.runtime import atomic_files
+from jaxnerf.runtime.printed_text import printable
+from jaxnerf.tools.viewer.live import score_of
 from jaxnerf.training import auto_config, workdir
 from runs import ROOT, run_forked, smoke_config
 
@@ -132,3 +135,65 @@ def test_a_plot_without_matplotlib_says_what_to_install(runs, tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, ROOT)))}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
     assert done.returncode == 1 and "pip install matplotlib" in done.stderr and not (tmp_path / "a.png").exists()
+
+
+def test_plots_ignore_the_matplotlibrc_of_the_working_folder(tmp_path):
+    pytest.importorskip("matplotlib")
+    write_run(tmp_path / "_run $x_{$")  # of a name that is no formula, and is listed though it begins with _
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nsavefig.dpi: nonsense\n")
+    code, out, err = run_forked("report", "_run $x_{$", "--plot=a.svg", folder=tmp_path)
+    assert (code, err) == (0, "") and "plot: a.svg" in out
+    assert (tmp_path / "a.svg").read_text().count("_run $x_{$") == 1
+
+
+def test_a_report_shows_text_of_strangers_and_obeys_none(tmp_path):
+    """Names of folders, of options and their values, those that are not UTF-8 too."""
+    for name, value in (
+        ("\x1b[2J\n=1+1", "\u202egnp\x07"),
+        ("=cmd|'C calc'!A0", "=1+1"),
+        (b"\xff".decode("utf-8", "surrogateescape"), "x" * 999),
+    ):
+        folder = write_run(tmp_path / "runs" / name)
+        config = json.loads((folder / "config.json").read_text())
+        config["data"] |= {"dir": value, "\x1b]0;title\x07": value}
+        (folder / "config.json").write_text(json.dumps(config))
+    files = tmp_path / "a.csv", tmp_path / "a.svg"
+    code, out, err = run_forked("report", tmp_path / "runs", f"--csv={files[0]}", f"--plot={files[1]}")
+    assert (code, err) == (0, "") and printable(out, keep="\n") == out
+    assert len(out.splitlines()) == 6 and all(len(line) < 400 for line in out.splitlines())
+    with files[0].open(newline="") as file:
+        rows = [*csv.reader(file)]
+    assert {row[0] for row in rows[1:]} == {"\\x1b[2J\\n=1+1", "'=cmd|'C calc'!A0", "\\udcff"}
+    assert not any(cell.startswith("=") or printable(cell) != cell for row in rows for cell in row)
+
+
+@pytest.mark.parametrize("key", ["views", "psnr", "ssim", "step", "training_seconds", "lpips", "conventions"])
+@pytest.mark.parametrize(
+    "value", ["Infinity", "-Infinity", "NaN", "1e400", '"8"', "-1", "true", "[]", "{}", "10000000000000000000000"]
+)
+def test_no_value_of_a_result_is_a_traceback(key, value, tmp_path):
+    folder = write_run(tmp_path / "run", scores=[(100, "test", 23.0)])
+    path = folder / "eval" / "100" / "results.json"
+    path.write_text(path.read_text()[:-1] + f', "{key}": {value}}}')  # of equal keys the last one counts
+    try:
+        text = run_report.table(run_report.read_runs([tmp_path]))
+        accepted = key in ("psnr", "ssim", "lpips") and value[0] not in '"t[{' or (key, value) == ("conventions", "{}")
+        assert accepted and ("23.00" in text) == (key != "psnr")
+    except ValueError as error:
+        assert "results.json: " in str(error) and str(error).endswith("score it again with --overwrite")
+    assert isinstance(score_of(folder, 100), str)
+
+
+def test_folders_that_are_nested_without_end_are_an_error(tmp_path):
+    place = os.open(tmp_path, os.O_RDONLY)
+    for _ in range(3000):
+        os.mkdir("d", dir_fd=place)
+        place, above = os.open("d", os.O_RDONLY, dir_fd=place), place
+        os.close(above)
+    code, _, err = run_forked("report", ".", folder=tmp_path)
+    assert (
+        code == 1 and err.startswith("error: d/d/d/") and err.count("\n") == 1 and "name the folder of the runs" in err
+    )
+    with pytest.raises(ValueError, match="folders that are nested more than 100 levels deep"):
+        list(atomic_files.files_below(tmp_path))
+    subprocess.run(["rm", "-r", tmp_path / "d"], check=True)  # pytest's own removal would fail

@@ -73,12 +73,14 @@ def test_a_config_name_becomes_a_path():
     assert cli.CONFIGS.resolve() == ROOT / "jaxnerf" / "configs"
 
 
-def test_an_existing_file_wins_over_a_config_name(tmp_path, monkeypatch):
+def test_a_config_name_wins_over_a_file_of_the_working_folder(tmp_path, monkeypatch):
+    """A config is code, and a stranger's folder may hold a file of that name."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "smoke").mkdir()  # a folder is no config file
-    assert cli.config_path("smoke") == str(cli.CONFIGS / "smoke.py")
-    (tmp_path / "lego_fast").write_text("")
-    assert cli.config_path("lego_fast:small") == "lego_fast:small"
+    for name in ("smoke", "mine"):
+        (tmp_path / name).write_text("")
+    assert cli.config_path("smoke:small") == f"{cli.CONFIGS / 'smoke.py'}:small"
+    assert cli.config_path("./smoke:small") == "./smoke:small"
+    assert cli.config_path("mine:small") == "mine:small"
 
 
 def test_a_wrong_config_name_lists_the_names():
@@ -220,6 +222,32 @@ def test_a_fault_in_a_config_file_is_not_an_unknown_field(tmp_path, fault):
     code, out, err = run_forked("train", f"--config={file}", f"--workdir={tmp_path}")
     assert code == 2 and not out
     assert err.startswith(f"error: --config: {file}, line 5: ") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "package, content, expected",
+    [
+        ("optax", "import jax\njax.config.update('jax_gone', 1)\n", "optax cannot be imported (AttributeError: Unrec"),
+        ("flax", "from jax.core import gone\n", "jax cannot be imported (ImportError: cannot import name 'gone'"),
+        ("optax", "import nowhere_to_be_found\n", "nowhere_to_be_found cannot be imported (ModuleNotFoundError: No m"),
+        ("jaxtyping", "1 / 0\n", "jaxtyping cannot be imported (ZeroDivisionError: division by zero)"),
+        ("config", "1 / 0\n", "--config: config.py, line 1: ZeroDivisionError: division by zero; correct the file"),
+        ("config", "import nowhere_to_be_found\n", "No module named 'nowhere_to_be_found'"),
+    ],
+)
+def test_a_package_that_cannot_be_imported_is_named(tmp_path, package, content, expected):
+    """The config is blamed for its own code only."""
+    (tmp_path / f"{package}.py").write_text(content)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / package), str(ROOT)])}
+    if package != "config":
+        (tmp_path / package).mkdir()
+        (tmp_path / f"{package}.py").rename(tmp_path / package / f"{package}.py")
+    config = "config.py" if package == "config" else "smoke"
+    command = [sys.executable, "-P", "-m", "jaxnerf.train", f"--config={config}", "--workdir=run"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode in (1, 2) and not done.stdout
+    assert done.stderr.startswith(f"error: {expected}") and done.stderr.count("\n") == 1
+    assert ("installed are jax " in done.stderr and "pip install -U" in done.stderr) == (package != "config")
 
 
 def test_help_lists_the_flags_of_the_program(tmp_path):

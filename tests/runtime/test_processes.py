@@ -11,6 +11,7 @@ import pytest
 import two_hosts
 from helpers import assert_same
 from jaxnerf.runtime import processes
+from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.state import create_state
@@ -74,6 +75,13 @@ def test_first_process_prints_and_all_have_the_same_state(together):
     states = [[line for line in text.splitlines() if line.startswith("state")] for text in (first, second)]
     assert len(states[0]) == 2 and states[0] == states[1]
     assert Checkpoints(folder).steps() == [3, 6]
+
+
+@pytest.mark.slow
+def test_each_process_reads_what_it_scores(together):
+    folder, said = together
+    here = f"rendered {fingerprint(jax.tree.map(np.asarray, two_hosts.rendered(folder)))}"
+    assert all(here in text.splitlines() for text in said), "\n".join(said)
 
 
 @pytest.mark.parametrize(

@@ -111,5 +111,9 @@ def test_messages_that_a_full_disk_cannot_hold_are_discarded():
 def test_importing_the_package_changes_a_handler_in_its_own_programs_only(monkeypatch, command, ours):
     signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(sys, "orig_argv", command)
+    monkeypatch.setattr(sys, "argv", command[1:] or [""])
+    monkeypatch.setattr(sys, "path", ["/a/strangers/folder", *sys.path])
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
     importlib.reload(quiet_start)
+    assert ("/a/strangers/folder" not in sys.path) == (ours and "-m" in command)
     assert (signal.getsignal(signal.SIGINT) is signal.SIG_DFL) == ours

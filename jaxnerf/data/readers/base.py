@@ -16,6 +16,7 @@ from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
 from jaxnerf.data.readers.colmap_model import check_complete
 from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.registry import READERS
+from jaxnerf.runtime.atomic_files import files_below
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
 _FAR_AWAY = 100.0  # distance of cameras from an origin over how far they are apart
@@ -249,7 +250,7 @@ def _find_masks(folder, images):
     for place in (folder / name for name in _MASK_FOLDERS):
         if not place.is_dir():
             continue
-        paths = (path for path in place.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        paths = (path for path in files_below(place) if path.suffix.lower() in IMAGE_SUFFIXES)
         paths = sorted(path for path in paths if not is_hidden(path.name))
         files = {fold(path.relative_to(place).with_suffix("").as_posix()): path for path in paths}
         masks = [files.get(fold(name)) or files.get(fold(name + suffix)) for name, suffix in images]

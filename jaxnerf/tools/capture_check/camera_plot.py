@@ -6,12 +6,12 @@ import pathlib
 import jax
 import numpy as np
 from jaxtyping import Float, Int
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from jaxnerf.core.types import Camera
 from jaxnerf.data.images.image_files import open_image
 from jaxnerf.runtime.atomic_files import partial_file
+from jaxnerf.runtime.plotting import Figure, LineCollection
+from jaxnerf.runtime.printed_text import printable
 from jaxnerf.tools.capture_check.report import Report
 
 CAMERA, FLAGGED, POINT, PATH, NEXT = "#2060c0", "#e02020", "#9a9a9a", "#20a040", "#d06000"
@@ -44,7 +44,7 @@ def plot_cameras(report: Report) -> Figure:
     text = f"{len(poses)} cameras (blue, open in viewing direction), {len(report.points)} points (grey)"
     text += f", {len(flagged)} cameras with findings (red)" if flagged else ""
     text += ", the path of jaxnerf-render (green)" if len(path) else ""
-    figure.suptitle(f"{capture.source}: {text}", fontsize="medium")
+    figure.suptitle(printable(f"{capture.source}: {text}"), fontsize="medium", parse_math=False)
     return figure
 
 
@@ -81,7 +81,7 @@ def plot_coverage(
             plot.annotate(str(number), eye @ view, color=NEXT, weight="bold", fontsize="large")
     if len(positions):
         figure.colorbar(cells, ax=[plot for plot, _ in plots], label="directions from which a cell was seen, of 64")
-    figure.suptitle(title, fontsize="medium")
+    figure.suptitle(printable(title), fontsize="medium", parse_math=False)
     return figure
 
 
@@ -135,7 +135,7 @@ def new_path(out: str | None, folder: pathlib.Path, *, is_run: bool, overwrite: 
 
 def save(figure: Figure, path: str | os.PathLike, folder: str | os.PathLike) -> None:
     """Writes a PNG that names the dataset's folder; see `is_plot_of`."""
-    metadata = {"Software": _SOFTWARE, "Source": str(pathlib.Path(folder).resolve())}
+    metadata = {"Software": _SOFTWARE, "Source": printable(pathlib.Path(folder).resolve())}
     with partial_file(path) as partial:
         figure.savefig(partial, format="png", metadata=metadata)
 
@@ -147,7 +147,7 @@ def is_plot_of(path: str | os.PathLike, folder: str | os.PathLike) -> bool:
             found = image.info.get("Software"), image.info.get("Source")
     except (OSError, ValueError, SyntaxError):
         return False
-    return found == (_SOFTWARE, str(pathlib.Path(folder).resolve()))
+    return found == (_SOFTWARE, printable(pathlib.Path(folder).resolve()))
 
 
 def _axes(mean: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -16,6 +16,7 @@ from jaxnerf.data.geometry.world import looks_forward, poses_of
 from jaxnerf.data.images.load_images import split_indices
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
+from jaxnerf.runtime.printed_text import printable
 from jaxnerf.tools.capture_check import cameras, depths, folds, tracks
 from jaxnerf.tools.capture_check import images as images_module
 from jaxnerf.tools.capture_check.findings import Finding, percent
@@ -58,13 +59,13 @@ class Report(NamedTuple):
     def text(self) -> str:
         """Returns the report as text: one line for each fact, one for each finding, and a summary."""
         width = max(len(name) for name, _ in self.facts)
-        lines = [f"{name:{width}}  {value}" for name, value in self.facts]
+        lines = [f"{name:{width}}  {printable(value)}" for name, value in self.facts]
         groups: dict[tuple[str, str], list[Finding]] = {}
         for finding in self.findings:  # of a fault that all images have, the first few are shown
             groups.setdefault((finding.severity, finding.kind), []).append(finding)
         for (_, kind), found in groups.items():
             shown = _SAME if kind in ("size", "file") else len(found)
-            lines += [finding.line() for finding in found[:shown]]
+            lines += [printable(finding.line()) for finding in found[:shown]]
             lines += [f"        and {len(found) - shown} more images like these"] if found[shown:] else []
         errors, warnings = self.num_errors, len(self.findings) - self.num_errors
         summary = f"{errors or 'no'} error{'s' * (errors != 1)}, {warnings or 'no'} warning{'s' * (warnings != 1)}"

@@ -13,6 +13,7 @@ from jaxnerf.data.readers import colmap
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.atomic_files import check_tree, partial_file, read_bytes, sweep, write_text
 from jaxnerf.runtime.fingerprint import file_sha256
+from jaxnerf.runtime.printed_text import printable
 from jaxnerf.tools.structure_from_motion import colmap_process
 from jaxnerf.tools.structure_from_motion import images as images_module
 from jaxnerf.tools.structure_from_motion.colmap_process import Model
@@ -91,7 +92,7 @@ class Report(NamedTuple):
         name = self.out.resolve().name
         return "\n".join(
             [
-                *(f"{name:14}  {value}" for name, value in lines),
+                *(f"{name:14}  {printable(value)}" for name, value in lines),
                 "next:",
                 f"  jaxnerf-check --data_dir={self.out}",
                 f"  jaxnerf-train --config=capture --data_dir={self.out} --workdir=runs/{name}",

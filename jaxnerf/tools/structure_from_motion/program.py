@@ -42,6 +42,7 @@ _OVERWRITE = flags.DEFINE_bool(
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
+    from jaxnerf.runtime.printed_text import printable
     from jaxnerf.tools.structure_from_motion.estimate import Settings, estimate_cameras
 
     report = estimate_cameras(
@@ -50,7 +51,7 @@ def main(argv):
         Settings(_CAMERA_MODEL.value, _SINGLE_CAMERA.value, _MATCHING.value, _MAX_SIZE.value),
         num_threads=_NUM_THREADS.value,
         overwrite=_OVERWRITE.value,
-        say=lambda line: print(line, flush=True),
+        say=lambda line: print(printable(line), flush=True),
     )
     print(report.text())
 

@@ -4,13 +4,12 @@ The page asks for newer parameters every few seconds and renders by itself, so t
 """
 
 import asyncio
-import contextlib
 import http
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from collections.abc import Callable
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs
 
 from jaxnerf.tools.exporters import web
 from jaxnerf.tools.exporters.base import ExportSource
@@ -21,7 +20,14 @@ FRAMES = "/frames/"  # the address of the page that shows frames of the server
 _PRECISION = "16 bits"  # of features: 8 would have to be scored, as the export does
 _COMPRESSION = 0  # of gzip: parameters are nearly noise, and compressing them takes longer than all else
 _ABSENT = 10.0  # s without a request after which a page counts as closed; it sends one every 2 s
-_TRANSFER_SECONDS = 120.0  # in which a scene has to reach the browser
+
+
+class Answer(NamedTuple):
+    """An HTTP response: its status, the type of its body, and the body."""
+
+    status: http.HTTPStatus
+    kind: str
+    body: bytes
 
 
 class ClientRendering:
@@ -48,17 +54,16 @@ class ClientRendering:
         """Whether a page has asked recently."""
         return time.monotonic() - self._requested < _ABSENT
 
-    async def answer(self, request: Any) -> tuple[http.HTTPStatus, str, bytes] | None:
-        """Returns the status, type and body for a request of a browser; None: it is for the page with frames."""
-        address = urlsplit(request.path)
-        if address.path == FRAMES:
-            request.path = "/"  # where viser has its page
-        elif address.path == "/" and not self.refused:
+    async def answer(self, path: str, query: str) -> Answer | None:
+        """Returns the answer to a request of a browser; None: there is no such page."""
+        if self.refused:
+            return None
+        if path == "/":
             self._note_request()
-            return http.HTTPStatus.OK, "text/html; charset=utf-8", web.page(None, live=True).encode()
-        elif address.path == "/scene.bin" and not self.refused:
+            return Answer(http.HTTPStatus.OK, "text/html; charset=utf-8", web.page(None, live=True).encode())
+        if path == "/scene.bin":
             self._note_request()
-            return await self._scene(parse_qs(address.query).get("step", [""])[0])
+            return await self._scene(parse_qs(query).get("step", [""])[0])
         return None
 
     def _note_request(self):
@@ -68,12 +73,12 @@ class ClientRendering:
     async def _scene(self, step):
         state = self._viewer.state
         if state is None or step == str(state.step):
-            return http.HTTPStatus.NO_CONTENT, "application/octet-stream", b""
+            return Answer(http.HTTPStatus.NO_CONTENT, "application/octet-stream", b"")
         try:
             data = await asyncio.to_thread(self._encode, state)
         except ValueError as error:
-            return http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", str(error).encode()
-        return http.HTTPStatus.OK, "application/octet-stream", data
+            return Answer(http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", str(error).encode())
+        return Answer(http.HTTPStatus.OK, "application/octet-stream", data)
 
     def _encode(self, state):
         viewer = self._viewer
@@ -84,41 +89,3 @@ class ClientRendering:
                 source = ExportSource(viewer.run, state.step, variables, viewer.views, WebOptions(), print)
                 self._encoded = state, web.encode(scene, web.about(source, scene, viewer.score), level=_COMPRESSION)
             return self._encoded[1]
-
-
-@contextlib.contextmanager
-def answering(admits: Callable[[Any], str | None], answer: Callable[[Any], Any]) -> Iterator[None]:
-    """Lets a viser server that is made in this context answer requests of browsers by itself.
-
-    viser takes no function for this, so the one that it gives to websockets is wrapped.
-
-    Args:
-        admits: headers -> why the request is refused, or None.
-        answer: see `ClientRendering.answer`.
-    """
-    from websockets import datastructures, http11
-    from websockets.asyncio import server
-
-    def response(status, kind, body):
-        headers = {"Content-Type": kind, "Content-Length": str(len(body)), "Cache-Control": "no-store"}
-        return http11.Response(status, status.phrase, datastructures.Headers(**headers), body)
-
-    serve = server.serve
-
-    def wrapped(*args, process_request, **options):
-        async def process(connection, request):
-            if request.headers.get("Upgrade") != "websocket":
-                if why := admits(request.headers):
-                    return response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", why.encode())
-                if found := await answer(request):
-                    return response(*found)
-            return process_request(connection, request)
-
-        times = {"open_timeout": _TRANSFER_SECONDS, "close_timeout": _TRANSFER_SECONDS}
-        return serve(*args, process_request=process, **{**options, **times})
-
-    server.serve = wrapped
-    try:
-        yield
-    finally:
-        server.serve = serve

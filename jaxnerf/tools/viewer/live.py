@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from jaxnerf.core.views import Views
+from jaxnerf.evaluation.aggregate import read_results
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
-from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.tools.uncertainty.laplace import stored_uncertainty
 from jaxnerf.tools.viewer.server import HOST, PORT, Viewer, check_port, import_viser
@@ -172,9 +172,9 @@ def score_of(workdir: str | os.PathLike, step: int) -> str:
     """Returns the evaluation of a checkpoint as text, or else its training loss; "" without either."""
     workdir = pathlib.Path(workdir)
     try:
-        found = atomic_files.read_json(workdir / "eval" / str(step) / "results.json", "score it again")
-        return f"PSNR {float(found['psnr']):.2f} dB over {int(found['views'])} views"
-    except (OSError, ValueError, KeyError, TypeError):
+        found = read_results(workdir / "eval" / str(step), "score it again")
+        return f"PSNR {found['psnr']:.2f} dB over {found['views']} views"
+    except (OSError, ValueError):
         rows = [row for row in metric_log.read_rows(workdir) if row["step"] <= step and "psnr_fine" in row]
         return f"{rows[-1]['psnr_fine']:.2f} dB in training" if rows else ""
 

@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxnerf.evaluation.paths.render_path import Frames, Output, render_path
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY, cleaned
 from jaxnerf.tools.viewer.frame_renderer import MAX_SIDE, MODES, UNCERTAINTY, FrameCamera, frame_image
-from jaxnerf.tools.viewer.keyframes import cameras_through, load_keyframes, save_path
+from jaxnerf.tools.viewer.keyframes import MAX_KEYFRAMES, cameras_through, load_keyframes, save_path
 from jaxnerf.tools.viewer.occupied_cells import surface_cells
 from jaxnerf.tools.viewer.render_loop import Delivery, Request
 
@@ -24,6 +25,7 @@ RESOLUTIONS = ("100", "200", "400", "800", "1600")  # px of the longer side
 _AXES = {"+x": (1, 0, 0), "+y": (0, 1, 0), "+z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 _MAX_FRUSTUMS, _THUMBNAIL, _BESIDE = 120, 64, 400  # views, px, px
 _NARROW = 0.75  # width over height of a window, below which the controls are folded at first: a phone's
+_MAX_WAITING = 32  # uses of controls that wait for their turn; later ones are dropped
 _STATUS_EVERY = 0.25  # s between changes of the status while the camera moves
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # viser's cameras look along +z with y down
 
@@ -47,6 +49,7 @@ class Page:
         self._closed, self._playing = threading.Event(), threading.Event()
         self._delivery, self._reported, self._kind = None, 0.0, None
         self._lock = threading.RLock()  # of what callbacks change
+        self._worker, self._room = ThreadPoolExecutor(1), threading.Semaphore(_MAX_WAITING)
         self._status = client.gui.add_markdown("waiting for the first image")  # other threads may report at once
 
     # The page as a whole
@@ -100,6 +103,7 @@ class Page:
         """Ends what runs for the page."""
         self._closed.set()
         self._playing.set()
+        self._worker.shutdown(wait=False, cancel_futures=True)
 
     def show(self, delivery: Delivery) -> None:
         """Shows a frame; called by the thread that renders."""
@@ -131,9 +135,23 @@ class Page:
 
     def _add(self, handle, call=None):
         """Makes a control call a function when it is used, by default to request a frame; returns the control."""
-        guarded = self._guarded(self._request if call is None else call)
-        (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(lambda _: guarded())
+        self._when(handle.on_click if hasattr(handle, "on_click") else handle.on_update, call or self._request)
         return handle
+
+    def _when(self, on_event, call):
+        """Calls a function at an event of the browser, in the page's own thread."""
+        guarded = self._guarded(call)
+
+        def run():
+            self._room.release()
+            if not self._closed.is_set():
+                guarded()
+
+        async def used(_):  # in the order of the messages, which viser's threads would not keep
+            if not self._closed.is_set() and self._room.acquire(blocking=False):
+                self._worker.submit(run)
+
+        on_event(used)
 
     def _guarded(self, call: Callable[[], Any]) -> Callable[[], None]:
         """Returns a function that shows an error on the page."""
@@ -323,14 +341,15 @@ class Page:
             self._beside.label = views.names[index] if views.names else f"view {index}"
             self._beside.visible = True
 
-        guarded = self._guarded(visit)
-        frustum.on_click(lambda _: guarded())
+        self._when(frustum.on_click, visit)
         return frustum
 
     # The camera path
 
     def _add_keyframe(self):
         camera = self._camera()
+        if len(self._keyframes) >= MAX_KEYFRAMES:
+            raise ValueError(f"a path has at most {MAX_KEYFRAMES} keyframes; remove some")
         if camera is not None:
             self._keyframes.append(camera)
             self._report_keyframes()

@@ -1,6 +1,5 @@
-"""Serves a scene to browsers: which of them are connected, what they see, and who may connect."""
+"""Serves a scene to browsers: which of them are connected, and what they see."""
 
-import asyncio
 import contextlib
 import io
 import logging
@@ -9,20 +8,20 @@ import pathlib
 import socket
 import sys
 import threading
+import time
+import warnings
 from collections.abc import Callable
 from typing import Any
-from urllib.parse import urlsplit
 
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import TrainedRun
-from jaxnerf.tools.viewer.client_rendering import ClientRendering, answering
+from jaxnerf.tools.viewer.client_rendering import ClientRendering
 from jaxnerf.tools.viewer.frame_renderer import FrameRenderer
 from jaxnerf.tools.viewer.page import Page
 from jaxnerf.tools.viewer.render_loop import RenderLoop
 
 HOST, PORT = "127.0.0.1", 8080
-MAX_BROWSERS = 16
-_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_REPORT_SECONDS = 10.0  # between messages about what browsers send
 
 
 def check_port(host: str, port: int) -> None:
@@ -89,8 +88,10 @@ class Viewer:
         """
         viser = import_viser()
         check_port(host, port)
-        self._only_local = host in _LOOPBACK
-        with answering(self._refusal, self.client_rendering.answer):
+        from jaxnerf.tools.viewer.connections import Guard, guarding  # which imports what viser needs
+
+        guard = Guard(host, self.client_rendering.answer, page_at_root=bool(self.client_rendering.refused))
+        with guarding(guard):
             self._server = _listen(viser, host, port)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
@@ -126,8 +127,6 @@ class Viewer:
                 self._server.stop()
 
     def _connected(self, client):
-        if not self._admits(client):
-            return
         page = Page(self, client)
         with self._lock:
             self._pages[client.client_id] = page
@@ -141,31 +140,6 @@ class Viewer:
             page.close()
         self.loop.drop(client.client_id)
         self._changed()
-
-    def _admits(self, client):
-        """Returns whether a browser may connect; closes the connection otherwise.
-
-        The page of another site could open a connection to this server through the user's browser, and so read the
-        scene. Such a connection has another origin, or reaches a loopback address by a name that is not one.
-        """
-        connection = self._server._websock_server._live_connections.get(client.client_id)
-        if connection is None:
-            return False
-        why = self._refusal(connection.request.headers)
-        if why is None and len(self._pages) >= MAX_BROWSERS:
-            why = f"more than {MAX_BROWSERS} pages"
-        if why:
-            asyncio.run_coroutine_threadsafe(connection.close(1008, why), self._server.get_event_loop())
-        return why is None
-
-    def _refusal(self, headers):
-        """Returns why a request is refused; None: it is not."""
-        origin, host = (" ".join(headers.get_all(name)) for name in ("Origin", "Host"))
-        if origin and urlsplit(origin).netloc != host:
-            return "the page of another site"
-        if self._only_local and urlsplit(f"//{host}").hostname not in _LOOPBACK:
-            return "another name of this machine than localhost"
-        return None
 
     def _deliver(self, client_id, delivery):
         page = self._pages.get(client_id)
@@ -191,14 +165,21 @@ def _listen(viser, host, port):
             """Does nothing: any browser could otherwise open a tunnel to this server from the internet."""
 
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # it would print a traceback for bad input
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a page may close while it is drawn
     with contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=host, port=port, label="jaxnerf", verbose=False)
     if port and server.get_port() != port:  # viser takes the next one that is free
         server.stop()
         raise ValueError(f"port {port} of {host}: something else listens there; give another one")
 
+    reported = -_REPORT_SECONDS
+
     def report(loop, context):
-        error = context.get("exception")
+        nonlocal reported
+        error, now = context.get("exception"), time.monotonic()
+        if error is None or now - reported < _REPORT_SECONDS:
+            return
+        reported = now
         print(f"viewer: ignored a message from a browser ({type(error).__name__}: {error})"[:300], file=sys.stderr)
 
     server.get_event_loop().call_soon_threadsafe(server.get_event_loop().set_exception_handler, report)
