@@ -46,7 +46,9 @@ def undistort(
 
     Returns:
         points [..., 2], x right and y down, focal length 1; and converged [...]. A pixel outside
-        the image of the lens has no preimage: its point is 0 and converged is False.
+        the image of the lens, or that only points beyond a fold of the lens are seen in, has no preimage: its point
+        is 0 and converged is False. A lens folds where its image, on the way from the axis to the point, stops
+        growing, along the ray or across it: where the Jacobian's determinant is no longer positive.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -193,8 +195,8 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
 
     Returns:
         pixels [..., 2] px, (x, y); and depth [...] in world units along the camera's axis, > 0 in front,
-        the t of rays_from_pixels. A point behind the camera or beyond a fold of the lens has pixels inf, with
-        gradient 0.
+        the t of rays_from_pixels. A point behind the camera, beyond a fold of the lens, see `undistort`, or so near
+        the camera that the gradient of its pixel overflows, has pixels inf, with gradient 0.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -208,8 +210,10 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
     # Sums of products instead of a matmul, which may round the camera to ten bits.
     local = (to_world[:, :3].reshape(*lead, 3, 3) * offset[..., None]).sum(axis=-2)
     depth = -local[..., 2]
-    seen = depth > 0
-    points = jnp.stack([local[..., 0], -local[..., 1]], axis=-1) / jnp.where(seen, depth, 1)[..., None]
+    points = jnp.stack([local[..., 0], -local[..., 1]], axis=-1)
+    steepest = focal * (1 + jnp.abs(points / depth[..., None])) / depth[..., None]
+    seen = (depth > 0) & jnp.isfinite(jax.lax.stop_gradient(steepest)).all(axis=-1)
+    points = divide(points, jnp.broadcast_to(jnp.where(seen, depth, 1)[..., None], points.shape))
     if camera.distortion is not None and camera.lens != "pinhole":
         distort, distortion = _lens("project", camera)
         if camera.lens == "fisheye":
@@ -338,13 +342,12 @@ def _equidistant(distortion, point):
 
 def _growing(distort, distortion, point):
     """Returns whether the image grows monotonically from the axis to a point [2]; a lens folds where it does not."""
-    fractions = jnp.linspace(0, 1, 32, dtype=point.dtype)
-    _, slopes = jax.vmap(lambda s: jax.jvp(lambda s: distort(distortion, s * point), (s,), (jnp.ones_like(s),)))(
-        fractions
-    )
-    # Not a sum along the axis of length 2: XLA calls a library for that on a CPU, which is slow for so short an axis.
-    along = slopes[:, 0] * point[0] + slopes[:, 1] * point[1]
-    return (along[1:] > 0).all() | (norm(point) == 0)
+    way = jnp.linspace(0, 1, 32, dtype=point.dtype)[:, None] * point[None]
+    (a, b), (c, d) = jnp.moveaxis(jax.vmap(lambda at: jax.jacfwd(distort, argnums=1)(distortion, at))(way), 0, -1)
+    # Not sums along an axis of length 2: XLA calls a library for that on a CPU, which is slow for so short an axis.
+    x, y = normalize(point)
+    along = x * (a * x + b * y) + y * (c * x + d * y)
+    return ((along > 0) & (a * d - b * c > 0)).all() | (norm(point) == 0)
 
 
 def _invert(distort, distortion, goal):

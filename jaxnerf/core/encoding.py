@@ -42,16 +42,16 @@ def positional_encoding(
 
     Returns:
         [..., D (1 + 2F)], or [..., D 2F] without the input, ordered as in Eq. 4, each entry D
-        wide and at least float32. Infinite x gives NaN in its sines and cosines, and so does x where 2^(F-1) x is
-        infinite in x's type. The gradient of sin 2^k x is
-        2^k cos 2^k x, to the same accuracy.
+        wide and at least float32. Infinite x gives NaN in its sines and cosines. Where 2^k x overflows float32, with
+        2^k the first octave of 16, those of these 16 are NaN; those of other x beyond 1e6 are in [-1, 1] and lose
+        their digits. In float64 the octaves are NaN whose 2^k x overflows. The gradient of sin 2^k x is 2^k cos 2^k x,
+        to the same accuracy.
 
     Raises:
         ValueError: on a scalar or integer x, if F is outside [0, 64], or if there are no features.
     """
     (x,) = _checked("positional_encoding", x, num_freqs, include_input)
-    planes = encode_planes(_planes(x), num_freqs=num_freqs, include_input=include_input)
-    return jnp.moveaxis(planes.reshape(-1, *x.shape[:-1]), 0, -1)
+    return _features(x.shape, encode_planes(_planes(x), num_freqs=num_freqs, include_input=include_input))
 
 
 def integrated_encoding(
@@ -84,7 +84,7 @@ def integrated_encoding(
     x, variance = _checked("integrated_encoding", x, num_freqs, include_input, variance)
     check_shapes("integrated_encoding", x=(x, "... D"), variance=(variance, "... D"))
     planes = encode_planes(_planes(x), num_freqs=num_freqs, include_input=include_input, variance=_planes(variance))
-    return jnp.moveaxis(planes.reshape(-1, *x.shape[:-1]), 0, -1)
+    return _features(x.shape, planes)
 
 
 def frustum_variance(
@@ -134,7 +134,12 @@ def _checked(function, x, num_freqs, include_input, *others):
 
 
 def _planes(x):
-    return jnp.moveaxis(x, -1, 0).reshape(x.shape[-1], -1)
+    return jnp.moveaxis(x, -1, 0).reshape(x.shape[-1], math.prod(x.shape[:-1]))
+
+
+def _features(shape, planes):
+    """Returns encoded planes [features, N] of x of a shape [..., D] as [..., features]."""
+    return jnp.moveaxis(planes.reshape(len(planes), *shape[:-1]), 0, -1)
 
 
 def encode_planes(
@@ -160,7 +165,7 @@ def encode_planes(
         if variance is not None:
             scales = _scales(num_freqs, variance.dtype)
             waves = waves * jnp.exp(-0.5 * scales**2 * variance.reshape(1, -1))[:, None]
-        parts.append(waves.reshape(2 * num_freqs * x.shape[0], -1))
+        parts.append(waves.reshape(2 * num_freqs * x.shape[0], x.shape[1]))
     return jnp.concatenate(parts, axis=0)
 
 

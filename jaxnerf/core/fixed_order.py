@@ -16,7 +16,8 @@ def add_rows(values: Float[ArrayLike, "M F"], rows: Int[ArrayLike, " M"], num_ro
     """Computes the sum of the values of each row, the same whatever their order.
 
     Values are rounded to multiples of a power of two, so that the largest possible sum is below 2^63 of them, and
-    these whole numbers are summed. For 10^7 values, errors are at most 2^-38 of the largest value each.
+    these whole numbers are summed. For 10^7 values, this changes each by at most 2^-38 of the largest. The sum is
+    rounded to float32.
 
     Args:
         values: [M, F].
@@ -58,10 +59,12 @@ def segment_sums(
         values: [K, C].
         segment: [K] in [0, count), ascending.
         starts: [K] bool, the first value of each segment.
-        used: [K] bool, False for values that do not count; they come last, as in PlacedSamples.
-        count: of segments; the sum of one without values is 0.
+        used: [K] bool, False for values that do not count; they come after all others, as in PlacedSamples.
+        count: of segments; the sum of one without values that count is 0, also if K is 0.
         longest: upper bound of the values of a segment that count.
     """
+    if not len(used):
+        return jnp.zeros((count, jnp.shape(values)[1]))
     sums = jax.vmap(lambda column: running_sum_since(starts, column, longest), 1, 1)(jnp.asarray(values))
     place = jnp.where(used, jnp.arange(len(sums)), -1)
     last = jax.ops.segment_max(place, segment, count, indices_are_sorted=True)

@@ -160,11 +160,14 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Float[Array, "3 4"]:
     Args:
         eye: [3] position of the camera, world.
         target: [3] the point in the center of the image, world.
-        up: [3] upwards in the image, any length > 0. If it is parallel to the viewing direction, another axis
-            replaces it. No direction leads from a point to itself: a target at the eye makes the rotation 0.
+        up: [3] upwards in the image, any length > 0. If it is parallel to the viewing direction, within 1e-6
+            radians, the coordinate axis after that of the direction's largest component replaces it: y after x, z
+            after y, x after z. No direction leads from a point to itself: a target at the eye makes the rotation 0.
 
     Returns:
-        Pose [3, 4], camera to world.
+        Pose [3, 4], camera to world, orthonormal also where up is nearly parallel to the viewing direction. The
+        gradient is finite; it grows as the inverse of the angle between them, to 1e6, and is 0 with respect to an up
+        that is replaced.
 
     Raises:
         ValueError: on other shapes.
@@ -172,9 +175,12 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Float[Array, "3 4"]:
     eye, target, up = (jnp.asarray(value, jnp.float32) for value in (eye, target, up))
     check_shapes("look_at", eye=(eye, "3"), target=(target, "3"), up=(up, "3"))
     back = normalize(eye - target)
-    right = jnp.cross(normalize(up), back)
-    substitute = jnp.cross(jnp.roll(back, 1), back)
-    right = normalize(jnp.where(norm(right) > 1e-6, right, substitute))  # a shorter one is rounding error
+    right, largest = jnp.cross(normalize(up), back), jnp.arange(3) == jnp.abs(back).argmax()
+    sine = norm(right)
+    substitute = jnp.cross(jnp.roll(jnp.where(largest, back, 0), 1), back)
+    right = normalize(jnp.where(sine > 1e-6, right, substitute))  # a shorter one is rounding error
+    # Of a short one, rounding has changed the direction.
+    right = jnp.where(sine > 1e-2, right, normalize(right - (right * back).sum() * back))
     return jnp.stack([right, jnp.cross(back, right), back, eye], axis=-1)
 
 

@@ -239,6 +239,7 @@ def half_depths(
 
 def first_finite(places: Float[Array, "*batch samples"]) -> Float[Array, "*batch"]:
     """Returns the first value [...] that is not inf; NaN counts, and without any the result is inf."""
+    places = places if places.shape[-1] else jnp.full((*places.shape[:-1], 1), jnp.inf, places.dtype)
     first = (~jnp.isinf(places)).argmax(axis=-1)
     return jnp.take_along_axis(places, first[..., None], axis=-1)[..., 0]
 

@@ -142,7 +142,7 @@ def _forward_in_fixed_order(levels, table, place):
 def _backward_in_fixed_order(levels, residuals, change):
     table, place = residuals
     rows, weights = _all_corners(levels, place)
-    change_of_level = jnp.moveaxis(change.reshape(*rows.shape[2:], len(levels), -1), 1, 0)
+    change_of_level = jnp.moveaxis(change.reshape(*rows.shape[2:], len(levels), table.shape[-1]), 1, 0)
     values = weights[..., None] * change_of_level[:, None]
     sums = add_rows(values.reshape(-1, values.shape[-1]), rows.reshape(-1), len(table))
     moved = jax.vjp(lambda place: _interpolated(levels, table, place), place)[1](change)[0]

@@ -200,9 +200,9 @@ class MLP(linen.Module):
         if self.use_viewdirs:
             # The direction is encoded and multiplied once per ray, and broadcast over its samples.
             directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
-            directions = directions.astype(self.compute_dtype).reshape(-1, *viewdirs.shape[:-1])
+            directions = directions.astype(self.compute_dtype).reshape(len(directions), *viewdirs.shape[:-1])
             bottleneck = Affine(self.width, name="bottleneck")(self.width)
-            features = hidden[0].reshape(-1, *shape)
+            features = hidden[0].reshape(self.width, *shape)
             view = Dense(self.view_width, name="view")(features, directions, before=bottleneck)
             hidden = (jax.nn.relu(view).reshape(self.view_width, -1),)
         rgb = Dense(3, name="rgb")(*hidden).astype(dtype)

@@ -17,7 +17,7 @@ from jaxnerf import (
     rays_from_pixels,
     undistort,
 )
-from jaxnerf.core.cameras import project
+from jaxnerf.core.cameras import _brown, project
 from jaxnerf.core.safe_math import norm, normalize
 
 OPENCV = [[0.0] * 4, [0.08, -0.02, 0.004, -0.003], [-0.25, 0.06, 0.002, 0.001], [-0.3, 0.0, 0.0, 0.0]]
@@ -54,6 +54,7 @@ def fisheye(points, *k):
 
 fast_undistort, fast_rays, fast_look_at = map(compiled, (undistort, rays_from_pixels, look_at))
 fast_ndc, fast_back, fast_positions, fast_project = map(compiled, (ndc_rays, ndc_to_t, points_on_rays, project))
+fast_gradient = compiled(lambda camera, x: jax.jacrev(lambda x: project(camera, x)[0])(x))
 
 
 def test_pixels_are_x_then_y_through_their_centres():
@@ -94,6 +95,39 @@ def test_a_pixel_without_a_preimage_is_flagged_and_has_an_empty_ray():
     np.testing.assert_array_equal(rays.near, np.full(300, 2.0))
     np.testing.assert_array_equal(rays.far, np.where(converged, 6, 2))
     assert all_finite(rays)
+
+
+@pytest.mark.parametrize(
+    "k", [[0, 0, 0.2, 0.1], [0, 0, 0.3, -0.3], [-0.2, 0.02, 0.15, 0.1], [0.1, 0, 0.5, 0], [0, 0, 0, 0.4, 0.01]], ids=str
+)
+def test_a_lens_that_folds_across_the_ray_has_no_two_points_in_a_pixel(k):
+    """With tangential terms the Jacobian changes its sign where the image still grows along the ray."""
+    camera = a_camera("opencv", k)
+    points = np.stack(np.meshgrid(*[np.linspace(-2, 2, 41)] * 2), axis=-1).reshape(-1, 2)
+    with jax.enable_x64(True):
+        jacobian = jax.vmap(jax.jacfwd(lambda at: _brown(jnp.array(k), at)))(points)
+        folded = np.linalg.det(jacobian) < 0
+        rotation = np.asarray(camera.to_world, float)
+        x = rotation[:, 3] + np.concatenate([points * [1, -1], -np.ones((len(points), 1))], axis=1) @ rotation[:, :3].T
+    pixels = np.asarray(fast_project(camera, np.float32(x))[0])
+    seen = np.isfinite(pixels).all(axis=-1)
+    assert folded.any() and not seen[folded].any() and seen.sum() > 500
+    found, converged = fast_undistort(camera, np.where(seen[:, None], pixels, 0))
+    assert converged[seen].all()
+    np.testing.assert_allclose(found[seen], points[seen], atol=2e-3)  # the inverse is steep near a fold
+
+
+@pytest.mark.parametrize("lens, k", [("pinhole", None), ("opencv", OPENCV[1]), ("fisheye", FISHEYE[1])])
+@pytest.mark.parametrize("depth", [1e-10, 1e-20, 1e-30, 1e-37, 1e-40])
+def test_the_gradient_of_a_projection_is_finite_however_near_the_point(lens, k, depth):
+    camera = dataclasses.replace(a_camera(lens, k), to_world=jnp.eye(3, 4))
+    for x in (np.float32([0.5 * depth, -0.5 * depth, -depth]), np.float32([1, 1, -depth])):
+        pixel = fast_project(camera, x)[0]
+        gradient = np.asarray(fast_gradient(camera, x))
+        assert np.isfinite(gradient).all() and gradient.any() == np.isfinite(pixel).all()
+        if x[0] < 1 and depth > 1e-35:
+            at_one = np.asarray(fast_gradient(camera, x / np.float32(depth)), np.float64)
+            np.testing.assert_allclose(gradient * np.float64(depth), at_one, rtol=1e-4)
 
 
 def test_undistort_gradient_is_that_of_the_inverse():
@@ -213,6 +247,23 @@ def test_look_at():
     up = pose[:, :3].T @ np.array([0.0, 0.0, 1.0])
     assert up[1] > 0 and abs(up[0]) < 1e-6
     assert all_finite(fast_look_at(np.array([0.0, 0.0, 4.0]), np.zeros(3), np.array([0.0, 0.0, 1.0])))
+
+
+DIRECTIONS = [np.array(each) - 1.0 for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]
+
+
+@pytest.mark.parametrize("aside", [0, 1e-8, 1e-7, 5e-7, 1e-6, 2e-6, 1e-5, 1e-3, 0.02])
+def test_look_at_along_up_is_orthonormal(aside):
+    """Along (1, 1, 1), another axis was (1, 1, 1), too; just beside up, rounding bent the axes."""
+    rng, slope = np.random.default_rng(0), compiled(jax.jacrev(look_at, argnums=(0, 1, 2)))
+    for direction in (*DIRECTIONS, *rng.normal(size=(10, 3))):
+        up = direction * rng.choice([-2, 2]) + aside * rng.normal(size=3)
+        places = np.float32(direction), np.zeros(3, np.float32), np.float32(up)
+        pose = fast_look_at(*places)
+        np.testing.assert_allclose(pose[:, :3].T @ pose[:, :3], np.eye(3), atol=2e-6)
+        assert np.linalg.det(pose[:, :3]) > 0.99
+        np.testing.assert_allclose(pose[:, 2], direction / np.linalg.norm(direction), atol=1e-6)
+        assert all_finite(slope(*places))
 
 
 def test_batch_is_vmap_is_jit():

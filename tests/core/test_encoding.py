@@ -20,10 +20,17 @@ def test_order_is_x_then_sine_and_cosine_of_each_octave():
     np.testing.assert_array_equal(bare, got[2:])
 
 
-@pytest.mark.parametrize("shape", [(3,), (5, 3), (2, 4, 2)])
+@pytest.mark.parametrize("shape", [(3,), (5, 3), (2, 4, 2), (0, 3), (4, 0, 3), (0,)])
 def test_shape(shape):
-    got = jax.eval_shape(lambda x: positional_encoding(x, num_freqs=10), jnp.ones(shape))
-    assert got.shape == (*shape[:-1], 21 * shape[-1]) and got.dtype == jnp.float32
+    for encoding in (positional_encoding, lambda x, num_freqs: integrated_encoding(x, x, num_freqs=num_freqs)):
+        got = jax.eval_shape(lambda x, encoding=encoding: encoding(x, num_freqs=10), jnp.ones(shape))
+        assert got.shape == (*shape[:-1], 21 * shape[-1]) and got.dtype == jnp.float32
+
+
+def test_octaves_are_nan_where_the_first_of_their_group_overflows():
+    for x, num_nan in ((1e31, 0), (3e38, 32), (np.inf, 64)):
+        waves = np.asarray(encode(jnp.float32([x]), num_freqs=32, include_input=False))
+        assert np.isnan(waves).sum() == num_nan and (np.abs(waves[~np.isnan(waves)]) <= 1).all()
 
 
 def test_no_octaves_leave_x():

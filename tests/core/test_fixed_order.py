@@ -45,6 +45,8 @@ def test_a_value_that_is_not_finite_is_visible(bad):
 
 def test_no_values_sum_to_zero():
     np.testing.assert_array_equal(add_rows(np.zeros((0, 2)), np.zeros(0, int), 3), np.zeros((3, 2)))
+    nowhere = np.zeros(0, int), np.zeros(0, bool), np.zeros(0, bool)
+    np.testing.assert_array_equal(segment_sums(np.zeros((0, 2)), *nowhere, 3, 4), np.zeros((3, 2)))
 
 
 def test_segments_have_the_sums_and_gradients_of_jax():

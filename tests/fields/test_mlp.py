@@ -321,3 +321,22 @@ def test_padding_for_the_cache_changes_no_output(name, rays, samples, directions
     assert_same(outputs, jax.tree.map(lambda *some: jnp.concatenate(some), *(part[0][1] for part in parts)))
     assert_same(moves, jnp.concatenate([part[1][1] for part in parts]), **close)
     assert_same(slopes, jax.tree.map(jnp.add, *(part[1][0] for part in parts)), **close)
+
+
+@pytest.mark.parametrize("shape", [(0, 4), (4, 0), (0,)])
+@pytest.mark.parametrize("prefilter", [False, True])
+def test_fields_are_evaluated_at_no_points(shape, prefilter):
+    box = {"lower": (-1,) * 3, "upper": (1,) * 3, "resolutions": (4, 8), "table_size": 64}
+    fields = mlp_field(depth=2, width=16, view_width=8, prefilter=prefilter), hash_grid_field(**box)
+    x, viewdirs = np.zeros((*shape, 3), np.float32), np.zeros((*shape[:-1], 1, 3), np.float32)
+    sizes = {"radius": np.zeros(shape, np.float32), "length": np.zeros(shape, np.float32)} if prefilter else {}
+    for field in fields[: 2 - prefilter]:
+        params = field.init(jax.random.key(0))
+        for apply in filter(None, (field.apply, field.apply_in_fixed_order)):
+
+            def total(params, apply=apply):
+                density, rgb = apply(params, x, viewdirs, **sizes)
+                assert density.shape == shape and rgb.shape == (*shape, 3)
+                return density.sum() + rgb.sum()
+
+            assert not any(leaf.any() for leaf in jax.tree.leaves(jax.jit(jax.grad(total))(params)))

@@ -5,9 +5,13 @@ OUT receives a run of the embedded scene, unless it holds one already, and scree
 """
 
 import contextlib
+import functools
+import http.server
 import io
 import os
 import pathlib
+import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -16,15 +20,17 @@ import time
 
 import imageio.v3 as iio
 import numpy as np
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Error, sync_playwright
 
 from runs import ROOT, free_port, module_of
+from viewer_client import FakeBrowser
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 FLAGS = [
     *("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--ignore-gpu-blocklist", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
+    "--host-resolver-rules=MAP evil.example 127.0.0.1",  # the name of another site, which its owner makes lead here
 ]
 TRAIN = (
     "--config=quickstart",
@@ -53,6 +59,10 @@ def main(out):
         a_reload_recovers(page)
         closing_all_pages_stops_the_rendering(page, process)
         a_page_renders_by_itself(browser, port, out)
+        other_sites_get_nothing(browser, port, out)
+        large_messages_take_no_memory(browser, process, port)
+        the_17th_page_and_half_open_connections(browser, port, out)
+    signals_end_it(run)
     with server("train", *TRAIN, f"--workdir={out / 'live'}", "--viewer", flag="viewer_port") as (process, port):
         with chromium() as browser:
             a_training_is_shown_while_it_runs(browser, port, out)
@@ -202,6 +212,238 @@ def a_page_renders_by_itself(browser, port, out):
     check(f"{STEPS + MORE_STEPS} steps" in page.inner_text("#how"), f"the page says {page.inner_text('#how')!r}")
     page.screenshot(path=out / "by_itself.png")
     page.close()
+
+
+# What a link, a frame or a script of another site may ask for; TRAP is a server of that site.
+ADDRESSES = (
+    "/frames/?websocket=ws://127.0.0.1:TRAP",
+    "/frames/?playbackPath=http://127.0.0.1:TRAP/scene.viser",
+    "/frames/?x=1&%77ebsocket=ws://127.0.0.1:TRAP#websocket=ws://127.0.0.1:TRAP",
+    "/frames?websocket=ws://127.0.0.1:TRAP",
+    "//frames/?websocket=ws://127.0.0.1:TRAP",
+    "/frames/index.html?websocket=ws://127.0.0.1:TRAP",
+    "/index.html?websocket=ws://127.0.0.1:TRAP",
+    "/%66rames/?websocket=ws://127.0.0.1:TRAP",
+    "/?websocket=ws://127.0.0.1:TRAP",
+)
+SCRIPT = """async (viewer) => {
+  const found = [];
+  const socket = await new Promise((resolve) => {
+    const socket = new WebSocket(viewer.replace("http", "ws"), ["viser-v%s"]);
+    socket.onopen = () => resolve("open");
+    socket.onerror = () => resolve("refused");
+  });
+  found.push(["websocket", socket]);
+  for (const mode of ["cors", "no-cors"]) {
+    const answer = await fetch(viewer + "scene.bin", {mode}).catch(() => null);
+    found.push([mode, answer === null ? "refused" : String(answer.status)]);
+  }
+  for (const kind of ["img", "script", "iframe", "embed"]) {
+    const element = document.createElement(kind);
+    const loaded = new Promise((resolve) => {
+      element.onload = () => resolve("loaded");
+      element.onerror = () => resolve("refused");
+      setTimeout(() => resolve("nothing"), 3000);
+    });
+    element.src = viewer + (kind === "script" ? "scene.bin" : "");
+    document.body.append(element);
+    found.push([kind, await loaded]);
+  }
+  return found;
+}"""
+
+
+def other_sites_get_nothing(browser, port, out):
+    """A page of another site, of another port of this machine, and of a name that leads to the viewer."""
+    import viser
+
+    tried, add = 0, "([tag, values]) => document.body.append(Object.assign(document.createElement(tag), values))"
+    with foreign_site() as (site, trap):
+        for origin in (f"http://evil.example:{site}", f"http://127.0.0.1:{site}"):
+            page = browser.new_page()
+            page.set_default_timeout(SECONDS * 1000)
+            page.goto(origin)
+            for name, got in page.evaluate(SCRIPT % viser.__version__, f"http://127.0.0.1:{port}/"):
+                # The browser says of a frame that it is loaded, where it shows its own page about the refusal.
+                hidden = name in ("iframe", "embed") and all(shows_nothing(frame) for frame in page.frames[1:])
+                check(hidden or got in ("refused", "nothing"), f"{origin} gets nothing by {name}: {got}")
+                tried += 1
+            for address in ADDRESSES:
+                address = f"http://127.0.0.1:{port}" + address.replace("TRAP", str(trap.port))
+                page.goto(origin)
+                page.evaluate(add, ["iframe", {"src": address}])
+                page.wait_for_timeout(1000)
+                check(all(shows_nothing(frame) for frame in page.frames[1:]), f"a frame shows nothing: {address}")
+                page.goto(origin)
+                page.evaluate(add, ["a", {"href": address, "textContent": "look", "id": "link"}])
+                page.click("#link")
+                page.wait_for_timeout(3000)
+                led = f":{trap.port}" in page.url.partition("#")[0] and not shows_nothing(page.main_frame)
+                check(not led and trap.count == 0, f"a link leads to {page.url}")
+                tried += 2
+            page.screenshot(path=out / "link.png")
+            page.close()
+        page = open_page(browser, port)
+        connect = """(target) => new Promise((resolve) => {
+          const socket = new WebSocket(target);
+          socket.onopen = socket.onerror = (event) => resolve(event.type);
+        })"""
+        for target in (f"ws://127.0.0.1:{trap.port}", f"ws://evil.example:{trap.port}"):
+            check(page.evaluate(connect, target) == "error", "the viewer's page connects to nobody else")
+            tried += 1
+        page.close()
+        check(trap.count == 0, f"the server of the other site was asked {trap.count} times")
+    rebound = browser.new_page()
+    for path in ("", "frames/", "scene.bin"):
+        answer = rebound.goto(f"http://evil.example:{port}/{path}")
+        check(answer.status == 403, f"a name that leads here is refused: {rebound.inner_text('body')!r}")
+        tried += 1
+    rebound.close()
+    print(f"      {tried} attacks of other sites tried, all held")
+
+
+def shows_nothing(frame):
+    """Returns whether a frame shows nothing of the viewer."""
+    try:
+        text = frame.evaluate("() => document.body ? document.body.innerText + document.title : ''")
+    except Error:
+        return True  # a page of the browser
+    return "viser" not in text.lower() and "jaxnerf" not in text.lower() and "More controls" not in text
+
+
+def large_messages_take_no_memory(browser, process, port):
+    """From the viewer's own page, which its own scripts could send."""
+    import viser
+
+    page = open_page(browser, port)
+    rest(page)
+    before = megabytes(process)
+    for count, size in ((40, 10), (1, 60), (400, 1)):
+        closed = page.evaluate(
+            """async ([address, protocol, count, size]) => {
+              let closed = 0;
+              for (let each = 0; each < count; ++each) {
+                const socket = new WebSocket(address, [protocol]);
+                await new Promise((resolve) => { socket.onopen = socket.onerror = resolve; });
+                const end = new Promise((resolve) => {
+                  socket.onclose = () => resolve(true);
+                  setTimeout(resolve, 20000);
+                });
+                socket.send(new Uint8Array(size * 2 ** 20));
+                closed += await end ? 1 : 0;
+              }
+              return closed;
+            }""",
+            [f"ws://127.0.0.1:{port}/frames", f"viser-v{viser.__version__}", count, size],
+        )
+        check(closed == count, f"{closed} of {count} messages of {size} MB close their connection")
+    taken = megabytes(process) - before
+    check(taken < 50, f"memory grows by {taken:.0f} MB")
+    drag(page, 60, 20)
+    rest(page)
+    page.close()
+
+
+def the_17th_page_and_half_open_connections(browser, port, out):
+    with contextlib.ExitStack() as stack:
+        pages = [FakeBrowser(port) for _ in range(16)]
+        for each in pages:
+            stack.callback(each.close)
+        page = browser.new_page()
+        answer = page.goto(f"http://127.0.0.1:{port}/frames/")
+        text = page.inner_text("body")
+        page.screenshot(path=out / "17th.png")
+        check(answer.status == 503 and "16 pages of this viewer are open" in text, f"the 17th page says {text!r}")
+        pages[0].close()
+        page.wait_for_timeout(1000)
+        check(page.reload().status == 200, "once a page is closed, it is served")
+        page.close()
+    with contextlib.ExitStack() as stack:
+        for _ in range(500):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+        page = open_page(browser, port)
+        rest(page)
+        check(True, "500 connections without a request stop nobody")
+        page.close()
+
+
+def signals_end_it(run):
+    """While it starts, while it serves a page, and twice; without a traceback."""
+    slow = 0.0
+    for number in (signal.SIGINT, signal.SIGTERM):
+        for delay, times in ((0.3, 1), (1.0, 1), (2.0, 2), (3.0, 1), (4.0, 1), (5.0, 2), (None, 1), (None, 2)):
+            port = free_port()
+            command = [sys.executable, "-m", module_of("view"), f"--workdir={run}", f"--port={port}"]
+            process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            page = None
+            if delay is None:
+                page = wait_for_port(port)
+                page.move()
+                page.wait(lambda page=page: page.image is not None, seconds=SECONDS)
+            else:
+                time.sleep(delay)
+            started = time.monotonic()
+            for _ in range(times):
+                process.send_signal(number)
+                time.sleep(0.05)
+            out, err = process.communicate(timeout=SECONDS)
+            slow = max(slow, time.monotonic() - started)
+            # Before the program has set its handlers, Python ends as it does: by the signal, or with its traceback.
+            early = delay is not None and delay < 1.5
+            lines = [line for line in err.splitlines() if not line.startswith("viewer  ")]
+            ended = process.returncode in (128 + number, -number) or early
+            good = ended and ("Traceback" not in err or early) and (len(lines) <= 1 or early)
+            check(good, f"{number.name} after {delay} s, {times} times: {process.returncode}, {err.strip()[-300:]!r}")
+    check(slow < 5, f"it ends within {slow:.1f} s")
+
+
+def wait_for_port(port):
+    """Returns a page once the viewer listens."""
+    end = time.monotonic() + SECONDS
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError):
+            return FakeBrowser(port)
+        time.sleep(0.2)
+    sys.exit("the viewer did not serve")
+
+
+class Trap:
+    """Counts the connections to a port, which nobody should make."""
+
+    def __init__(self):
+        self.listener, self.count = socket.create_server(("127.0.0.1", 0)), 0
+        self.port = self.listener.getsockname()[1]
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self):
+        with contextlib.suppress(OSError):
+            while True:
+                self.listener.accept()[0].close()
+                self.count += 1
+
+
+@contextlib.contextmanager
+def foreign_site():
+    """Yields the port of a web server with an empty page, and a Trap."""
+    with tempfile.TemporaryDirectory() as folder:
+        (pathlib.Path(folder) / "index.html").write_text("<!doctype html><title>other</title><body></body>")
+
+        class Quiet(http.server.SimpleHTTPRequestHandler):
+            def log_message(self, *arguments):
+                """Prints nothing."""
+
+        handler = functools.partial(Quiet, directory=folder)
+        site, trap = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler), Trap()
+        threading.Thread(target=site.serve_forever, daemon=True).start()
+        yield site.server_port, trap
+        site.shutdown()
+        trap.listener.close()
+
+
+def megabytes(process):
+    """Returns the memory that a process occupies."""
+    lines = pathlib.Path(f"/proc/{process.pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) / 1024
 
 
 def a_training_is_shown_while_it_runs(browser, port, out):

@@ -50,9 +50,10 @@ def importance_samples(
         max_optical_depth: candidates behind this optical depth, as estimated by the grid, are skipped.
 
     Returns:
-        PlacedSamples, all in occupied cells; and occluded [B], whether candidates of a ray in occupied cells were
-        skipped. No ray with candidates is dropped unless there are more such rays than slots. A ray that is NaN
-        has samples, so that it is visible.
+        PlacedSamples, all in candidates in occupied cells; as the middle of a candidate decides, a few percent of the
+        samples lie outside the cells, by up to half a candidate's length. And occluded [B], whether candidates of a
+        ray in occupied cells were skipped. No ray with candidates is dropped unless there are more such rays than
+        slots. A ray that is NaN has samples, so that it is visible.
 
     Raises:
         ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
@@ -69,8 +70,8 @@ def importance_samples(
             f"importance_samples: rule is {candidates.rule!r}, max_samples {max_samples} and uniform_fraction "
             f"{uniform_fraction}, expected 'segments', at least 1, and above 0 up to 1"
         )
-    if not rays.near.size:
-        zeros, none = jnp.zeros(max_samples), jnp.zeros(0, jnp.int32)
+    if not candidates.t.size:
+        zeros, none = jnp.zeros(max_samples), jnp.zeros(rays.near.size, jnp.int32)
         index = jnp.zeros(max_samples, jnp.int32)
         return PlacedSamples(t=zeros, delta=zeros, ray_index=index, used=index > 0, num_dropped=none), none > 0
     # Candidates that the grid expects to be hidden are skipped; the others share out the slots of the buffer.

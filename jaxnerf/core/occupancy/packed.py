@@ -153,7 +153,7 @@ def _without_gradient_if_empty(scene, rays):
 def flattened(function: str, rays: Rays, samples: Samples, max_samples: int) -> tuple[Rays, Samples]:
     """Returns Rays [B] and Samples [B, S] of any leading axes; ValueError on what cannot be packed.
 
-    If there are no rays, B is 1: a ray of length 0, which `_rendering` removes.
+    If there are no rays, B is 1: a ray of length 0, which `_rendering` removes. If there are no samples, S is 1, too.
     """
     if samples.rule == "gauss":
         raise ValueError(
@@ -163,6 +163,8 @@ def flattened(function: str, rays: Rays, samples: Samples, max_samples: int) -> 
     check_shapes(function, near=(rays.near, "..."), t=(samples.t, "... S"), delta=(samples.delta, "... S"))
     if max_samples < 1:
         raise ValueError(f"{function}: max_samples is {max_samples}, expected at least 1")
+    if not samples.t.shape[-1]:
+        samples = jax.tree.map(lambda x: jnp.zeros((*x.shape[:-1], 1), x.dtype), samples)
     leading = rays.near.ndim
     flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(rays.near.size, *x.shape[leading:]), (rays, samples))
     return _at_least_one(flat)

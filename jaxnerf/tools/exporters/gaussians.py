@@ -54,7 +54,7 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
     released code sets to 0.
     """
     ordered = _in_file(gaussians.harmonics)
-    rest = ordered[:, 1:].transpose(0, 2, 1).reshape(len(ordered), -1)  # channel by channel
+    rest = ordered[:, 1:].transpose(0, 2, 1).reshape(len(ordered), 24)  # channel by channel
     columns = dict(zip("xyz", gaussians.mean.T, strict=True))
     columns |= {f"f_dc_{i}": ordered[:, 0, i] for i in range(3)}
     columns |= {f"f_rest_{i}": values for i, values in enumerate(rest.T)}

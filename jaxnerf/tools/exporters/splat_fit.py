@@ -63,6 +63,8 @@ def fit_gaussians(
         steps: of Adam; its rates decay exponentially.
         seed: of the order of the images.
     """
+    if not len(gaussians.mean):
+        return gaussians
     initial = np.float32(gaussians.mean), np.float32(gaussians.scale.max(axis=1, keepdims=True))
     parameters = _parameters(gaussians)
     behind = np.zeros(3, np.float32) if background is None else np.float32(background)
@@ -139,7 +141,7 @@ def _listed(gaussians: Gaussians, camera: Camera) -> _Pairs:
         sources.append(pairs.source[kept])
         start += pairs.size
     count = sum(map(len, pixels))
-    more = (0, -count % _PADDING)
+    more = (0, -count % _PADDING if count else _PADDING)
     return _Pairs(
         np.pad(np.concatenate(pixels).astype(np.int32), more, constant_values=start),
         np.pad(np.concatenate(sources).astype(np.int32), more),

@@ -74,7 +74,7 @@ def make_gaussians(points: np.ndarray, normals: np.ndarray, extinction: np.ndarr
         extinction: [N] 1 / unit, the density of the matter.
         colors: [N, 9, 3] harmonics, see Gaussians.
     """
-    number = min(_NUM_NEIGHBORS, len(points) - 1)
+    number = max(min(_NUM_NEIGHBORS, len(points) - 1), 0)
     distance = np.ones(len(points))
     if number:
         distance = cKDTree(points).query(points, k=number + 1)[0][:, 1:].mean(axis=1)

@@ -62,12 +62,14 @@ def calibrate(
     """Calibrates by split conformal prediction: every second view gives the map, the others the factor.
 
     The map is the RMS error by score, made monotone (isotonic regression of the means of bins with equally many
-    pixels), so that it keeps the order of the scores. A constant factor then gives the predicted errors of all views
-    the mean square of the true ones: all views together tell the level of the errors better than half of them, and
-    the intervals do not depend on it. With n pixels of the other views the factor is the ceil((n + 1) coverage)-th
-    smallest ratio of error and predicted error. A new pixel from the same distribution is then within the interval
-    with at least that probability (arXiv:1604.04173). Pixels of one view are alike, so that the coverage of a single
-    view differs from it by more than its number of pixels suggests.
+    pixels), so that it keeps the order of the scores. Pixels of equal scores, as those of culled rays have, stay
+    together: a score that fills a bin has one of its own, and the map has the RMS error of that bin there. A
+    constant factor then gives the predicted errors of all views the mean square of the true ones: all views
+    together tell the level of the errors better than half of them, and the intervals do not depend on it. With n
+    pixels of the other views the factor is the ceil((n + 1) coverage)-th smallest ratio of error and predicted
+    error. A new pixel from the same distribution is then within the interval with at least that probability
+    (arXiv:1604.04173). Pixels of one view are alike, so that the coverage of a single view differs from it by more
+    than its number of pixels suggests.
 
     Args:
         scores, errors: of each view, [N] each.
@@ -105,15 +107,35 @@ def _scaled(known, predicted, errors):
 
 
 def _monotone(scores, errors):
-    """Returns (scores, errors) of bins, ascending: their mean scores and RMS errors, neighbours out of order merged."""
+    """Returns (scores, errors) of bins, ascending: their mean scores and RMS errors, neighbours out of order merged.
+
+    Where bins of one score each are merged, the result has the error at the first and the last of these scores.
+    """
     order = np.argsort(scores, kind="stable")
-    merged = []  # [sum of squared errors, sum of scores, count]
-    for part in np.array_split(order, min(_NUM_BINS, scores.size)):
-        merged.append([np.square(errors[part]).sum(), scores[part].sum(), part.size])
-        while len(merged) > 1 and merged[-2][0] / merged[-2][2] >= merged[-1][0] / merged[-1][2]:
-            merged[-2:] = [[sum(pair) for pair in zip(*merged[-2:], strict=True)]]
-    squares, total, count = np.array(merged).T
-    return tuple((total / count).tolist()), tuple(np.maximum(np.sqrt(squares / count), _LEAST_ERROR).tolist())
+    merged = []  # [sum of squared errors, sum of scores, count], and the [first, last] of the bins of one score
+    for part in np.split(order, _bin_starts(scores[order])[1:]):
+        alone = len(part) > 1 and scores[part[0]] == scores[part[-1]]
+        ends = [scores[part[0]]] * 2 if alone else [np.inf, -np.inf]
+        merged.append(([np.square(errors[part]).sum(), scores[part].sum(), part.size], ends))
+        while len(merged) > 1 and merged[-2][0][0] / merged[-2][0][2] >= merged[-1][0][0] / merged[-1][0][2]:
+            (sums, ends), (more, others) = merged[-2:]
+            sums = [sum(pair) for pair in zip(sums, more, strict=True)]
+            merged[-2:] = [(sums, [min(ends[0], others[0]), max(ends[1], others[1])])]
+    points = []
+    for (squares, total, count), (first, last) in merged:
+        at = {first: None, last: None} if first <= last else {total / count: None}
+        points += [(float(score), max(math.sqrt(squares / count), _LEAST_ERROR)) for score in at]
+    return tuple(zip(*points, strict=True))
+
+
+def _bin_starts(ascending):
+    """Returns where the bins of ascending scores begin: equally many in each, but no score is in two of them."""
+    size, bins = ascending.size, min(_NUM_BINS, ascending.size)
+    starts = np.cumsum([0, *map(len, np.array_split(ascending, bins))])[:-1]
+    first, end = (np.searchsorted(ascending, ascending[starts], side) for side in ("left", "right"))
+    fills = end - first >= size / bins
+    # A boundary inside of equal scores moves to their start, or, if these fill a bin, one is at both of their ends.
+    return np.unique([0, *first, *end[fills & (end < size)]])
 
 
 def sparsification(error: ArrayLike, score: ArrayLike, *, num_fractions: int = 100) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Where the scene of the viewer comes from: checkpoints in a workdir, or a training in this process."""
 
+import contextlib
 import os
 import pathlib
 import sys
@@ -10,14 +11,16 @@ import jax
 import numpy as np
 
 from jaxnerf.core.views import Views
-from jaxnerf.evaluation.aggregate import read_results
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
+from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.tools.uncertainty.laplace import stored_uncertainty
 from jaxnerf.tools.viewer.server import HOST, PORT, Viewer, check_port, import_viser
 from jaxnerf.training import metric_log
+from jaxnerf.training.config import identity
 from jaxnerf.training.optimizer import image_params
 from jaxnerf.training.state import TrainState
+from jaxnerf.training.workdir import load_config
 
 _POLL_SECONDS = 1.0  # between searches for a new checkpoint
 _REFRESH_SECONDS = 2.0  # between copies of the parameters of a training, at least
@@ -50,6 +53,7 @@ def view_run(
     """
     import_viser()
     check_port(host, port)
+    trained = identity(load_config(workdir))
     run = cleaned(restore_with_grid(workdir, data_dir=data_dir), workdir, max_uncertainty)
     first = newest_step(run, workdir, step)
     variables = run.variables(first)
@@ -60,26 +64,43 @@ def view_run(
         uncertainty_at = stored_uncertainty(run, workdir, step, variables[0])
         viewer.show(step, variables, score_of(workdir, step), uncertainty_at=uncertainty_at)
 
-    show(first, variables)  # compiles before anyone can connect
-    port = viewer.listen(host, port)
-    print(f"viewer        {address(host, port)} shows {workdir}, step {first}; Ctrl-C ends it", file=sys.stderr)
-    failed = None
+    def show_newest(steps):
+        if identity(load_config(workdir)) != trained:
+            raise ValueError(f"{workdir}: holds another run than that which is shown; start again to show it")
+        show(steps[-1], run.variables(steps[-1]))
+
     try:
-        ended = threading.Event() if ended is None else ended
-        while not ended.wait(_POLL_SECONDS):
-            newest = run.steps()[-1:]
-            if step is not None or not newest or newest[0] in (viewer.state.step, failed) or not viewer.num_browsers:
-                continue
-            try:
-                variables = run.variables(newest[0])
-            except ValueError as error:
-                if newest[0] in run.steps():  # otherwise training has deleted it as too old
-                    failed = newest[0]
-                    print(f"viewer: {error}", file=sys.stderr)
-                continue
-            show(newest[0], variables)
+        show(first, variables)  # compiles before anyone can connect
+        port = viewer.listen(host, port)
+        print(f"viewer        {address(host, port)} shows {workdir}, step {first}; Ctrl-C ends it", file=sys.stderr)
+        _follow(run, viewer, show_newest if step is None else None, threading.Event() if ended is None else ended)
     finally:
         viewer.close()
+
+
+def _follow(run, viewer, show_newest, ended):
+    """Shows each new checkpoint until an event; what cannot be shown is reported in a line, and the last one stays."""
+    failed, reported = None, ""
+    while not ended.wait(_POLL_SECONDS):
+        if show_newest is None or not viewer.num_browsers:
+            continue
+        steps = []
+        try:
+            steps = run.steps()
+            if not steps:
+                raise ValueError(f"{viewer.workdir}: has no checkpoint any more; step {viewer.state.step} stays")
+            if steps[-1] not in (viewer.state.step, failed):
+                show_newest(steps)
+                reported = ""
+        except Exception as error:  # the run may have been removed, replaced or damaged in any way
+            if steps and steps[-1] not in run.steps():  # training has deleted it as too old
+                continue
+            failed = steps[-1] if steps else None
+            kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
+            line = kind + " ".join(str(error).split())[:500]
+            if line != reported:
+                print(f"viewer: {line}", file=sys.stderr)
+            reported = line
 
 
 class LiveViewer:
@@ -171,12 +192,13 @@ class LiveViewer:
 def score_of(workdir: str | os.PathLike, step: int) -> str:
     """Returns the evaluation of a checkpoint as text, or else its training loss; "" without either."""
     workdir = pathlib.Path(workdir)
-    try:
-        found = read_results(workdir / "eval" / str(step), "score it again")
-        return f"PSNR {found['psnr']:.2f} dB over {found['views']} views"
-    except (OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, OverflowError):
+        found = atomic_files.read_json(workdir / "eval" / str(step) / "results.json", "score it again")
+        return f"PSNR {float(found['psnr']):.2f} dB over {int(found['views'])} views"
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         rows = [row for row in metric_log.read_rows(workdir) if row["step"] <= step and "psnr_fine" in row]
         return f"{rows[-1]['psnr_fine']:.2f} dB in training" if rows else ""
+    return ""
 
 
 def address(host: str, port: int) -> str:

@@ -146,6 +146,28 @@ def test_slots_are_shared_evenly(seed):
         assert not short.size or (short.max() - short.min() <= 1 and number.max() <= short.min() + 1)
 
 
+def test_samples_are_at_most_half_a_candidate_outside_of_occupied_cells(rays, candidates):
+    """A candidate counts as occupied by its middle."""
+    cells = (np.indices((16,) * 3).reshape(3, -1).T + 0.5) / 16 - 0.5
+    ball = (np.linalg.norm(cells, axis=1) < 0.3).reshape(16, 16, 16)
+    grid = jaxnerf.create_grid(-np.ones(3) / 2, np.ones(3) / 2, ball, initial_density=1.0)
+    rng, length = np.random.default_rng(0), 1 / STEPS
+    offsets = rng.uniform(-0.2, 0.2, (2, RAYS, 3)).astype(np.float32)
+    moved = dataclasses.replace(rays, origins=offsets[0] - [0.5, 0, 0], directions=rays.directions + offsets[1])
+    samples, _ = place(jax.random.key(0), grid, moved, candidates)
+    used = np.asarray(samples.used)
+    one = jax.tree.map(lambda leaf: leaf[np.asarray(samples.ray_index)[used]], moved)
+    inside = [is_occupied(grid, one, samples.t[used][:, None] + shift * length) for shift in (-0.5, 0, 0.5)]
+    assert 0.001 < 1 - np.asarray(inside[1]).mean() < 0.1
+    assert np.any(inside, axis=0).all()
+
+
+def test_without_candidates_there_are_no_samples(grid, rays):
+    none = jaxnerf.Samples(t=jnp.zeros((RAYS, 0)), delta=jnp.zeros((RAYS, 0)))
+    samples, occluded = importance_samples(jax.random.key(0), grid, rays, none, max_samples=4, uniform_fraction=0.5)
+    assert not samples.used.any() and samples.num_dropped.shape == occluded.shape == (RAYS,) and not occluded.any()
+
+
 def test_a_single_slot_is_used(grid, rays, candidates):
     samples, _ = place(jax.random.key(0), grid, rays, candidates, max_samples=1)
     assert samples.used.shape == (1,) and samples.used.all()

@@ -261,6 +261,23 @@ def test_nan_of_a_scene_shows_only_where_the_scene_is_evaluated(rays, samples):
     assert np.isnan(value(given, np.ones_like(kept))[0])
 
 
+@pytest.mark.parametrize("early_stop_eps", [0.0, 0.1])
+def test_rays_without_samples_show_the_background(rays, early_stop_eps):
+    none = jaxnerf.Samples(t=jnp.zeros((RAYS, 0)), delta=jnp.zeros((RAYS, 0)))
+    options = {"background": BACKGROUND, "median_depth": True}
+
+    @compiled
+    def both(rays, none):
+        packed = {"max_samples": 4, "early_stop_eps": early_stop_eps}
+        found = jaxnerf.render_packed(scene, full_grid(), rays, none, **packed, **options)
+        return found, jaxnerf.render_samples(scene, rays, none, **options)
+
+    for got in both(rays, none):
+        np.testing.assert_array_equal(got.rgb, np.broadcast_to(BACKGROUND, (RAYS, 3)))
+        np.testing.assert_array_equal(got.median_depth, rays.far)
+        assert not got.opacity.any() and not got.num_dropped.any()
+
+
 def test_wrong_arguments(rays, samples):
     pairs, grid = dataclasses.replace(samples, rule="gauss"), full_grid()
     for message, call in {

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from jaxnerf import Camera, look_at
+from jaxnerf.data.readers.ply import read_points
 from jaxnerf.tools.exporters import gaussians as files
 from jaxnerf.tools.exporters import splat_fit
 from jaxnerf.tools.exporters.gaussians import Gaussians, rasterize
 from jaxnerf.tools.exporters.splat_fit import fit_gaussians
+from jaxnerf.tools.exporters.splats import make_gaussians
 from jaxnerf.tools.exporters.surfaces import DepthImage
 
 SIZE, WHITE = 24, np.float32([1, 1, 1])
@@ -120,3 +122,19 @@ def test_another_file_than_spz_is_refused(tmp_path):
     (tmp_path / "other.spz").write_bytes(gzip.compress(b"ply\n" * 8))
     with pytest.raises(ValueError, match="is no SPZ file of version 2 and degree 2"):
         files.read_spz(tmp_path / "other.spz")
+
+
+def test_no_gaussians_are_made_written_read_drawn_and_fitted(tmp_path):
+    none = make_gaussians(*(np.zeros(shape) for shape in ((0, 3), (0, 3), (0,), (0, 9, 3))))
+    files.write_gaussians(tmp_path / "splats.ply", none)
+    assert read_points(tmp_path / "splats.ply").shape == (0, 3)
+    files.write_spz(tmp_path / "splats.spz", none)
+    for found in (files.read_spz(tmp_path / "splats.spz"), fit_gaussians(none, images_of(some(3), 1), WHITE, steps=1)):
+        assert [each.shape for each in found] == [each.shape for each in none]
+    np.testing.assert_array_equal(rasterize(none, camera(0), WHITE), np.ones((SIZE, SIZE, 3)))
+
+
+def test_gaussians_that_no_image_shows_stay_as_they_are():
+    behind = some(3)._replace(mean=np.float32([[40, 0, 0]] * 3))
+    fitted = fit_gaussians(behind, images_of(some(3), 1), WHITE, steps=2)
+    np.testing.assert_array_equal(fitted.mean, behind.mean)

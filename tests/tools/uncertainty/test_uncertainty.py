@@ -67,6 +67,32 @@ def test_the_level_of_predicted_errors_is_that_of_all_views(monkeypatch):
     np.testing.assert_allclose(found.interval(scores[0]), other.interval(scores[0]), rtol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "tied, fraction",
+    [((0.01,), 0.8), ((0.01, 0.02, 0.05), 0.9), ((0.1, 0.2, 0.3), 1.0), (tuple(range(1, 31)), 1.0)],
+    ids=str,
+)
+def test_pixels_of_equal_scores_get_their_own_rms_error(tied, fraction):
+    """As culled pixels have, many: they were split by their index, and their map led on to the next score."""
+    views, rng = [], np.random.default_rng(1)
+    for seed in range(6):
+        scores, errors = draws(seed)
+        at = rng.random(scores.size) < fraction
+        scores[at] = rng.choice(tied, at.sum())
+        views.append((scores, np.where(at, 0.02 * scores, errors + 0.3) * np.linspace(0.1, 1.9, scores.size)))
+    found = calibration.calibrate(*zip(*views, strict=True), list("abcdef"))
+    scores, errors = map(np.concatenate, zip(*views, strict=True))
+    for score in tied:
+        expected = max(np.sqrt(np.square(errors[scores == score]).mean()), 1 / (255 * 12**0.5))
+        assert found.predicted(score) == pytest.approx(expected, rel=0.1)
+
+
+def test_scores_of_ties_that_are_out_of_order_get_one_value():
+    scores, errors = np.repeat([1.0, 2.0, 2.1], 100), np.repeat([0.3, 0.1, 0.9], 100)
+    found = calibration.calibrate([scores] * 2, [errors] * 2, ["a", "b"])
+    np.testing.assert_allclose(found.predicted([1, 2, 2.1]), [0.05**0.5, 0.05**0.5, 0.9], rtol=1e-5)
+
+
 def test_the_factor_has_the_finite_sample_correction():
     errors = [np.full(4, 0.1), np.array([0.1, 0.2, 0.3, 0.4])]
     found = calibration.calibrate([np.ones(4), np.ones(4)], errors, ["a", "b"], 0.8)
