@@ -38,8 +38,9 @@ def surface_colors(
 
     The colour that a view sees is that of the field along the view's ray, from `reach` in front of the point to as far
     behind it, composited as in an image (Eq. 3 of arXiv:2003.08934). Views count by the cosine between ray and normal
-    and by the opacity there. Those whose colour is far from that of most others do not count: a view whose matte cuts the
-    object has taught the field to show the background from there. What the field looks like in detail does not depend on the size of the images.
+    and by the opacity there. Those whose colour is far from that of most others do not count: a view whose matte cuts
+    the object has taught the field to show the background from there. What the field looks like in detail does not
+    depend on the size of the images.
 
     Args:
         source: the run.

@@ -23,6 +23,7 @@ from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import TrainedRun, refined_views
 from jaxnerf.fields.hash_grid import HashGrid
+from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters import web_scene
 from jaxnerf.tools.exporters.base import ExportSource
 from jaxnerf.tools.exporters.web_scene import WebScene
@@ -50,13 +51,15 @@ def export_web(source: ExportSource, folder: pathlib.Path) -> None:
     split = experiment.config.eval.split
     views = refined_views(source.run, experiment.load_split(split), split, source.variables[0])
     for precision in web_scene.PRECISIONS:
-        scene = scene_of(source.run, source.variables, precision)
+        with stages.stage(f"packing features of {precision}"):
+            scene = scene_of(source.run, source.variables, precision)
         score = measure(source, scene, views)
         if score.of_run - score.of_page <= MAX_LOSS:
             break
         source.say(f"features of {precision} would lose {score.of_run - score.of_page:.2f} dB")
     quality = f"PSNR {score.of_page:.1f} dB on {score.num_views} test views"
-    data = encode(scene, about(source, scene, quality))
+    with stages.stage("compressing the scene"):
+        data = encode(scene, about(source, scene, quality))
     (folder / "index.html").write_text(page(None if source.settings.split else data))
     if source.settings.split:
         (folder / _DATA_FILE).write_bytes(data)
