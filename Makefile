@@ -20,9 +20,8 @@ $(BIN)/.dev: $(BIN)/.installed
 	touch $@
 
 demo: $(BIN)/.installed
-	$(BIN)/jaxnerf-train --config=quickstart --workdir=$(DEMO)
-	$(BIN)/jaxnerf-eval --workdir=$(DEMO) --overwrite
-	$(BIN)/jaxnerf-render --workdir=$(DEMO) --overwrite
+	$(BIN)/jaxnerf-train --config=quickstart --config.eval.at_end --workdir=$(DEMO)
+	$(BIN)/jaxnerf-render --workdir=$(DEMO) --frames=24 --overwrite
 	$(BIN)/jaxnerf-report $(DEMO)
 	@echo "make view shows the scene in a browser; its image is in $(DEMO)/eval, a video in $(DEMO)/renders"
 

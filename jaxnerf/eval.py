@@ -42,6 +42,7 @@ _ERROR_BUDGET = flags.DEFINE_float(
     "The largest RMS colour error, against the model's own exact rendering. The program searches the fastest "
     "settings that stay within it, and scores with them.",
     lower_bound=0.0,
+    upper_bound=1.0,
 )
 _PREDICTIONS = flags.DEFINE_string(
     "predictions", None, "A folder of images, or of color/ with images, that are scored in place of a run."
@@ -132,7 +133,12 @@ def _reference_config():
 def run():
     """Runs the program."""
     prepare = functools.partial(cli.with_saved_config, only_for_fields=True)
-    cli.run(main, prepare=prepare, stopped="between two views; the same command continues from there")
+    cli.run(main, prepare=prepare, stopped=_stopped)
+
+
+def _stopped():
+    continues = not (_PREDICTIONS.value or _OVERWRITE.value)
+    return f"between two views; the same command {'continues from there' if continues else 'begins again'}"
 
 
 if __name__ == "__main__":

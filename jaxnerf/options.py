@@ -52,12 +52,16 @@ class Range(NamedTuple):
 
 def at_least(low: float) -> Range:
     """Returns the range of numbers that are not below one."""
-    return Range(f"at least {low:,g}", lambda value: value >= low)
+    return Range(f"at least {_shown(low)}", lambda value: value >= low)
 
 
 def between(low: float, high: float) -> Range:
     """Returns the range from one number to another, both included."""
-    return Range(f"from {low:,g} to {high:,g}", lambda value: low <= value <= high)
+    return Range(f"from {_shown(low)} to {_shown(high)}", lambda value: low <= value <= high)
+
+
+def _shown(number):
+    return f"{number:,}" if isinstance(number, int) else f"{number:,g}"
 
 
 POSITIVE = Range("more than 0", lambda value: value > 0)

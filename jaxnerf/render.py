@@ -27,6 +27,7 @@ _FRAMES = flags.DEFINE_integer(
     "The number of frames. When it is not given, a turntable has 48, an arc 96, a spiral or ellipse 120, interpolate "
     "6 for each view, but at most 240.",
     lower_bound=1,
+    upper_bound=100_000,
 )
 _CLOSED = flags.DEFINE_bool("closed", False, "Whether --path=interpolate returns to the first view.")
 _UP = flags.DEFINE_enum(
@@ -51,7 +52,7 @@ _MAX_RAYS = flags.DEFINE_integer(
     upper_bound=4096,
 )
 _FPS = flags.DEFINE_float(
-    "fps", None, "The frames per second. When it is not given, the path's file states them, or 24.", lower_bound=0.1
+    "fps", None, "Frames per second. When it is not given, those of the path, or 24.", lower_bound=0.1, upper_bound=1e3
 )
 _VIDEO = flags.DEFINE_string(
     "video", "auto", "The format of the video: mp4, gif, none, or auto: mp4 if imageio finds ffmpeg, otherwise gif."
@@ -102,7 +103,11 @@ def main(argv):
 
 def run():
     """Runs the program."""
-    cli.run(main, stopped="between two frames; the same command continues from there")
+    cli.run(main, stopped=_stopped)
+
+
+def _stopped():
+    return f"between two frames; the same command{' without --overwrite' * _OVERWRITE.value} continues from there"
 
 
 if __name__ == "__main__":

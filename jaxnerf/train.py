@@ -60,7 +60,10 @@ _HEARTBEAT_SECONDS = flags.DEFINE_float(
     "heartbeat_seconds", 100.0, "The time without a sign of life after which a process counts as lost.", lower_bound=5.0
 )
 _STOPPED_CODE = flags.DEFINE_integer(
-    "stopped_code", 0, "The exit code after SIGTERM or Ctrl-C. Kubernetes restarts a program that does not exit with 0."
+    "stopped_code",
+    0,
+    "The exit code after SIGTERM or Ctrl-C. Kubernetes restarts a program that does not exit with 0.",
+    upper_bound=255,
 )
 _SEEDS = flags.DEFINE_list(
     "seeds",

@@ -76,7 +76,7 @@ def source_of(scene=ball, *, say=lambda line: None, background=None, count=14, n
         config=changed(RunConfig(), {"eval.chunk": SIZE**2, "eval.sample_multiplier": 1.0}),
         background=background,
         model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid)),
-        load_split=lambda split: views,
+        load_split=lambda split, **options: views,
         cameras=None,
     )
     grid = create_grid(np.full(3, -1.0), np.full(3, 1.0), np.ones((2, 2, 2), bool), initial_density=1.0)

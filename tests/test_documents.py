@@ -34,7 +34,7 @@ EXAMPLES = [
 def test_links_and_included_files_exist(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
-        path = page.parent / target
+        path = (page.parent / target).resolve()
         assert re.match(r"[a-z]+:", target) or path.exists() or path in OF_NOTEBOOKS, target
     for target, place in re.findall(r"\]\(([^)#:\s]*)#([^)\s]+)\)", text):
         headings = re.findall(r"^#+ (.*)$", (page.parent / target if target else page).read_text(), re.MULTILINE)

@@ -9,4 +9,5 @@ def get_config():
     data, train = config.data, config.train
     data.format, data.dir, data.factor, data.size = "synthetic", "", 1, 200
     train.max_seconds, train.lr_decay_power, train.table_momentum = 60.0, 4.0, True
+    train.preview_every = 15.0
     return config

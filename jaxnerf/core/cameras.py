@@ -4,6 +4,7 @@ Camera axes are x right, y up, looking along -z. Image axes are x right, y down.
 """
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -12,6 +13,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core.safe_math import at_least_float32, divide, norm, normalize
 from jaxnerf.core.types import Camera, Rays, check_shapes
+
+# Degrees from the axis of a fisheye up to which directions reach the plane at distance 1. Those beyond, also backwards,
+# end on the sphere through that plane's circle at this angle.
+_SIDEWAYS = math.radians(80)
 
 
 def pixel_grid(height: int, width: int, *, offset: float = 0.5) -> Float[Array, "H W 2"]:
@@ -48,31 +53,62 @@ def undistort(
         points [..., 2], x right and y down, focal length 1; and converged [...]. A pixel outside
         the image of the lens, or that only points beyond a fold of the lens are seen in, has no preimage: its point
         is 0 and converged is False. A lens folds where its image, on the way from the axis to the point, stops
-        growing, along the ray or across it: where the Jacobian's determinant is no longer positive.
+        growing, along the ray or across it: where the Jacobian's determinant is no longer positive. A fisheye's
+        pixel at 90 degrees from the axis or beyond is flagged, too: its ray, see `rays_from_pixels`, does not cross
+        that plane.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
     """
+    points, converged = _before_lens("undistort", camera, pixels)
+    if _is_fisheye(camera):
+        return _on_plane(points, converged & (norm(points) < 0.5 * math.pi))
+    return points, converged
+
+
+def _is_fisheye(camera):
+    return camera.lens == "fisheye" and camera.distortion is not None
+
+
+def _before_lens(function, camera, pixels):
+    """Returns the points [..., 2] that the lens distorts, of a fisheye as long as their angle, and which exist."""
     pixels = jnp.asarray(pixels)
-    check_shapes("undistort", pixels=(pixels, "... 2"))
-    _check_one("undistort", camera, "focal", "center")
+    check_shapes(function, pixels=(pixels, "... 2"))
+    _check_one(function, camera, "focal", "center")
     lead = (1,) * (pixels.ndim - 1)
     focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
     target = (pixels - center) / focal
     if camera.distortion is None or camera.lens == "pinhole":
         return target, jnp.ones(target.shape[:-1], bool)
-    distort, distortion = _lens("undistort", camera)
-    flat = target.reshape(-1, 2)
-    points, converged = jax.vmap(lambda goal: _invert(distort, distortion, goal))(flat)
-    if camera.lens == "fisheye":
-        # The length of a solution is the angle from the axis; on the plane at distance 1 it is the angle's tangent.
-        angle = norm(points)
-        inside = converged & (angle < 0.5 * math.pi)
-        angle = jnp.where(inside, angle, 0)
-        wide = angle > 1e-4  # below, the series is exact, and its derivative has no 0 / 0
-        stretch = jnp.where(wide, jnp.tan(angle) / jnp.where(wide, angle, 1), 1 + angle**2 / 3)
-        points, converged = jnp.where(inside[:, None], points * stretch[:, None], 0), inside
+    distort, distortion = _lens(function, camera)
+    points, converged = jax.vmap(lambda goal: _invert(distort, distortion, goal))(target.reshape(-1, 2))
     return points.reshape(target.shape), converged.reshape(target.shape[:-1])
+
+
+def _on_plane(points, inside):
+    """Returns points as long as an angle from the axis as points at its tangent, 0 unless inside; and inside."""
+    angle = jnp.where(inside, norm(points), 0)
+    wide = angle > 1e-4  # below, the series is exact, and its derivative has no 0 / 0
+    stretch = jnp.where(wide, jnp.tan(angle) / jnp.where(wide, angle, 1), 1 + angle**2 / 3)
+    return jnp.where(inside[..., None], points * stretch[..., None], 0), inside
+
+
+def _directions(function, camera, pixels):
+    """Returns directions [..., 3] in the camera's axes through pixels [..., 2], along -z without one; which exist."""
+    points, converged = _before_lens(function, camera, pixels)
+    plane, ahead = points, converged
+    if _is_fisheye(camera):
+        angle = norm(points)
+        converged &= angle < math.pi  # all around, a lens shows the point behind it
+        plane, ahead = _on_plane(points, converged & (angle <= _SIDEWAYS))
+    local = jnp.stack([plane[..., 0], -plane[..., 1], -jnp.ones_like(plane[..., 0])], axis=-1)
+    if not _is_fisheye(camera):
+        return local, converged
+    beside = converged & ~ahead
+    angle = jnp.where(beside, angle, _SIDEWAYS)
+    across = points * (jnp.sin(angle) / angle)[..., None]
+    around = jnp.stack([across[..., 0], -across[..., 1], -jnp.cos(angle)], axis=-1) / math.cos(_SIDEWAYS)
+    return jnp.where(beside[..., None], around, local), converged
 
 
 def rays_from_pixels(
@@ -93,7 +129,9 @@ def rays_from_pixels(
 
     Returns:
         Rays [...], or [V, ...] of several cameras; directions reach the plane at distance 1 (not unit length), as in
-        the released codes. The ray of a pixel without a preimage has near = far and runs along the axis.
+        the released codes. Those of a fisheye that are more than 80 degrees from the axis, up to 180, have the length
+        1 / cos 80 degrees, at which they are continuous. The ray of a pixel without a preimage has near = far and
+        runs along the axis.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -103,10 +141,9 @@ def rays_from_pixels(
     if jnp.ndim(camera.to_world) > 2:
         return _rays_of_cameras(camera, pixels, near, far)
     _check_one("rays_from_pixels", camera, "to_world", "focal", "center")
-    points, converged = undistort(camera, pixels)
+    local, converged = _directions("rays_from_pixels", camera, pixels)
     to_world = jnp.asarray(camera.to_world)
     lead = (1,) * (pixels.ndim - 1)
-    local = jnp.stack([points[..., 0], -points[..., 1], -jnp.ones_like(points[..., 0])], axis=-1)
     # Sums of products instead of a matmul, which may round the camera to ten bits.
     directions = (to_world[:, :3].reshape(*lead, 3, 3) * local[..., None, :]).sum(axis=-1)
     shape = pixels.shape[:-1]
@@ -172,7 +209,8 @@ def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Ar
         pixels: [..., 2] px, as from pixel_grid.
 
     Returns:
-        [...] world units per t. For a lens it is that of the pixel's area after `undistort`; 0 without a preimage.
+        [...] world units per t. For a lens it is that of the pixel's area on that plane, or on the sphere where a
+        fisheye's directions end, see `rays_from_pixels`; 0 without a preimage.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -181,8 +219,11 @@ def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Ar
     check_shapes("pixel_radius", pixels=(pixels, "... 2"))
     _check_one("pixel_radius", camera, "focal", "center")
     steps = [jnp.broadcast_to(jnp.eye(2, dtype=pixels.dtype)[axis], pixels.shape) for axis in range(2)]
-    right, down = (jax.jvp(lambda at: undistort(camera, at)[0], (pixels,), (step,))[1] for step in steps)
+    directions = functools.partial(_directions, "pixel_radius", camera)
+    right, down = (jax.jvp(lambda at: directions(at)[0], (pixels,), (step,))[1] for step in steps)
     area = jnp.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
+    if _is_fisheye(camera):
+        area = norm(jnp.cross(right, down))
     return jnp.where(area > 0, 2 / math.sqrt(12) * jnp.sqrt(jnp.where(area > 0, area, 1)), 0)
 
 
@@ -195,8 +236,9 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
 
     Returns:
         pixels [..., 2] px, (x, y); and depth [...] in world units along the camera's axis, > 0 in front,
-        the t of rays_from_pixels. A point behind the camera, beyond a fold of the lens, see `undistort`, or so near
-        the camera that the gradient of its pixel overflows, has pixels inf, with gradient 0.
+        the t of rays_from_pixels, also where this is not along the axis, beside a fisheye. A point that the camera
+        does not see, behind it or beyond a fold of the lens, see `undistort`, or so near the camera that the gradient
+        of its pixel overflows, has pixels inf, with gradient 0.
 
     Raises:
         ValueError: on other shapes or an unknown lens.
@@ -210,17 +252,18 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
     # Sums of products instead of a matmul, which may round the camera to ten bits.
     local = (to_world[:, :3].reshape(*lead, 3, 3) * offset[..., None]).sum(axis=-2)
     depth = -local[..., 2]
-    points = jnp.stack([local[..., 0], -local[..., 1]], axis=-1)
-    steepest = focal * (1 + jnp.abs(points / depth[..., None])) / depth[..., None]
+    across = jnp.stack([local[..., 0], -local[..., 1]], axis=-1)
+    steepest = focal * (1 + jnp.abs(across / depth[..., None])) / depth[..., None]
     seen = (depth > 0) & jnp.isfinite(jax.lax.stop_gradient(steepest)).all(axis=-1)
-    points = divide(points, jnp.broadcast_to(jnp.where(seen, depth, 1)[..., None], points.shape))
+    points = divide(across, jnp.broadcast_to(jnp.where(seen, depth, 1)[..., None], across.shape))
     if camera.distortion is not None and camera.lens != "pinhole":
         distort, distortion = _lens("project", camera)
         if camera.lens == "fisheye":
             radius = norm(points)
             wide = radius > 1e-4  # below, the series is exact, and its derivative has no 0 / 0
             angle = jnp.where(wide, jnp.arctan(radius) / jnp.where(wide, radius, 1), 1 - radius**2 / 3)
-            points = points * angle[..., None]
+            points, depth, beside = _beside(across, depth, points * angle[..., None])
+            seen |= beside
         flat = points.reshape(-1, 2)
 
         def has_image(point):
@@ -230,6 +273,17 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
         flat = jnp.where(seen.reshape(-1, 1), flat, 0)
         points = jax.vmap(lambda point: distort(distortion, point))(flat).reshape(points.shape)
     return jnp.where(seen[..., None], points * focal + center, jnp.inf), depth
+
+
+def _beside(across, depth, points):
+    """Returns points as long as the angle from the axis and t, also where a fisheye sees beside itself; and where."""
+    radius = norm(across)
+    near = radius < 1e-18  # of the type's smallest root: the gradient overflows there
+    angle = jnp.arctan2(radius, jnp.where(near, 1, depth))
+    beside = (angle > _SIDEWAYS) & ~near
+    scale = jnp.where(beside, angle, 0) / jnp.where(beside, radius, 1)
+    t = norm(jnp.stack([radius, depth], axis=-1)) * math.cos(_SIDEWAYS)
+    return jnp.where(beside[..., None], across * scale[..., None], points), jnp.where(beside, t, depth), beside
 
 
 def ndc_rays(rays: Rays, camera: Camera, *, near_plane: Num[ArrayLike, ""] = 1.0) -> Rays:

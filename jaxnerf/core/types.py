@@ -291,7 +291,7 @@ def check_shapes(function: str, **arrays: tuple[object, str]) -> None:
         fits = len(shape) >= len(tail) if "..." in axes else len(shape) == len(tail)
         fits = fits and ("..." not in axes or known.setdefault("...", leading) == leading)
         for axis, length in found:
-            expected = int(axis) if axis.isdigit() else known.setdefault(axis, length)
+            expected = int(axis) if axis.isdecimal() else known.setdefault(axis, length)
             fits = fits and length == expected
         if not fits:
             others = ", ".join(

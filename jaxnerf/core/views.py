@@ -15,7 +15,8 @@ class Views:
     """Images with their cameras; the pixels of all images are in one array.
 
     Attributes:
-        pixels: [P, C] uint8 or uint16, row by row; the fourth channel, if any, is straight alpha.
+        pixels: [P, C] uint8 or uint16, row by row; the fourth channel, if any, is straight alpha. P is 0 where only
+            the cameras are known.
         offset: [V] index of each view's first pixel.
         size: [V, 2] px, (height, width).
         cameras: stacked, [V, ...].
@@ -56,6 +57,7 @@ class Views:
     def image(self, index: int) -> Float[Array, "H W 3"]:
         """Returns a view's colours [H, W, 3] in [0, 1]; alpha is composited over the background, or over black."""
         _check_index(self, index)
+        check_pixels(self, "Views.image")
         height, width = (int(side) for side in self.size[index])
         first = int(self.offset[index])
         pixels = jnp.asarray(self.pixels[first : first + height * width])
@@ -74,6 +76,12 @@ class Views:
         rays = rays_from_pixels(self.camera(index), pixel_grid(height, width), near=near, far=far)
         time = None if self.time is None else jnp.full_like(rays.near, self.time[index])
         return dataclasses.replace(rays, time=time)
+
+
+def check_pixels(views: Views, user: str) -> None:
+    """Raises a ValueError if only the cameras of views are known; user: what needs their pixels."""
+    if jnp.shape(views.pixels)[:1] == (0,):
+        raise ValueError(f"{user} needs images, and only their cameras are known here; give --data_dir")
 
 
 def _check_index(views, index):

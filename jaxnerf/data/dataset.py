@@ -11,14 +11,14 @@ from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt
 from jaxnerf.data.geometry import bounds, world
 from jaxnerf.data.geometry.poses import AXES, axis_of
-from jaxnerf.data.images import downscaled_copies, image_files, load_images
+from jaxnerf.data.images import downscaled_copies, image_files, load_images, pixel_rays
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 from jaxnerf.data.scene import BACKGROUNDS
 from jaxnerf.data.shared_views import found_by_split
 from jaxnerf.data.view_selection import select_views, selection
 from jaxnerf.fields import still_life
-from jaxnerf.options import AUTO, Changes, Options, at_least, declarations, infer, is_auto, option, replaced, values_of
+from jaxnerf.options import AUTO, Changes, Options, between, declarations, infer, is_auto, option, replaced, values_of
 from jaxnerf.registry import READERS, needs_folder
 
 WORLDS = {
@@ -50,12 +50,12 @@ class DataOptions(Options):
     factor: int = option(
         1,
         "images are shrunk by this whole number (area average); auto: the one whose images are nearest to `width`",
-        range=at_least(1),
+        range=between(1, 4096),
         auto=True,
         protocol=True,
     )
-    width: int = option(800, "see `factor`", unit="px", range=at_least(1))
-    size: int = option(100, "side of the embedded scene's images", unit="px", range=at_least(1))
+    width: int = option(800, "see `factor`", unit="px", range=between(1, 65_536))
+    size: int = option(100, "side of the embedded scene's images", unit="px", range=between(1, 1024))
     finish: str = option(
         "usual",
         "surfaces of the embedded scene; `matt` ones do not depend on the view direction",
@@ -66,10 +66,10 @@ class DataOptions(Options):
         "Where rays start, along the camera's axis. 0: each image has its own, from the dataset. auto: one small "
         "distance where space is contracted and its empty cells are skipped, otherwise 0.",
         unit="of the dataset's files",
-        range=at_least(0),
+        range=between(0, 10**9),
         auto=True,
     )
-    far: float = option(0.0, "where rays end, as `near`", unit="of the dataset's files", range=at_least(0))
+    far: float = option(0.0, "where rays end, as `near`", unit="of the dataset's files", range=between(0, 10**9))
     background: str = option(
         "white",
         "The colour behind alpha and behind the scene. `none`: alpha is dropped, and `scene.background` is behind the "
@@ -79,10 +79,10 @@ class DataOptions(Options):
         protocol=True,
     )
     hold_out: int = option(
-        0, "every n-th training view belongs to the split `held_out` instead; 0: none", range=at_least(0), protocol=True
+        0, "every n-th training view belongs to the split `held_out`; 0: none", range=between(0, 10**6), protocol=True
     )
     num_views: int = option(
-        0, "number of training views to use, spread evenly over all of them; 0: all", range=at_least(0), protocol=True
+        0, "number of training views to use, spread evenly; 0: all", range=between(0, 10**6), protocol=True
     )
     view_indices: tuple[int, ...] = option(
         (),
@@ -92,7 +92,7 @@ class DataOptions(Options):
         protocol=True,
     )
     pixel_offset: float = option(
-        0.5, "rays pass through pixel centres (0.5) or pixel corners (0)", unit="px", protocol=True
+        0.5, "rays pass through pixel centres (0.5) or corners (0)", unit="px", range=between(-1, 1), protocol=True
     )
     world: str = option(
         AUTO,
@@ -166,6 +166,7 @@ def _resolve(data):
     folder = dataset_folder(data.dir)
     if pathlib.Path(data.dir).is_dir():  # a name below $JAXNERF_SCENES stays a name
         data = replaced(data, dir=str(folder.absolute()))
+    read = data.format
     if is_auto(data.format):
         found = base.detect_formats(folder)
         others = f", of {', '.join(found)}: --format selects another" if len(found) > 1 else ""
@@ -173,7 +174,7 @@ def _resolve(data):
         data = replaced(data, format=found[0])
     # Reading the cameras takes a while, so they are only read to infer something from them.
     if any(map(is_auto, (data.factor, data.world, data.background))):
-        capture = base.read_capture(folder, data.format)
+        capture = base.read_capture(folder, read)
         data, more = infer(data, **_of_capture(data, capture))
         lines += [*_facts_of(data, capture), *more]
     if data.up:
@@ -187,6 +188,8 @@ def _facts_of(data, capture):
     """Returns lines about what the reader has chosen and skipped."""
     lines = [f"read          {choice}" for choice in capture.choices]
     lines += [f"note          {note}" for note in capture.notes]
+    if rays := pixel_rays.rays_line([downscaled_copies.with_size(frame).camera for frame in capture.frames]):
+        lines.append(f"rays          {rays}")
     masks = [frame.mask for frame in capture.frames if frame.mask is not None]
     if masks:
         where = f"{len(masks)} of {len(capture.frames)} images have one, such as {masks[0]}"
@@ -353,6 +356,14 @@ def _in_world(data, capture):
     if data.world == "around":
         return world.center(capture, up=axis_of(data.up) if data.up else None)
     return capture, np.eye(4)
+
+
+def is_there(data: DataOptions) -> bool:
+    """Returns whether the dataset has a folder that exists, or needs none."""
+    try:
+        return not needs_folder(data.format) or dataset_folder(data.dir).is_dir()
+    except ValueError:
+        return False
 
 
 def dataset_folder(name: str) -> pathlib.Path:

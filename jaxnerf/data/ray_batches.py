@@ -222,6 +222,8 @@ def _known_depth(views, view, chosen, place, rays, ndc):
         for values, index in ((sparse.positions, jnp.asarray(sparse.point)[chosen]), (views.cameras.to_world, view))
     )
     depth = ((pose[:, :, 3] - position) * pose[:, :, 2]).sum(axis=-1)  # along the axis, as t of the rays
+    if views.cameras.lens == "fisheye":  # whose rays may run sideways
+        depth = ((position - pose[:, :, 3]) * rays.directions).sum(axis=-1) / (rays.directions**2).sum(axis=-1)
     if ndc:
         depth = 1 + 1 / position[:, 2]  # t of `ndc_rays`: 0 at z = -1, 1 at infinity
     weight = 1.0 if sparse.confidence is None else jnp.asarray(sparse.confidence)[chosen]

@@ -4,7 +4,6 @@ import json
 import math
 import os
 import pathlib
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -26,6 +25,7 @@ PROVENANCE = "provenance.json"
 _AGAIN = "remove it, and the same command scores that view again"
 _KEPT, _WORKING = ("color", "gt-color", "depth"), ("rows", "contact_sheet")
 _MEANS = ("psnr", "ssim", "psnr_float", "psnr_truncated", "psnr_aligned", "ssim_aligned")  # over the images
+_SOME = ("lpips", "psnr_one_ray", "ssim_one_ray")
 FOLDERS = _KEPT + _WORKING
 
 
@@ -136,13 +136,13 @@ def merge(
         file.write_text(json.dumps(results, indent=2) + "\n")
     old = target.with_name(target.name + ".old")
     if overwrite and target.exists():  # a process killed between the two moves loses neither result
-        shutil.rmtree(old, ignore_errors=True)  # left by such a process
+        atomic_files.remove(old)  # left by such a process
         os.replace(target, old)
     os.replace(partial, target)
     for name in _WORKING:
-        shutil.rmtree(target / name, ignore_errors=True)
+        atomic_files.remove(target / name)
     atomic_files.sweep(target)
-    shutil.rmtree(old, ignore_errors=True)
+    atomic_files.remove(old)
     return results
 
 
@@ -160,12 +160,13 @@ def results_of(
     seconds = sum(row["seconds"] for row in timed) / len(timed)
     trained = [row for row in metric_log.read_rows(workdir) if row["step"] <= provenance["step"]]
     conventions = {**dataset.conventions(run.experiment.config.data), "chunk": run.experiment.config.eval.chunk}
-    rays_per_pixel = run.experiment.config.train.rays_per_side**2
+    usual = run.experiment.config.train.rays_per_side**2
+    rays = sum(view["rays"] * view["row"].get("rays_per_pixel", usual) for view in finished)
     return {
         **means(rows),
         "views": len(rows),
         # The rate of one process, averaged over all processes that rendered.
-        "rays_per_second": rays_per_pixel * sum(view["rays"] for view in finished) / len(rows) / seconds,
+        "rays_per_second": rays / len(rows) / seconds,
         "seconds_per_frame": seconds,
         "step": provenance["step"],
         "rays_seen": trained[-1].get("rays") if trained else None,
@@ -180,8 +181,8 @@ def results_of(
 
 
 def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Returns the mean over the images of each metric; that of lpips where all have it."""
-    names = [*_MEANS, *(["lpips"] if all("lpips" in row for row in rows) else [])]
+    """Returns the mean over the images of each metric; those of `_SOME` where all have them."""
+    names = [*_MEANS, *(name for name in _SOME if all(name in row for row in rows))]
     return {key: float(np.mean([row[key] for row in rows])) for key in names}
 
 

@@ -23,7 +23,7 @@ from jaxnerf.evaluation import aggregate, output_images
 from jaxnerf.evaluation.metrics import image_metrics, object_mask, pixel_mask
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
-from jaxnerf.evaluation.supersampling import render_pixels
+from jaxnerf.evaluation.supersampling import rays_per_side_of_views, render_pixels, training_cameras
 from jaxnerf.runtime import atomic_files, devices, memory, processes, shards, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
@@ -164,6 +164,9 @@ def score_run(
         memory.release()
     views = refined_views(run, views, split, variables[0])
     partial, provenance = target.with_name(target.name + ".tmp"), _provenance(run, variables, views, split, step)
+    sides = rays_per_side_of_views(run, views, training_cameras(run, workdir, variables[0]))
+    if (sides > run.experiment.config.train.rays_per_side).any():
+        provenance["rays_per_pixel"] = fingerprint(sides)
     if predictor is not None:
         provenance["uncertainty"] = predictor.identity
     if target.exists() and not overwrite:
@@ -173,7 +176,8 @@ def score_run(
         with atomic_files.naming(partial):
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
-            _score_views(run, functools.partial(render_pixels, run, variables, views), views, partial, shard, predictor)
+            render = functools.partial(render_pixels, run, variables, views)
+            _score_views(run, render, views, sides, partial, shard, predictor)
 
             def summarize(finished):
                 results = aggregate.results_of(run, workdir, views, variables, finished, provenance)
@@ -233,6 +237,9 @@ def summary(results: dict[str, Any]) -> str:
     metrics = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
     if "lpips" in results:
         metrics += f", LPIPS {results['lpips']:.4f}"
+    if "psnr_one_ray" in results:
+        metrics += f" ({results['psnr_one_ray']:.2f} dB, {results['ssim_one_ray']:.4f} with one ray a pixel: these "
+        metrics += "images are smaller than those of training, and have several rays, as frames have)"
     if results.get("exposure"):
         metrics += f" ({results['psnr_aligned']:.2f} dB, {results['ssim_aligned']:.4f} after colour alignment)"
     shared = results.get("conventions", {}).get("shared_with_training")
@@ -249,8 +256,8 @@ def summary(results: dict[str, Any]) -> str:
     return f"{step}{metrics} over {results['views']} views{speed}{errors}{paired}{note}"
 
 
-def _score_views(run, render, views, folder, shard, predictor):
-    """Renders and scores those views of a shard that are not finished."""
+def _score_views(run, render, views, sides, folder, shard, predictor):
+    """Renders and scores those views of a shard that are not finished, with rays along the `sides` [V] of a pixel."""
     count = len(views.names)
     frames = shards.indices_of(range(count), shard)
     files = [aggregate.view_files(folder, index, count=count, errors=predictor is not None) for index in frames]
@@ -262,10 +269,14 @@ def _score_views(run, render, views, folder, shard, predictor):
         name, (height, width) = views.names[index], (int(value) for value in views.size[index])
         pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
         started = time.perf_counter()
-        image, depth = jax.block_until_ready(render(index, pixels))
+        image, depth = jax.block_until_ready(render(index, pixels, side=int(sides[index])))
         seconds = time.perf_counter() - started
         truth = views.image(index)
         row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
+        if (sides > run.experiment.config.train.rays_per_side).any():
+            plain = image_metrics(render(index, pixels, side=1)[0].rgb, truth, pixel_mask(views, index))
+            row |= {"rays_per_pixel": int(sides[index]) ** 2}
+            row |= {f"{name}_one_ray": plain[name] for name in ("psnr", "ssim")}
         if predictor is not None:
             masks = pixel_mask(views, index), object_mask(views, index)
             rays = run.experiment.view_rays(views, index, pixels)

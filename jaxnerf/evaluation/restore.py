@@ -19,6 +19,7 @@ from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
 from jaxnerf.training.state import rendered_shapes
+from jaxnerf.training.stored_cameras import is_of_run, training_views, without_images
 from jaxnerf.training.workdir import load_config
 
 
@@ -68,10 +69,12 @@ def _restore(workdir, config, data_dir, settings, *, crop):
     config = _with_settings(config, settings)
     config, _ = auto_config.resolve_for_device(config, training=False)
     experiment = build.render_parts(config)
+    read = functools.partial(_load_split, workdir, config, bool(data_dir), experiment.load_split)
+    experiment = experiment._replace(load_split=read)
     checkpoints = Checkpoints(workdir)
     model, bake = experiment.model, None
     if config.eval.bake_occupancy and model.grid_schedule is None:
-        views = experiment.load_split("train")
+        views = experiment.load_split("train", images=bool(auto_fields(config)))
         if auto_fields(config):  # of a run that was converted without its dataset
             config = auto_config.resolve_for_device(auto_config.resolve(config, views).config, training=False)[0]
         options = {"view_rays": experiment.view_rays, "pixel_offset": config.data.pixel_offset}
@@ -117,6 +120,21 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         model_with,
         {name: getattr(options, name) for name in changing(options, Changes.IMAGES)},
     )
+
+
+def _load_split(workdir, config, is_elsewhere, read, split, *, images=True, **options):
+    """Does what `RenderParts.load_split` describes; is_elsewhere: whether the dataset is another one than the run's."""
+    there = dataset.is_there(config.data)
+    stored = split == "train" and (images is False or not (images or there))
+    if stored and not is_elsewhere and is_of_run(workdir, config):
+        return training_views(workdir)
+    if not there:
+        raise ValueError(
+            f"this needs the images of the split {split!r}, and data.dir is {config.data.dir!r}: no such folder; give "
+            "--data_dir of the dataset"
+        )
+    views = read(split, **options)
+    return without_images(views) if images is False else views
 
 
 def dataset_at(config: RunConfig, folder: str | None) -> RunConfig:

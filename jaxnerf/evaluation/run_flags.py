@@ -67,7 +67,7 @@ def define(done: str, written: str, *, required: bool = False) -> RunFlags:
     return RunFlags(
         workdir=flags.DEFINE_string("workdir", None, "The run's folder.", required=required),
         data_dir=flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir."),
-        step=flags.DEFINE_integer("step", None, f"The checkpoint's step. When it is not given, the newest is {done}."),
+        step=cli.define_step(f"The checkpoint's step. When it is not given, the newest is {done}."),
         chunk=cli.define_count(
             "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
         ),
@@ -77,7 +77,7 @@ def define(done: str, written: str, *, required: bool = False) -> RunFlags:
             "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
             "config.eval.bake_occupancy.",
         ),
-        max_uncertainty=cli.define_number("max_uncertainty", MAX_UNCERTAINTY),
+        max_uncertainty=cli.define_fraction("max_uncertainty", MAX_UNCERTAINTY),
         uncertainty=flags.DEFINE_string(
             "uncertainty",
             None,

@@ -5,7 +5,9 @@ larger pixel shows a point of what the pixel should average; rays as dense as th
 """
 
 import dataclasses
+import functools
 import math
+import os
 from typing import Any, NamedTuple
 
 import jax
@@ -16,9 +18,11 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 from jaxnerf.core.types import Rendering
 from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt
-from jaxnerf.evaluation.restore import TrainedRun
+from jaxnerf.evaluation.restore import TrainedRun, refined_views
+from jaxnerf.training.stored_cameras import training_views
 
 MAX_RAYS = 16  # per pixel: at an eighth of the size of training they are a quarter of the rays of a full image
+_SMALLER = 0.9  # times the pixels of the smallest training image
 _RAYS_PER_CALL = 2**20  # a small image's are rendered together, as a chunk is mostly empty otherwise
 
 
@@ -71,6 +75,27 @@ def trained_footprint(run: Any, views: Views) -> Footprint:
         distance=math.inf if config.data.ndc else float(look_at.distance.max()),
         covered=per_ray * usual / float(np.quantile(focal, 0.05)) if sized else per_ray,
     )
+
+
+def training_cameras(run: TrainedRun, workdir: str | os.PathLike, params: Any) -> Views:
+    """Returns the Views that a run was trained on, with refined cameras, also if it now has another --data_dir."""
+    read = functools.partial(run.experiment.load_split, "train", images=False)
+    return refined_views(run, training_views(workdir, read), "train", params)
+
+
+def rays_per_side_of_views(run: TrainedRun, views: Views, trained: Views) -> Int[np.ndarray, " V"]:
+    """Returns how many rays along each side of a pixel score views: those of training, as published protocols have.
+
+    Images that are smaller than all of training have as many as frames of a camera path.
+
+    Args:
+        run: TrainedRun.
+        views: that are scored.
+        trained: see `training_cameras`.
+    """
+    own, (size, least) = run.experiment.config.train.rays_per_side, (np.prod(each.size, 1) for each in (views, trained))
+    sides = trained_footprint(run, trained).rays_per_side(views.cameras.to_world, views.cameras.focal)
+    return np.where(size < _SMALLER * least.min(), np.maximum(sides, own), own)
 
 
 def render_pixels(

@@ -9,7 +9,7 @@ import jax
 from jaxnerf.core.types import Background, Rendering, SceneFn
 from jaxnerf.fields.base import Field
 from jaxnerf.models.grid_schedule import GridSchedule
-from jaxnerf.options import BELOW_ONE, POSITIVE, Box, Changes, Device, Facts, Options, at_least, infer, option
+from jaxnerf.options import BELOW_ONE, Box, Changes, Device, Facts, Options, Range, between, infer, option
 
 FINAL_NETWORK = "fine"  # the network of the final rendering, whose field the config names
 _SAMPLE_MULTIPLIER = 1.5  # samples of images over those of training: no jitter averages over a step in rendering
@@ -19,11 +19,11 @@ _SAMPLE_MULTIPLIER = 1.5  # samples of images over those of training: no jitter 
 class ViewOptions(Options):
     """The options of images: how a trained model renders them."""
 
-    chunk: int = option("auto", "rays per rendered chunk", range=at_least(1), auto=True, changes=Changes.SPEED)
+    chunk: int = option("auto", "rays per rendered chunk", range=between(1, 2**24), auto=True, changes=Changes.SPEED)
     sample_multiplier: float = option(
         1.0,
         "samples per ray of images, divided by those of training; auto: 1.5",
-        range=POSITIVE,
+        range=Range("more than 0 and at most 64", lambda value: 0 < value <= 64),
         auto=True,
         changes=Changes.IMAGES,
     )
@@ -36,7 +36,7 @@ class ViewOptions(Options):
         1e-3, "with a grid: the transmittance below which a ray is terminated", range=BELOW_ONE, changes=Changes.IMAGES
     )
     max_samples: int = option(
-        "auto", "with a grid: size of the sample buffer", range=at_least(1), auto=True, changes=Changes.SPEED
+        "auto", "with a grid: size of the sample buffer", range=between(1, 2**28), auto=True, changes=Changes.SPEED
     )
 
     def resolve(self, facts: Facts, device: Device) -> tuple["ViewOptions", list[str]]:

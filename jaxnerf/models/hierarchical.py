@@ -12,8 +12,10 @@ from jaxnerf.core.types import Background, without_samples
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.fields.mlp import FIELD as MLP
 from jaxnerf.models.base import Model, SamplerContext
-from jaxnerf.options import Options, at_least, option
+from jaxnerf.options import Options, at_least, between, option
 from jaxnerf.registry import Part
+
+_MAX_SAMPLES = 16_384  # per ray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,9 +24,9 @@ class HierarchicalOptions(Options):
 
     needs_box = False
 
-    num_coarse: int = option(64, "samples per ray for the coarse network", range=at_least(1))
+    num_coarse: int = option(64, "samples per ray for the coarse network", range=between(1, _MAX_SAMPLES))
     num_fine: int = option(
-        128, "additional samples per ray for the fine network; 0: no coarse network", range=at_least(0)
+        128, "additional samples per ray for the fine network; 0: no coarse network", range=between(0, _MAX_SAMPLES)
     )
     rule: str = option(
         "segments",

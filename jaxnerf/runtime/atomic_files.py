@@ -131,6 +131,23 @@ def check_tree(folder: str | os.PathLike, *, links: bool = False) -> None:
             raise ValueError(f"{path}: is {kind}, expected a folder or a regular file; remove it")
 
 
+def check_utf8(path: str | os.PathLike) -> None:
+    """Raises a ValueError if a path is not UTF-8, as the libraries that write checkpoints need it."""
+    try:
+        os.path.abspath(path).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{path}: is not UTF-8 with the folders that it lies in; rename them, or use others") from None
+
+
+def remove(path: str | os.PathLike) -> None:
+    """Removes a file, or a folder as far as possible, if there is one; a link itself, not what it names."""
+    path = pathlib.Path(path)
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
 @contextlib.contextmanager
 def partial_file(path: str | os.PathLike, suffix: str = ".tmp", *, mode: int = 0o666) -> Iterator[pathlib.Path]:
     """Yields the path of a new, empty file to write to, and then moves that file to `path`.
@@ -213,9 +230,9 @@ def partial_folder(target: str | os.PathLike) -> Iterator[pathlib.Path]:
         if target.exists():
             target.rename(replaced)
         partial.rename(target)
-        shutil.rmtree(replaced, ignore_errors=True)
+        remove(replaced)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove(partial)
         if lock >= 0:
             os.close(lock)
 

@@ -20,7 +20,7 @@ from typing import Any
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from jaxnerf.options import Option, at_least, is_auto, is_tuple
+from jaxnerf.options import MAX_INT, Option, between, is_auto, is_tuple
 from jaxnerf.registry import READERS, needs_folder
 from jaxnerf.runtime import failed_imports, signals, stages
 
@@ -34,7 +34,7 @@ def run(
     *,
     positional: bool = False,
     prepare: Callable[[list[str]], list[str]] = list,
-    stopped: str = "before anything was saved; the same command starts again",
+    stopped: str | Callable[[], str] = "before anything was saved; the same command starts again",
 ) -> None:
     """Parses the flags, imports the plugins and calls main(argv).
 
@@ -46,7 +46,8 @@ def run(
         positional: whether arguments that are not flags are accepted, as argv[1:].
         prepare: called with the command line once the plugins are imported, before flags are parsed: it may define
             flags, and returns the command line that is parsed.
-        stopped: completes the message "stopped ..." after a signal: what was saved, and how to continue.
+        stopped: completes the message "stopped ..." after a signal: what was saved, and how to continue; a function
+            that returns it where that depends on the flags.
     """
     signals.keep_streams()
     sys.excepthook = failed_imports.show
@@ -74,6 +75,8 @@ def run(
             result = main(argv)
             sys.stdout.flush()
             return result
+        except UnicodeEncodeError as error:
+            _leave(1, f"a name is not UTF-8: {error.object[:200]!r} ({error.reason}); rename the file or the folder")
         except (ValueError, OSError) as error:
             _leave(1, error)
         except MemoryError as error:
@@ -87,6 +90,8 @@ def run(
         _leave(1, error)
     except KeyboardInterrupt as interrupt:
         code = 128 + (interrupt.args or (signal.SIGINT,))[0]
+        if callable(stopped):
+            stopped = stopped() if flags.FLAGS.is_parsed() else "before anything was read"
         print(f"stopped {stopped}", file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
@@ -163,12 +168,17 @@ def given_flag(name: str, argv: Sequence[str]) -> str:
 
 def define_count(name: str, help: str) -> flags.FlagHolder:
     """Defines a flag that is "auto" or an integer of at least 1; None when it is not given."""
-    return flags.DEFINE(_Value(int, auto=True, range=at_least(1)), name, None, help)
+    return flags.DEFINE(_Value(int, auto=True, range=between(1, MAX_INT)), name, None, help)
 
 
-def define_number(name: str, help: str) -> flags.FlagHolder:
-    """Defines a flag that is "auto" or a number; None when it is not given."""
-    return flags.DEFINE(_Value(float, auto=True), name, None, help)
+def define_fraction(name: str, help: str) -> flags.FlagHolder:
+    """Defines a flag that is "auto" or a number from 0 to 1; None when it is not given."""
+    return flags.DEFINE(_Value(float, auto=True, range=between(0, 1)), name, None, help)
+
+
+def define_step(help: str) -> flags.FlagHolder:
+    """Defines --step, that of a checkpoint; None when it is not given."""
+    return flags.DEFINE_integer("step", None, help, lower_bound=0)
 
 
 def define_option(name: str, declared: Option, kind: Any, help: str) -> flags.FlagHolder:
@@ -268,6 +278,10 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         sys.exit(0)
     try:
         rest = flags.FLAGS(argv)
+        for flag in (flags.FLAGS[name] for name in flags.FLAGS):
+            number = isinstance(flag.value, int | float) and "." not in flag.name  # options have their own ranges
+            if number and not abs(flag.value) <= MAX_INT:  # nor NaN, which is in every range of absl
+                _leave(2, f"--{flag.name} is {str(flag.value):.40}, expected at most {MAX_INT:,}; correct it")
         verbosity = flags.FLAGS["verbosity"]
         if not verbosity.present or verbosity.value in (0, 1):
             level = std_logging.INFO if verbosity.present else std_logging.WARNING

@@ -1,8 +1,4 @@
-"""Text that comes from files of unknown origin, made safe to print.
-
-Names and values in such files may contain sequences that move a terminal's cursor, set its title, or reverse the order
-of the characters that follow.
-"""
+"""Text of unknown origin, made safe to print: names in files may move a terminal's cursor or reverse what follows."""
 
 import re
 
@@ -13,12 +9,7 @@ _FORMULA = ("=", "+", "-", "@", "\\t", "\\r", "\uff1d", "\uff0b", "\uff0d", "\uf
 
 
 def printable(text: object, keep: str = "") -> str:
-    """Returns a text with an escape such as \\x1b in place of each character that could change how others are shown.
-
-    Args:
-        text: any object, by its str().
-        keep: such characters that stay.
-    """
+    """Returns str(text) with an escape, such as \\n, in place of each unsafe character that is not in `keep`."""
     return _UNSAFE.sub(lambda found: found[0] if found[0] in keep else ascii(found[0])[1:-1], str(text))
 
 

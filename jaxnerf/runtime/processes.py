@@ -91,7 +91,7 @@ def cluster(
 
 def _check(coordinator, num_processes, process_id):
     host, _, port = coordinator.rpartition(":")
-    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ValueError(f"--coordinator is {coordinator!r}, expected HOST:PORT of process 0")
     if num_processes is None or process_id is None or not 0 <= process_id < num_processes:
         raise ValueError(

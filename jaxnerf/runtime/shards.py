@@ -7,7 +7,6 @@ its files exist; each file appears completely or not at all, see `atomic_files`.
 import json
 import pathlib
 import re
-import shutil
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -74,8 +73,8 @@ def make_folder(
     Raises:
         ValueError: if the folder holds frames of another provenance; names what differs.
     """
-    if overwrite and folder.exists():
-        shutil.rmtree(folder)
+    if overwrite:
+        atomic_files.remove(folder)
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / file).exists() and all(path.suffix == ".tmp" for path in folder.iterdir()):
         atomic_files.write_text_once(folder / file, json.dumps(provenance, indent=2) + "\n")

@@ -38,7 +38,15 @@ def interrupt(number: int, _: Any) -> None:
     global _stopping
     _stopping = True
     handle(lambda number, _: os._exit(128 + number))
+    sys.unraisablehook = _raise_again
     raise KeyboardInterrupt(number)
+
+
+def _raise_again(ignored):
+    """Repeats an interrupt that has reached a callback of the garbage collector, where Python ignores exceptions."""
+    if ignored.exc_type is KeyboardInterrupt:
+        handle(interrupt)
+        threading.Timer(0.01, os.kill, (os.getpid(), ignored.exc_value.args[0])).start()
 
 
 class Interrupt:

@@ -8,6 +8,7 @@ import jax
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.facts import dataset_facts
+from jaxnerf.data.readers.base import TIME_UNUSED
 from jaxnerf.data.scene import bounded_by_alpha, resolve_background, resolve_scene
 from jaxnerf.options import Changes, Device, Facts, changing, is_auto, replaced
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
@@ -95,6 +96,8 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     left = [name for name in auto_fields(config) if name not in device_fields(config)]
     if left:
         raise ValueError(f"{left[0]} is 'auto', which is not inferred for this field; set a value")
+    if views.time is not None and "time" not in build_model(resolve_for_device(config, training=False)[0]).needs:
+        lines.append(f"time          {TIME_UNUSED}")
     return Resolved(config, views, lines + more + near)
 
 

@@ -15,6 +15,7 @@ from jaxnerf.data import dataset, ray_batches
 from jaxnerf.data.active_pixels import active_region, unmasked_pixels
 from jaxnerf.data.facts import footprint_radii
 from jaxnerf.data.geometry.free_space import interpolated_depths
+from jaxnerf.data.images.pixel_rays import sees_sideways
 from jaxnerf.data.observations import confident_observations
 from jaxnerf.data.scene import bounded_by_alpha
 from jaxnerf.fields.base import Field, contract_field
@@ -39,7 +40,8 @@ class RenderParts(NamedTuple):
         config: resolved.
         model: the config's field and sampler; its parameters have those of the training images, too.
         cameras: the parameters of the training images; None where the config has none.
-        load_split: split -> Views.
+        load_split: (split, images=True) -> Views. With images=False they have no pixels, and of a restored run those
+            of the split "train" come from its workdir; None: they have pixels if the dataset is there.
         view_rays: (Views, index, pixels) -> Rays.
         world_depth: (Views, index, pixels, depth in t) -> distance in the file's units.
         background: [3] the colour behind the scene; None: black.
@@ -361,7 +363,8 @@ def _prepare(config, model, extras, views):
             model.grid_schedule,
             # What is empty in one image of a scene that moves may hold matter in others.
             use_alpha=bounded_by_alpha(config.scene, views, ndc=config.data.ndc),
-            min_views=model.grid_schedule.min_views if views.time is None else 0,
+            # Nor does it where a lens sees beside it: its view is not that of a frustum.
+            min_views=0 if views.time is not None or sees_sideways(views) else model.grid_schedule.min_views,
             ndc=config.data.ndc,
             pixel_offset=config.data.pixel_offset,
         )
@@ -385,8 +388,9 @@ def _prepare(config, model, extras, views):
     return cells, TrainData(seed, drawn, active, indices, progress=progress, radii=radii)
 
 
-def _load_views(config, needs, split, **options):
+def _load_views(config, needs, split, *, images=True, **options):
     """Returns the Views of a split; a scene that asks for the image_index gets 0 for views that are not trained on."""
+    del images  # they are read
     views = dataset.load_split(config.data, split, fingerprint=config.fingerprint, **options)
     if split == "train" or "image_index" not in needs:
         return views

@@ -26,6 +26,7 @@ class Checkpoints:
 
     def __init__(self, workdir: str | os.PathLike, *, max_to_keep: int | None = None):
         """Opens the folder; max_to_keep: how many of the newest to keep, None for reading only."""
+        atomic_files.check_utf8(workdir)
         self._folder = pathlib.Path(workdir).absolute() / "checkpoints"
         policies = ocp.training.preservation_policies
         self._preservation = policies.LatestN(max_to_keep) if max_to_keep else None
@@ -106,6 +107,8 @@ class Checkpoints:
             metadata = atomic_files.read_json(self._folder / str(step) / "_CHECKPOINT_METADATA", "it was changed")
             yield metadata["custom_metadata"]
         except Exception as error:  # orbax raises many kinds
+            if isinstance(_cause(error), KeyboardInterrupt):
+                raise _cause(error) from None
             raise ValueError(
                 f"{self._folder / str(step)}: cannot be read as this model's state ({_reason(error)}); "
                 "remove it to continue from the previous checkpoint"
@@ -215,7 +218,13 @@ def _silence_orbax():
     sys.unraisablehook = hook
 
 
-def _reason(error):
-    while error.__cause__ is not None:  # the first error of orbax's chain says what went wrong
+def _cause(error):
+    """Returns the first error of orbax's chain, which says what went wrong."""
+    while error.__cause__ is not None:
         error = error.__cause__
+    return error
+
+
+def _reason(error):
+    error = _cause(error)
     return (str(error).splitlines() or [type(error).__name__])[0][:400]

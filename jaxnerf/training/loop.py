@@ -10,7 +10,7 @@ import jax
 
 from jaxnerf.core.views import Views
 from jaxnerf.runtime import devices, memory, processes, signals, stages
-from jaxnerf.training import build, metric_log, workdir
+from jaxnerf.training import build, metric_log, stored_cameras, workdir
 from jaxnerf.training.auto_config import resolve, resolve_for_device
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.compiled_step import compile_training
@@ -67,6 +67,7 @@ def train(
         def claim_workdir():
             stack.enter_context(workdir.workdir_lock(folder))
             workdir.save_config(folder, config)
+            stored_cameras.save(folder, config, views)
 
         processes.run_on_first(claim_workdir, pathlib.Path(folder) / "config.json")
         lines += [processes.Detail(line) for line in device_lines]

@@ -40,7 +40,7 @@ def save_config(workdir: str | os.PathLike, config: RunConfig) -> None:
     elif (path.parent / "checkpoints").exists():
         raise ValueError(f"{workdir}: has checkpoints but no config.json; give another --workdir")
     path.parent.mkdir(parents=True, exist_ok=True)
-    for name in ("config.json", "metrics.jsonl"):
+    for name in ("config.json", "metrics.jsonl", "cameras.npz"):
         for partial in path.parent.glob(f"{name}.*.tmp"):
             if not partial.is_dir():
                 partial.unlink(missing_ok=True)
@@ -156,6 +156,7 @@ def workdir_lock(workdir: str | os.PathLike) -> Iterator[None]:
             what training writes to another place; names the folder or the link.
     """
     path = pathlib.Path(workdir) / "running"
+    atomic_files.check_utf8(workdir)
     for name in _FOLDERS:
         atomic_files.check_tree(path.with_name(name))
     try:

@@ -13,6 +13,7 @@ from jaxnerf import (
     ndc_rays,
     ndc_to_t,
     pixel_grid,
+    pixel_radius,
     points_on_rays,
     rays_from_pixels,
     undistort,
@@ -273,6 +274,45 @@ def test_batch_is_vmap_is_jit():
     assert_batch_is_vmap_is_jit(lambda p: rays_from_pixels(bent, p, near=1.0, far=2.0), pixels)
     assert_batch_is_vmap_is_jit(lambda rays: ndc_rays(rays, camera), rays)
     assert_batch_is_vmap_is_jit(ndc_to_t, jnp.full((6, 8), 0.3), rays)
+
+
+@pytest.mark.parametrize("k", [(0.0, 0.0, 0.0, 0.0), (0.02, -0.001, 0.0, 0.0)])
+def test_a_fisheye_sees_beside_and_behind_itself(k):
+    """Equidistant up to 179 degrees from the axis; the plane at distance 1 ends at 90."""
+    camera = a_camera("fisheye", k)
+    angle, around = np.radians([0, 30, 79.9, 80.1, 89, 91, 120, 160, 179]), np.linspace(0, 2 * np.pi, 9)
+    bent = angle * (1 + k[0] * angle**2 + k[1] * angle**4)
+    spread = np.stack([np.cos(around), np.sin(around)], axis=-1)
+    pixels = np.float32(bent[:, None] * spread * [50, 60] + [41, 29])
+    rays = fast_rays(camera, pixels, near=2.0, far=6.0)
+    rotation, eye = np.asarray(camera.to_world[:, :3]), np.asarray(camera.to_world[:, 3])
+    expected = np.stack([*(np.sin(angle) * spread.T * [[1], [-1]]), -np.cos(angle)], axis=-1)
+    np.testing.assert_allclose(rays.viewdirs @ rotation, expected, atol=3e-6)
+    np.testing.assert_array_equal(rays.far, 6)
+    lengths = 1 / np.cos(np.minimum(angle, np.radians(80)))
+    np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=-1), lengths, rtol=2e-4)
+    found, t = fast_project(camera, rays.origins + 3 * rays.directions)
+    np.testing.assert_allclose(found, pixels, atol=2e-3)
+    np.testing.assert_allclose(t, 3, rtol=1e-5)
+    np.testing.assert_array_equal(fast_undistort(camera, pixels)[1], angle < np.pi / 2)
+    axes = dataclasses.replace(camera, to_world=np.eye(3, 4, dtype=np.float32))
+    behind = fast_project(axes, np.float32([0, 0, 1]))[0]
+    all_around = np.pi * (1 + k[0] * np.pi**2 + k[1] * np.pi**4)
+    beyond = fast_rays(camera, np.float32([[41 + 50 * 1.02 * all_around, 29]]), near=2.0, far=6.0)
+    assert not np.isfinite(behind).any() and beyond.far == beyond.near and all_finite(beyond)
+    # A pixel's solid angle is that of its cone: its radius over the ray's length, 2 / sqrt(12) of its side.
+    stretch = (np.sin(angle[1:]) / bent[1:]) / (1 + 3 * k[0] * angle[1:] ** 2 + 5 * k[1] * angle[1:] ** 4)
+    slant = np.where(angle[1:] < np.radians(80), np.cos(angle[1:]), 1)
+    radius = np.asarray(compiled(pixel_radius)(camera, pixels))[1:] / lengths[1:]
+    np.testing.assert_allclose(radius, np.sqrt(stretch / 3000 / slant / 3), rtol=3e-3)
+
+    def total(x):
+        pixels, t = project(camera, x)
+        return jnp.where(jnp.isfinite(pixels), pixels, 0).sum() + t.sum()
+
+    inside = np.asarray(rays.origins + 3 * rays.directions)
+    slopes = jax.jit(jax.vmap(jax.grad(total)))(np.float32([*inside, eye, eye + rotation @ [0, 0, 1]]))
+    assert all_finite(slopes)
 
 
 def test_wrong_arguments():

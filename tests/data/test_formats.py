@@ -325,3 +325,20 @@ def test_the_real_datasets(scenes_dir, name, format, world, ndc):
     assert data.factor == {"fern": 20, "fox": 5, "can": 4, "lego": 4}[name]
     skipped = [line for line in lines if line.startswith("note")]
     assert len(skipped) == (1 if name == "fox" else 0)
+
+
+def test_of_several_formats_the_one_that_can_be_read_is_named(tmp_path):
+    """A COLMAP model beside a transforms.json with the paths of another machine."""
+    shots = captures.noise(captures.orbit(8))
+    captures.write_colmap(tmp_path, shots)
+    content = captures.write_transforms(tmp_path, shots)
+    for frame in content["frames"]:
+        frame["file_path"] = "/home/other/capture/" + frame["file_path"].replace("0", "frame_0")
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="leaves the folder.*; --format=colmap reads this folder"):
+        dataset.load_dataset(tmp_path, split="train")
+    assert len(dataset.load_dataset(tmp_path, split="train", format="colmap").size) == 7
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("")
+    with pytest.raises(ValueError, match="leaves the folder") as error:
+        dataset.load_dataset(tmp_path, split="train")
+    assert "--format" not in str(error.value)

@@ -83,7 +83,7 @@ def test_exponentials_have_their_digits():
 
 def test_doubling_the_segments_changes_less_than_a_thousandth():
     stack = jax.tree.map(lambda leaf: leaf[::4], synthetic._cameras("test", 32))
-    once, twice = (_over_white(synthetic.render_views(stack, num_segments=n)) for n in (384, 768))
+    once, twice = (_over_white(synthetic.render_views(stack, num_segments=n)) for n in (256, 512))
     assert np.abs(once - twice).max() < 1e-3
 
 

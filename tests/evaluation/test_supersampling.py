@@ -9,9 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Rays
+from jaxnerf.evaluation.evaluate import score_run, summary
+from jaxnerf.evaluation.metrics import image_metrics
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.evaluation.supersampling import Footprint, render_pixels, trained_footprint
+from jaxnerf.training.config import changed
+from jaxnerf.training.workdir import load_config
 from runs import render_path
 
 pytest_plugins = ["run_fixtures"]
@@ -87,3 +92,23 @@ def test_cones_of_parts_of_a_pixel_are_narrower(trained):
     middle = run.experiment.view_rays(views, 0, pixels)
     np.testing.assert_allclose(rays.directions.mean(axis=0), middle.directions, atol=1e-6)
     assert isinstance(rays, Rays) and trained_footprint(run, views).covered == 1
+
+
+def test_images_smaller_than_those_of_training_are_scored_as_they_are_shown(trained, tmp_path):
+    """The figures of one ray stand beside them; those of images of the size of training are as they were."""
+    workdir = shutil.copytree(trained, tmp_path / "run")
+    config, results = load_config(workdir), {}
+    for scale in (1, 2):
+        run = restore_run(workdir, changed(config, {"data.size": config.data.size // scale}))
+        results[scale] = score_run(run, workdir, overwrite=True)
+    assert "psnr_one_ray" not in results[1] and "one ray" not in summary(results[1])
+    found, variables, views = results[2], run.variables(run.steps()[-1]), run.experiment.load_split("test")
+    assert "with one ray a pixel" in summary(found)
+    assert {row["rays_per_pixel"] for row in found["images"]} == {4}
+    for side, names in ((1, ("psnr_one_ray", "ssim_one_ray")), (2, ("psnr", "ssim"))):
+        pixels = pixel_grid(*(int(value) for value in views.size[0]), offset=config.data.pixel_offset)
+        image, _ = render_pixels(run, variables, views, 0, pixels, side=side)
+        metrics = image_metrics(image.rgb, views.image(0))
+        for name, metric in zip(names, ("psnr", "ssim"), strict=True):
+            assert found["images"][0][name] == pytest.approx(metrics[metric], rel=1e-5)
+    assert abs(found["psnr"] - found["psnr_one_ray"]) > 1e-3

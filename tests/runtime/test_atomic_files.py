@@ -150,6 +150,19 @@ def test_a_folder_appears_complete_or_not_at_all(tmp_path):
     assert (target / "mesh.ply").read_text() == "new" and list(tmp_path.iterdir()) == [target]
 
 
+@pytest.mark.parametrize("link", [False, True])
+def test_a_folder_replaces_a_file_or_a_link_and_leaves_nothing_behind(tmp_path, link):
+    precious = tmp_path / "precious" / "mesh.ply"
+    precious.parent.mkdir()
+    precious.write_text("kept")
+    target = tmp_path / "mesh-10"
+    target.symlink_to(precious.parent) if link else target.write_text("a file")
+    with atomic_files.partial_folder(target) as partial:
+        (partial / "mesh.ply").write_text("new")
+    assert (target / "mesh.ply").read_text() == "new" and precious.read_text() == "kept"
+    assert sorted(tmp_path.iterdir()) == [target, precious.parent] and not target.is_symlink()
+
+
 def test_partial_folders_of_killed_processes_are_removed_and_those_of_running_ones_stay(tmp_path):
     killed = tmp_path / "mesh-10.0123456789abcdef.tmp"
     killed.mkdir()

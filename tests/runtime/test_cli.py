@@ -44,7 +44,7 @@ from jaxnerf.registry import FIELDS
 from jaxnerf.runtime import cli
 
 COUNT = cli.define_count("count", "The number of things.")
-LIMIT = cli.define_number("limit", "The most of a thing.")
+LIMIT = cli.define_fraction("limit", "The most of a thing.")
 
 def main(argv):
     print(COUNT.value, *FIELDS.names(), *[LIMIT.value] * (LIMIT.value is not None))
@@ -128,6 +128,36 @@ def test_the_saved_config_may_be_used_for_fields_only(tmp_path, monkeypatch, fla
     assert cli.with_saved_config(["program", *flags], only_for_fields=True) == ["program", *config, *flags]
 
 
+@pytest.mark.parametrize(
+    "program, flag",
+    [
+        ("eval", "--error_budget=nan"),
+        ("eval", "--error_budget=2"),
+        ("eval", "--poll_seconds=inf"),
+        ("eval", "--coverage=nan"),
+        ("eval", "--step=-1"),
+        ("eval", "--chunk=1e400"),
+        ("eval", f"--chunk={10**30}"),
+        ("render", "--fps=nan"),
+        ("render", f"--frames={10**9}"),
+        ("render", "--max_uncertainty=-inf"),
+        ("train", "--join_seconds=inf"),
+        ("train", "--heartbeat_seconds=nan"),
+        ("train", "--stopped_code=256"),
+        ("check", "--near=nan"),
+        ("check", "--far=inf"),
+        ("cameras", f"--max_size={10**30}"),
+        ("cameras", f"--num_threads={10**30}"),
+        ("export", f"--step={10**30}"),
+    ],
+)
+def test_absurd_numbers_are_refused_before_anything_is_read(tmp_path, program, flag):
+    needed = {"cameras": ["--images=none", "--out=none"], "export": ["--workdir=none", "--kind=mesh"], "check": []}
+    code, out, err = run_forked(program, *needed.get(program, ["--workdir=none"]), flag, folder=tmp_path)
+    assert code == 2 and not out
+    assert err.startswith("error: ") and err.count("\n") == 1 and flag[2:].split("=")[0] in err
+
+
 def test_a_plugin_registers_a_field(tmp_path):
     plugin = "import jaxnerf\n\njaxnerf.register_field('mine', lambda options, box: None)\n"
     (tmp_path / "my_plugin.py").write_text(plugin)
@@ -155,7 +185,12 @@ def test_a_cache_that_cannot_be_used_is_reported(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "flag, expected", [("--count=0", "auto, or an integer (at least 1)"), ("--limit=half", "auto, or a number")]
+    "flag, expected",
+    [
+        ("--count=0", "auto, or an integer (from 1 to 2,147,483,647)"),
+        ("--limit=half", "auto, or a number (from 0 to 1)"),
+        ("--limit=nan", "auto, or a number (from 0 to 1)"),
+    ],
 )
 def test_a_wrong_number_is_reported_in_one_line(tmp_path, flag, expected):
     code, out, err = call(tmp_path, flag)
@@ -282,6 +317,16 @@ def test_a_reader_that_goes_away_while_flags_are_parsed_is_one_line(flag):
     os.close(writer)
     assert done.returncode == 129
     assert done.stderr.startswith("stopped before") and len(done.stderr.splitlines()) == 1
+
+
+def test_a_name_that_no_library_takes_is_reported_in_one_line(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text("from jaxnerf.runtime import cli\ncli.run(lambda argv: 'runs/\\udcff'.encode())\n")
+    code, _, err = run_forked(program, folder=tmp_path)
+    assert (code, err) == (
+        1,
+        "error: a name is not UTF-8: 'runs/\\udcff' (surrogates not allowed); rename the file or the folder\n",
+    )
 
 
 def test_a_signal_after_the_end_prints_nothing(tmp_path):

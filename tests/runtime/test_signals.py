@@ -1,9 +1,11 @@
 """Signals stop a program once, cleanly; a second one, and a reader that goes away, print no traceback."""
 
+import gc
 import importlib
 import os
 import signal
 import sys
+import time
 
 import pytest
 
@@ -16,6 +18,7 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def program(monkeypatch):
     """Handles signals as a program does; restores the handlers afterwards."""
     monkeypatch.setattr(signals, "_stopping", False)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     old = {number: signal.getsignal(number) for number in NUMBERS}
     signals.handle(signals.interrupt)
     yield
@@ -47,6 +50,24 @@ def test_a_signal_during_an_interrupt_ends_the_process(monkeypatch):
     send(signal.SIGTERM)
     send(signal.SIGINT)
     assert codes == [143, 130]
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(capfd, number):
+    numbers = [number]
+
+    def callback(phase, info):
+        if numbers:
+            send(numbers.pop())
+
+    gc.callbacks.append(callback)
+    try:
+        with pytest.raises(KeyboardInterrupt) as raised:
+            gc.collect()
+            time.sleep(20)
+    finally:
+        gc.callbacks.remove(callback)
+    assert raised.value.args == (number,) and capfd.readouterr().err == ""
 
 
 def test_an_ignored_sighup_stays_ignored():

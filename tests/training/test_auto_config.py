@@ -527,6 +527,9 @@ def test_alpha_does_not_bound_the_box_of_a_scene_that_moves(views):
     views = dataclasses.replace(views, pixels=pixels.reshape(-1, 4))
     moving = dataclasses.replace(views, time=np.linspace(0, 1, len(views.size), dtype=np.float32))
     assert box(moving, use_alpha=True) == box(views, use_alpha=False) != box(views, use_alpha=True)
+    both = [resolve(auto_config(), each).lines for each in (views, moving)]
+    still, line = ([each for each in lines if each.startswith("time  ")] for lines in both)
+    assert not still and "images state one, which is not used: the scene is trained as static" in line[0]
 
 
 def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):

@@ -1,6 +1,7 @@
 """The ranges of numbers of a config."""
 
 import math
+import re
 
 import pytest
 from ml_collections import ConfigDict
@@ -21,7 +22,15 @@ from runs import PACKED, ROOT, smoke_config
         ("train.max_steps", -5, "expected at least 1"),
         ("train.max_seconds", -1.0, "expected at least 0"),
         ("train.max_seconds", math.nan, r"expected a finite number of at most 3.4e\+38"),
-        ("data.factor", -2, "expected at least 1"),
+        ("data.factor", -2, "expected from 1 to 4,096"),
+        ("data.size", 4096, "expected from 1 to 1,024"),
+        ("data.pixel_offset", 1e30, "expected from -1 to 1"),
+        ("eval.sample_multiplier", 1e30, "expected more than 0 and at most 64"),
+        ("eval.sample_multiplier", -1.0, "expected more than 0 and at most 64"),
+        ("eval.chunk", 2**31 - 1, "expected from 1 to 16,777,216"),
+        ("eval.max_samples", 2**31 - 1, "expected from 1 to 268,435,456"),
+        ("sampling.num_coarse", 10**9, "expected from 1 to 16,384"),
+        ("sampling.num_fine", 10**9, "expected from 0 to 16,384"),
         ("train.lr_init", 0.0, "expected more than 0"),
         ("train.beta2", 1.0, "expected at least 0 and below 1"),
         ("fine.width", 0, "expected at least 1"),
@@ -32,7 +41,7 @@ from runs import PACKED, ROOT, smoke_config
 def test_a_number_outside_its_range_makes_no_workdir(tmp_path, field, value, expected):
     config = smoke_config()
     config.update_from_flattened_dict({field: value})
-    with pytest.raises(ValueError, match=rf"--config.{field} is {value}, {expected}; correct it"):
+    with pytest.raises(ValueError, match=rf"--config.{field} is {re.escape(str(value))}, {expected}; correct it"):
         train_and_evaluate(config, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

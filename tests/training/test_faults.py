@@ -128,6 +128,23 @@ def test_if_no_checkpoint_can_be_read_none_is_renamed(folder):
 
 
 @pytest.mark.extra
+def test_a_signal_while_a_checkpoint_is_read_does_not_rename_it(folder, monkeypatch):
+    """orbax reads in a loop of its own and raises an error of its own."""
+
+    class Interrupted:
+        def reload(self):
+            """Does nothing."""
+
+        def load(self, *_):
+            """Raises what orbax does."""
+            raise RuntimeError("cannot load") from KeyboardInterrupt(signal.SIGTERM)
+
+    monkeypatch.setattr(Checkpoints, "_open", lambda self: Interrupted())
+    with pytest.raises(KeyboardInterrupt) as raised:
+        load_newest(folder, keep=3)
+    assert raised.value.args == (signal.SIGTERM,) and (folder / "checkpoints" / "20").is_dir()
+
+
 def test_run_resumes_with_another_number_of_devices(folder, trained, monkeypatch):
     """It was trained on four; only the order in which gradients are summed differs."""
     shutil.rmtree(folder / "checkpoints" / "20")
@@ -319,3 +336,20 @@ def test_partial_files_of_a_killed_run_are_removed_and_no_others(tmp_path):
         "folder.tmp",
         "config.json.folder.tmp",
     }
+
+
+def test_a_workdir_that_is_not_utf8_is_refused_before_training(tmp_path):
+    folder = os.fsdecode(os.fsencode(tmp_path) + b"/\xff")
+    for use in (Checkpoints, lambda folder: workdir_lock(folder).__enter__()):
+        with pytest.raises(ValueError, match="is not UTF-8 .* rename them"):
+            use(folder)
+    assert not os.path.exists(folder)
+
+
+def test_a_clock_that_goes_backwards_changes_nothing(folder, monkeypatch):
+    clock = iter(range(2**31, 0, -3600))
+    monkeypatch.setattr("time.time", lambda: float(next(clock)))
+    train_and_evaluate(smoke_config(max_steps=22), folder)
+    rows = metric_log.read_rows(folder)
+    seconds = [row["seconds"] for row in rows]
+    assert rows[-1]["step"] == 22 and seconds == sorted(seconds) and Checkpoints(folder).steps()[-1] == 22

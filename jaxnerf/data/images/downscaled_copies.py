@@ -69,7 +69,7 @@ def with_size(frame: Frame) -> Frame:
     """Returns the frame with a height and width in its camera: the image's if the format states none."""
     if None not in (frame.camera.height, frame.camera.width):
         return frame
-    width, height = image_size(frame.image, follow_exif=frame.follow_exif)
+    width, height = image_size(frame.image, follow_exif=frame.follow_exif, center=np.asarray(frame.camera.center))
     return frame._replace(camera=dataclasses.replace(frame.camera, height=height, width=width))
 
 

@@ -18,6 +18,7 @@ from jaxnerf.runtime.atomic_files import open_regular
 # What Pillow decodes by itself. Left to choose by a file's content, it would start Ghostscript for an EPS.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+MASK_PREFIX = "dynamic_mask_"  # of instant-ngp's masks beside images: pixels where they are not black are ignored
 _GREY_MODES = ("I;16", "I;16B", "I;16L", "I", "F")  # Pillow's, of more than 8 bits
 _ROUNDING = 1e-4  # by which floats may leave [0, 1]
 _DARK = 16  # up to this brightest value, a mask of 8 bits with several levels holds class numbers or noise
@@ -44,8 +45,8 @@ class _WrongRangeError(ValueError):
 
 
 def is_hidden(name: str) -> bool:
-    """Returns whether a file's name is that of a hidden file, such as the ._ files that macOS writes beside images."""
-    return name.startswith(".")
+    """Returns whether a file is no image by its name: a mask of instant-ngp, or hidden as the ._ files of macOS."""
+    return name.startswith((".", MASK_PREFIX))
 
 
 def read_image(
@@ -57,7 +58,8 @@ def read_image(
         path: of one of the FORMATS: 8 bits, 16 bits in a PNG or grey, or in a grey TIFF floats in [0, 1] or whole
             numbers of 32 bits up to 65535. Of several pages the first is read.
         camera_size: (height, width) that the camera's intrinsics refer to, or a multiple of the image's size.
-            If only the stored, unrotated pixels fit it, the EXIF orientation is ignored.
+            EXIF orientation is followed if only the upright image fits it: programs that compute poses ignore it, so
+            where both fit, as at half a turn, the poses are those of the pixels as they are stored.
         follow_exif: whether EXIF orientation is followed at all.
 
     Returns:
@@ -109,8 +111,9 @@ def _upright(pixels, value, camera_size):
 
 def _is_rotated(size, value, camera_size):
     """Returns whether the EXIF orientation of an image [H, W] is followed."""
-    upright = size[::-1] if value >= 5 else size
-    return value in _UPRIGHT and not (camera_size and fits(size, camera_size) and not fits(upright, camera_size))
+    if value not in _UPRIGHT or camera_size is None:
+        return value in _UPRIGHT
+    return value >= 5 and fits(size[::-1], camera_size) and not fits(size, camera_size)
 
 
 def fits(found: tuple, declared: tuple) -> bool:
@@ -133,10 +136,25 @@ def read_mask(path: str | os.PathLike, *, camera_size: tuple | None = None) -> B
     return _upright(values > values.max(initial=0) / 2, value, camera_size)
 
 
-def image_size(path: str | os.PathLike, *, follow_exif: bool = True) -> tuple[int, int]:
-    """Returns the (width, height) in px of an image file from its first bytes; see `read_image`."""
+def image_size(
+    path: str | os.PathLike, *, follow_exif: bool = True, center: Float[np.ndarray, "2"] | None = None
+) -> tuple[int, int]:
+    """Returns the (width, height) in px of an image file from its first bytes; see `read_image`.
+
+    With a principal point it is the size upright only if that point fits it better than the size as stored.
+    """
     size, value = _open(path, lambda image: (image.size, _orientation(image)))
-    return size[::-1] if follow_exif and value >= 5 else size
+    if not follow_exif or value < 5:
+        return size
+    if center is None:
+        return size[::-1]
+    return min(size, size[::-1], key=lambda each: np.abs(center - np.array(each) / 2).sum())
+
+
+def read_ignored(path: str | os.PathLike, *, camera_size: tuple | None = None) -> Bool[np.ndarray, "H W"]:
+    """Reads an image whose pixels other than black are ignored, whatever their alpha, as a mask like `read_mask`'s."""
+    ignored, value = _open(path, lambda image: (_decode(path, image)[..., :3].any(axis=-1), _orientation(image)))
+    return _upright(~ignored, value, camera_size)
 
 
 def has_alpha(path: str | os.PathLike) -> bool:

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxnerf.core.types import Camera, SparsePoints
 from jaxnerf.core.views import Views
 from jaxnerf.data.images.downscaled_copies import choose_copies, with_size
-from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_image, read_mask
+from jaxnerf.data.images.image_files import average_tiles, fits, image_form, read_ignored, read_image, read_mask
 from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers
-from jaxnerf.data.readers.base import Capture, frame_times
+from jaxnerf.data.images.pixel_rays import pixels_with_rays
+from jaxnerf.data.readers.base import Capture, Frame, frame_times
 from jaxnerf.data.readers.validation import check_background, check_factor
 
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # number of coefficients
@@ -107,9 +108,9 @@ def _load_frames(chosen, shrink, *, background, source, points):
         raise ValueError(f"{source}: has {ends[-1]} pixels, expected fewer than 2^31; raise data.factor")
     offset = np.append(0, ends[:-1]).astype(np.int32)
     pixels = _read_pixels(chosen, forms, offset, shrink, background)
-    masks = _read_masks(chosen, forms, shrink)
     bounds = np.float32([frame.bounds for frame in chosen])
     cameras = [_scaled_camera(frame, form, shrink) for frame, form in zip(chosen, forms, strict=True)]
+    masks = _read_masks(chosen, forms, shrink, pixels_with_rays(cameras))
     return Views(
         pixels=pixels,
         offset=offset,
@@ -282,28 +283,53 @@ def _read(frame, form, shrink, background, channels, dtype):
     return np.concatenate([pixels, opaque], axis=-1)
 
 
-def _read_masks(frames, forms, shrink):
-    """Returns the mask [P] of all frames, or None if no frame has one."""
-    if all(frame.mask is None for frame in frames):
-        return None
+def _read_masks(frames, forms, shrink, with_rays):
+    """Returns the mask [P] of all frames, or None if all pixels count; with_rays: see `pixels_with_rays`."""
 
-    def read(frame, form):
-        if frame.mask is None:
-            return np.ones(form.size, bool)
-        mask = _read_mask(frame, form.full)
-        return mask if shrink == 1 else _all_in_tiles(mask, *form.size, shrink)
+    def read(frame, form, mask):
+        own = read_frame_mask(frame, form.full)
+        if own is not None:
+            own = own if shrink == 1 else _all_in_tiles(own, *form.size, shrink)
+            mask = own if mask is None else own & mask
+        return mask
 
     with ThreadPoolExecutor(num_workers()) as pool:
-        return np.concatenate([mask.reshape(-1) for mask in pool.map(read, frames, forms)])
+        masks = list(pool.map(read, frames, forms, with_rays))
+    if all(mask is None for mask in masks):
+        return None
+    pairs = zip(masks, forms, strict=True)
+    return np.concatenate(
+        [np.ones(math.prod(form.size), bool) if mask is None else mask.reshape(-1) for mask, form in pairs]
+    )
 
 
-def _read_mask(frame, full):
-    """Returns the mask [H, W] of a frame at its image's size; a mask of the original's size is shrunk."""
-    mask = read_mask(frame.mask, camera_size=full)
+def read_frame_mask(frame: Frame, full: tuple[int, int]) -> Bool[np.ndarray, "H W"] | None:
+    """Returns which pixels of a frame's image count, by its masks and its crop_radius; None: all.
+
+    Args:
+        frame: whose camera has a height and width.
+        full: (height, width) of its image. Masks of the original's size are shrunk.
+
+    Raises:
+        ValueError: if a mask is unreadable or of another size; names it.
+    """
+    masks = []
+    for path, read in ((frame.mask, read_mask), (frame.ignored, read_ignored)):
+        if path is not None:
+            masks.append(_shrunk_mask(path, read(path, camera_size=full), frame, full))
+    if frame.crop_radius is not None:
+        y, x = ((np.arange(side) + 0.5) / side - 0.5 for side in full)
+        across = np.hypot((x * frame.camera.width)[None], (y * frame.camera.height)[:, None])
+        masks.append(across <= frame.crop_radius)
+    return np.all(masks, axis=0) if masks and not all(mask.all() for mask in masks) else None
+
+
+def _shrunk_mask(path, mask, frame, full):
+    """Returns a mask at its image's size."""
     times = max(round(mask.shape[0] / full[0]), 1)
     if not fits(full, mask.shape) or any(times * have > side for have, side in zip(full, mask.shape, strict=True)):
         raise ValueError(
-            f"{frame.mask}: is {mask.shape[1]} x {mask.shape[0]}, expected {full[1]} x {full[0]} as "
+            f"{path}: is {mask.shape[1]} x {mask.shape[0]}, expected {full[1]} x {full[0]} as "
             f"{frame.image.name}; export the mask again"
         )
     return _all_in_tiles(mask, *full, times)

@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnerf.core.types import Camera
-from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
+from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, MASK_PREFIX, is_hidden
 from jaxnerf.data.readers.colmap_model import check_complete
 from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.atomic_files import files_below
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
+TIME_UNUSED = "images state one, which is not used: the scene is trained as static; see docs/extending/moving_scene.md"
 _FAR_AWAY = 100.0  # distance of cameras from an origin over how far they are apart
 _MASK_FOLDERS = ("images_mask", "images_masks", "masks")
 
@@ -32,12 +33,14 @@ class Frame(NamedTuple):
         camera: float64. Height and width are those that the format states for the image, or None.
         mask: an existing image; pixels are ignored where it is at most half as bright as its brightest pixel. None: no
             pixel is ignored.
-        follow_exif: whether EXIF orientation is applied. COLMAP's pixel coordinates, for example, refer to the
-            pixels as they are stored.
+        follow_exif: whether EXIF orientation is applied where only the upright image has the camera's size. COLMAP's
+            pixel coordinates, for example, always refer to the pixels as they are stored.
         bounds: nearest and farthest matter along the camera's axis, world units; None: not known.
         seen: [M] indices into the Capture's points that this image shows; None: not known.
         seen_at: [M, 2] px, where it shows them.
         time: in [0, 1], when it was taken in a scene that moves; None: not stated, which holds for all frames or none.
+        ignored: an existing image; pixels are ignored where it is not black, too. None: none is.
+        crop_radius: px of the camera, around the image's middle, beyond which pixels are ignored, too; None: none is.
     """
 
     name: str
@@ -49,6 +52,8 @@ class Frame(NamedTuple):
     seen: Int[np.ndarray, " M"] | None = None
     seen_at: Float[np.ndarray, "M 2"] | None = None
     time: float | None = None
+    ignored: Path | None = None
+    crop_radius: float | None = None
 
 
 class CameraFiles(NamedTuple):
@@ -121,6 +126,11 @@ def fingerprint(capture: Capture) -> str:
         parts += [np.float32(array) for array in arrays if array is not None]
         if frame.mask is not None:
             parts.append(f"mask {frame.mask.name}")
+        parts += [
+            f"{name} {value}"
+            for name, value in (("ignored", frame.ignored and frame.ignored.name), ("crop", frame.crop_radius))
+            if value
+        ]
         if frame.time is not None:
             parts.append(f"time {frame.time}")
     return f"{len(capture.frames)} images, {content_fingerprint(*parts)[:8]}"
@@ -164,11 +174,23 @@ def read_capture(folder: str | os.PathLike, format: str = "auto", *, split: str 
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    format = detect_formats(folder)[0] if format == "auto" else format
+    if format == "auto":
+        wrong = []
+        for name in detect_formats(folder):
+            try:
+                capture = read_capture(folder, name, split=split)
+            except ValueError as error:
+                wrong.append(error)
+                continue
+            if not wrong:
+                return capture
+            # Such as a COLMAP model beside a transforms.json with the paths of another machine.
+            raise ValueError(f"{wrong[0]}; --format={name} reads this folder") from None
+        raise wrong[0]
     read = READERS.get(format).read
     if has_split_files(format):
-        return read(Path(folder), split=split)
-    return moved_near(_with_masks(read(Path(folder)), Path(folder)))
+        return _with_ignored(read(Path(folder), split=split))
+    return moved_near(_with_masks(_with_ignored(read(Path(folder))), Path(folder)))
 
 
 def has_split_files(format: str) -> bool:
@@ -227,6 +249,19 @@ def _moved(frame, origin):
     pose = np.array(frame.camera.to_world, np.float64)
     pose[:, 3] -= origin
     return frame._replace(camera=dataclasses.replace(frame.camera, to_world=pose))
+
+
+def _with_ignored(capture):
+    """Returns the Capture with the masks of instant-ngp beside its images, unless its format states masks."""
+    if any(frame.mask is not None for frame in capture.frames):
+        return capture
+    paths = [frame.image.with_name(f"{MASK_PREFIX}{frame.image.stem}.png") for frame in capture.frames]
+    paths = [path if os.path.isfile(path) else None for path in paths]
+    if not (found := [path for path in paths if path is not None]):
+        return capture
+    note = f"{found[0]}: pixels where it is not black are ignored; {len(found)} of {len(paths)} images have such a mask"
+    frames = [frame._replace(ignored=path) for frame, path in zip(capture.frames, paths, strict=True)]
+    return capture._replace(frames=tuple(frames), choices=(*capture.choices, note))
 
 
 def _with_masks(capture, folder):

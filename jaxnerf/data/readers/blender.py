@@ -91,7 +91,8 @@ def _bounds(poses):
     ahead = -np.einsum("vi,vi->v", offset, poses[:, :, 2])
     looks_there = np.mean(ahead > 0.8 * np.linalg.norm(offset, axis=1)) > 0.8
     if near < distance < far or not (looks_there and distance > 0):
-        return _RANGE, ""
+        apart = np.linalg.norm(np.ptp(poses[:, :, 3], axis=0))
+        return _RANGE, f"although all cameras are within {apart:.3g}: see data.near" if 0 < apart < near / 100 else ""
     near, far = float(f"{distance / 2:.3g}"), float(f"{1.5 * distance:.3g}")
     return (near, far), f"as the cameras look at a point {2 * near:.4g} away"
 

@@ -13,6 +13,7 @@ from jaxnerf.data.readers.colmap_model import (
     MODEL_FOLDERS,
     UNDISTORT,
     check_complete,
+    convert,
     count_images,
     model_file,
     model_suffix,
@@ -171,7 +172,7 @@ def _to_world(image, where):
 def _camera(intrinsics, to_world):
     where, model, width, height, params = intrinsics
     if model not in _LENSES:
-        raise ValueError(f"{where}: {model} is not supported, expected {', '.join(_LENSES)}; {UNDISTORT}")
+        raise ValueError(f"{where}: {model} is not supported, expected {', '.join(_LENSES)}; {convert(model)}")
     if min(width, height) < 1 or width * height >= 2**31:  # pixel ids are int32
         raise ValueError(f"{where}: is {width} x {height}, expected at least 1 and fewer than 2^31 pixels; {AGAIN}")
     count, lens = _LENSES[model]

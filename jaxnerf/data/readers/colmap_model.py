@@ -36,6 +36,11 @@ MODELS = {  # COLMAP's number of a camera model: its name and number of paramete
 }
 AGAIN = "copy the model again or export it again"
 UNDISTORT = "run `colmap image_undistorter` and give the folder that it writes"
+# The undistorter copies panoramas as they are.
+PANORAMA = (
+    "panoramas are not read: give the folder that COLMAP's example python/examples/panorama_sfm.py writes with "
+    "--pano_render_type=perspective_overlapping, views rendered from them with a model"
+)
 _NUMBER = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model number, width, height; followed by its parameters
 _POSE = struct.Struct("<I7dI")  # id, quaternion and translation, camera; followed by name, 0, count, observations
@@ -43,6 +48,12 @@ _POINT = struct.Struct("<q3d3BdQ")  # id, position, colour, error, count; follow
 _OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])  # point -1: none
 _SMALLEST_IMAGE = _POSE.size + 1 + _NUMBER.size  # bytes
 _MAX_NAME = 4096  # bytes, the limit of common operating systems
+
+
+def convert(model: str, otherwise: str = UNDISTORT) -> str:
+    """Returns what to do with images of a camera model that is not read; otherwise: if it is none of panoramas."""
+    names = ("equirect", "spher", "latlong", "panorama", "omnidirect", "vr180")
+    return PANORAMA if any(name in model.lower() for name in names) else otherwise
 
 
 class Intrinsics(NamedTuple):
@@ -212,7 +223,8 @@ def _binary_cameras(path):
         (key, number, width, height), at = _unpack(path, data, at, _CAMERA)
         if number not in MODELS:
             found = f"model number {number}, expected 0 to {max(MODELS)}"
-            raise ValueError(f"{path}, camera {key}: {found}; {UNDISTORT}")
+            todo = "with the COLMAP that wrote it, run `colmap image_undistorter`, or for panoramas"
+            raise ValueError(f"{path}, camera {key}: {found}; {todo}: {PANORAMA}")
         model, size = MODELS[number]
         params, at = _unpack(path, data, at, struct.Struct(f"<{size}d"))
         yield key, Intrinsics(f"{path}, camera {key}", model, width, height, params)
@@ -316,7 +328,7 @@ def _text_cameras(path):
         (key, model, width, height), rest = _split(where, line, (int, str, int, int), expected)
         if model not in sizes:
             found = f"model {model[:40]!r}, expected one of COLMAP's"
-            raise ValueError(f"{where}, camera {key}: {found}; {UNDISTORT}")
+            raise ValueError(f"{where}, camera {key}: {found}; {convert(model)}")
         params, more = _split(where, rest, (float,) * sizes[model], f"{sizes[model]} PARAMS of {model}")
         if more:
             raise _no_entry(where, more, f"{sizes[model]} PARAMS of {model} and no more")

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxnerf.core.types import Camera
 from jaxnerf.data.images.image_files import image_size
+from jaxnerf.data.readers.colmap_model import convert
 from jaxnerf.data.readers.validation import is_number, short_repr
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
@@ -19,6 +20,7 @@ _OTHERS = ("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy")
 STATED = ("fl_x", "fl_y", "cx", "cy", "camera_model", "is_fisheye", *_COEFFICIENTS, "distortion_params", *_UNSUPPORTED)
 _UNUSED = {  # facts of other programs: why they are not used
     **dict.fromkeys(("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew"), "no lens of jaxnerf has that term"),
+    **dict.fromkeys(("timestamp", "fid", "time_id", "timestep", "timestep_index"), "time, from 0 to 1, is read"),
     "rolling_shutter": "all pixels of an image have one pose",
     **dict.fromkeys(("transform_matrix_start", "transform_matrix_end"), "transform_matrix is the pose"),
     **dict.fromkeys(("K", "intrinsics", "intrinsic_matrix"), "fl_x, fl_y, cx and cy are read"),
@@ -29,6 +31,8 @@ _UNUSED = {  # facts of other programs: why they are not used
 _TERMS = {"SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
 _ZERO = (None, 0, [], [0, 0, 0], [0, 0, 0, 0])
 _ROUNDING = 0.01  # of a focal length that is stated twice
+_ALIKE = 1.1  # of two ratios, along x and y: an image is smaller by both, not cropped
+_CROPPED = 1.3  # by which the principal point may be off the middle of an image, as if it was cropped
 
 
 def read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: Path) -> Camera:
@@ -36,22 +40,23 @@ def read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: 
 
     The center defaults to the middle of the image, the focal length in y to that in x. A perspective lens
     whose coefficients are all 0 is a pinhole. The size is the stated one. If it is not stated and center or
-    focal depend on it, it is the image's after EXIF rotation; otherwise it is None.
+    focal depend on it, it is the image's, as stored or as fits the center; otherwise it is None.
 
     Args:
         levels: [(where, entries)]: the file's, then the frame's. Later levels override earlier ones field by
             field; a later level's angle overrides an earlier one's focal length. where: for messages.
         to_world: [3, 4].
-        image: opened only if its size is needed.
+        image: opened only if no size is stated.
 
     Raises:
         ValueError: names where, what was found, what is expected and what to do.
     """
     fields, where = _fields(levels), levels[-1][0]
     size = [_size(fields, key) for key in "wh"]
-    if None in size and (size != [None, None] or not {"cx", "cy", "fl_x"} <= fields.keys()):
-        found = image_size(image)
-        size = [have if stated is None else stated for stated, have in zip(size, found, strict=True)]
+    if None in size:
+        found = _image_size(fields, image)
+        if size != [None, None] or not {"cx", "cy", "fl_x"} <= fields.keys():
+            size = [have if stated is None else stated for stated, have in zip(size, found, strict=True)]
     lens, distortion = _lens(fields, where)
     center = [
         number_in(fields, key, "a number of px") if key in fields else length / 2
@@ -66,6 +71,23 @@ def read_camera(levels: list[tuple[Any, dict]], *, to_world: np.ndarray, image: 
         height=size[1],
         width=size[0],
     )
+
+
+def _image_size(fields, image):
+    """Returns the (width, height) of an image whose camera states none; ValueError if its center is another image's."""
+    if not {"cx", "cy"} <= fields.keys():
+        return image_size(image, follow_exif=False)
+    center = np.array([number_in(fields, key, "a number of px") for key in ("cx", "cy")])
+    size = image_size(image, center=center)
+    times = 2 * center / size
+    scaled = times.max() < _ALIKE * times.min() and not 1 / _CROPPED < times.mean() < _CROPPED
+    if scaled or not ((times >= 0) & (times <= 2)).all():
+        expected = f"{size[0] / 2:g}, {size[1] / 2:g} or so, the middle of {image} of {size[0]} x {size[1]} px"
+        raise ValueError(
+            f"{fields['cx'][1]}: cx, cy are {center[0]:.6g}, {center[1]:.6g} without w and h, expected {expected}; add "
+            "w and h, the size in px that they and fl_x refer to"
+        )
+    return size
 
 
 def ignored_facts(levels: list[tuple[Any, dict]], camera: Camera, image: Path) -> dict[str, str]:
@@ -163,7 +185,8 @@ def _lens(fields, where):
     if other or model not in (None, *_PERSPECTIVE, "OPENCV_FISHEYE"):
         found = f"has {other[0]}" if other else f"camera_model is {short_repr(model)}"
         expected = f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE"
-        raise ValueError(f"{place}: {found}, expected {expected}; convert the images to one of these")
+        todo = convert(str(model or other), "undistort the images to one of these and export the file again")
+        raise ValueError(f"{place}: {found}, expected {expected}; {todo}")
     if not isinstance(fisheye, bool) or (model is not None and fisheye != (model == "OPENCV_FISHEYE")):
         expected = "true or false" if model is None else f"the value that camera_model {model} implies"
         raise wrong_value(flag, "is_fisheye", fisheye, f"{expected}; correct or remove it")

@@ -52,7 +52,9 @@ def _read_poses(path):
     """Returns poses [N, 3, 4] (x right, y up, looking along -z), bounds [N, 2], (h, w, f) [N, 3] and notes."""
     rows = read_npy(path, "floats [N, 17]")
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind != "f":
-        raise ValueError(f"{path}: holds {rows.dtype} {rows.shape}, expected floats [N, 17]; export it again")
+        nex = "NeX's form: append h, w and f of its hwf_cxcy.npy to each of the 3 rows of a matrix"
+        todo = nex if rows.shape[1:] == (14,) else "export it again"
+        raise ValueError(f"{path}: holds {rows.dtype} {rows.shape}, expected floats [N, 17]; {todo}")
     rows = rows.astype(np.float64)
     finite = np.abs(rows) < MAX_FLOAT32
     if not finite.all():

@@ -169,9 +169,10 @@ def _read_file(source, finder):
     cameras, camera_notes = read_cameras(
         [(source, content)], [(entry.where, entry.content, entry.image) for entry in kept], poses
     )
+    radii = [_crop_radius({**content, **entry.content}, entry.where) for entry in kept]
     frames = tuple(
-        Frame(entry.name, entry.image, camera, mask, time=time)
-        for entry, camera, mask, time in zip(kept, cameras, masks, times, strict=True)
+        Frame(entry.name, entry.image, camera, mask, time=time, crop_radius=radius)
+        for entry, camera, mask, time, radius in zip(kept, cameras, masks, times, radii, strict=True)
     )
     notes = (*notes, *pose_notes, *camera_notes, *points_notes, *box_notes)
     return _File(source, content, base, entries, frames, points, box, notes)
@@ -201,6 +202,12 @@ def _entries(content, source, finder):
         if any(key in level for level in (content, *frames))
     ]
     return entries, base, [*_missing(entries, source, finder), *notes]
+
+
+def _crop_radius(fields, where):
+    """Returns nerfstudio's radius around the middle of an image, outside of which a fisheye shows nothing, or None."""
+    value, key = fields.get("fisheye_crop_radius"), "fisheye_crop_radius"
+    return None if value is None else number_in({key: (value, where)}, key, "px above 0", 1e-3)
 
 
 def _without_suffix(path, image):
@@ -282,11 +289,14 @@ def _splits(file, finder):
 
 
 def _world(file):
-    """Returns a line about fields that say how the file's world was made from another, if there are any."""
+    """Returns lines about fields that say how the file's world was made from another, and what of images is ignored."""
     keys = [key for key in ("applied_transform", "applied_scale", "orientation_override") if key in file.content]
-    if not keys:
-        return []
-    return [f"{file.source.name}: {', '.join(keys)}: positions are those after it, as in the file's poses"]
+    lines = []
+    if keys:
+        lines.append(f"{file.source.name}: {', '.join(keys)}: positions are those after it, as in the file's poses")
+    if radii := {frame.crop_radius for frame in file.frames} - {None}:
+        lines.append(f"{file.source.name}: pixels beyond fisheye_crop_radius, {max(radii):g} px, are ignored")
+    return lines
 
 
 def _points(content, source, finder):

@@ -21,7 +21,7 @@ from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.paths.camera_path import CameraPath
 from jaxnerf.evaluation.restore import newest_step, refined_views
-from jaxnerf.evaluation.supersampling import MAX_RAYS, render_pixels, trained_footprint
+from jaxnerf.evaluation.supersampling import MAX_RAYS, render_pixels, trained_footprint, training_cameras
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
@@ -112,7 +112,7 @@ def render_path(
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
     step = newest_step(run, workdir, step)
-    shown = _shown(run, run.variables(step), frames)
+    shown = _shown(run, workdir, run.variables(step), frames)
     target = pathlib.Path(workdir) / "renders" / f"{name or shown.path.name}-{step}"
     atomic_files.check_tree(target.parent)
     shards.refuse_overwrite(output.overwrite, output.shard, target)
@@ -144,14 +144,14 @@ class _Shown(NamedTuple):
     predictor: Any = None
 
 
-def _shown(run, variables, frames):
+def _shown(run, workdir, variables, frames):
     """Makes the path of frames; prints what has been chosen for it."""
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    views = refined_views(run, run.experiment.load_split("train", images=False), "train", variables[0])
     up = frames.up or run.experiment.config.data.up or None
     options = {"num_frames": frames.num_frames, "closed": frames.closed, "up": up}
     path = camera_path.make_path(select_kind(frames.path, views, up), views, **options)
     path = camera_path.resize(path, frames.width, frames.height)
-    footprint = trained_footprint(run, views)
+    footprint = trained_footprint(run, training_cameras(run, workdir, variables[0]))
     sides = footprint.rays_per_side(path.poses, path.focal, max_rays=frames.max_rays_per_pixel)
     _print_rays(sides)
     return _Shown(run, variables, views, path, sides)

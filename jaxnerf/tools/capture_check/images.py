@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt
 
 from jaxnerf.data.geometry.world import poses_of
-from jaxnerf.data.images.image_files import open_image, read_image, read_mask
-from jaxnerf.data.images.load_images import check_size
+from jaxnerf.data.images.downscaled_copies import with_size
+from jaxnerf.data.images.image_files import open_image, read_image
+from jaxnerf.data.images.load_images import check_size, read_frame_mask
 from jaxnerf.data.readers.base import Capture, Frame
 from jaxnerf.tools.capture_check.findings import Finding, named
 
@@ -114,27 +115,22 @@ def _reduced_side(frames: Sequence[Frame]) -> int:
 
 
 def _summarize(frame: Frame, longest: int) -> ImageSummary:
+    frame = with_size(frame)
     camera = frame.camera
-    declared = None if None in (camera.height, camera.width) else (camera.height, camera.width)
+    declared = camera.height, camera.width
     pixels = read_image(frame.image, camera_size=declared, follow_exif=frame.follow_exif)
     size = pixels.shape[:2]
-    if declared is not None:
-        check_size(frame.image, size, declared)
+    check_size(frame.image, size, declared)
     grey = reduce(pixels, longest)
     corners, descriptors = find_corners(grey)
     corners *= np.array(size[::-1]) / grey.shape[::-1]
-    if frame.mask is not None:
-        mask = read_mask(frame.mask, camera_size=size)
-        if mask.shape != size:
-            raise ValueError(
-                f"{frame.mask}: is {mask.shape[1]} x {mask.shape[0]}, expected {size[1]} x {size[0]} as "
-                f"{frame.image.name}; export the mask again"
-            )
+    mask = read_frame_mask(frame, size)
+    if mask is not None:
         x, y = np.minimum(corners.astype(int), np.array(size[::-1]) - 1).T
         corners, descriptors = corners[mask[y, x]], descriptors[mask[y, x]]
     thumbnail = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).std())
-    scale = np.array(declared or size)[::-1] / size[::-1]
+    scale = np.array(declared)[::-1] / size[::-1]
     return ImageSummary(size, pixels.shape[-1], grey.shape, corners * scale, descriptors, thumbnail, sharpness)
 
 

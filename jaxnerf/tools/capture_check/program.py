@@ -17,7 +17,7 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "The folder of a trained run who
 _NEXT = flags.DEFINE_integer(
     "next_images", 5, "With --workdir: the number of further images to propose.", lower_bound=1, upper_bound=100
 )
-_STEP = flags.DEFINE_integer("step", None, "With --workdir: the checkpoint's step. When it is not given, the newest.")
+_STEP = cli.define_step("With --workdir: the checkpoint's step. When it is not given, the newest.")
 _FORMAT = flags.DEFINE_string("format", "auto", "The dataset's format, or auto, which selects the one training uses.")
 _NEAR = flags.DEFINE_float("near", None, "The t at which rays will begin. When it is not given, training's default.")
 _FAR = flags.DEFINE_float("far", None, "The t at which rays will end. When it is not given, training's default.")

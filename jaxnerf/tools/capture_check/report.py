@@ -15,9 +15,9 @@ from jaxnerf.data.geometry.poses import axis_of, gaze_center, sideways, up_of
 from jaxnerf.data.geometry.world import looks_forward, poses_of
 from jaxnerf.data.images.load_images import split_indices
 from jaxnerf.data.readers import base
-from jaxnerf.data.readers.base import Capture
+from jaxnerf.data.readers.base import TIME_UNUSED, Capture
 from jaxnerf.runtime.printed_text import printable
-from jaxnerf.tools.capture_check import cameras, depths, folds, tracks
+from jaxnerf.tools.capture_check import cameras, depths, folds, image_facts, tracks
 from jaxnerf.tools.capture_check import images as images_module
 from jaxnerf.tools.capture_check.findings import Finding, percent
 
@@ -122,6 +122,7 @@ def inspect(
     findings += depths.judge_box(capture, points)
     findings += _judge_splits(whole)
     findings += [Finding("warning", "skipped", note, "", "") for note in dict.fromkeys(whole.notes)]
+    findings += image_facts.judge_files(whole)
     path, line = _path(whole, given)
     facts = _image_facts(whole, available, images) + _camera_facts(capture, evidence, images, given)
     facts += [("near, far", _range(bounds, stated, depth, capture)), ("path", line)]
@@ -151,7 +152,7 @@ def _image_facts(capture, available, images):
     splits = capture.splits or {name: split_indices(capture, name) for name in ("train", "test")}
     sizes = Counter("{1} x {0}".format(*image.size) for image in images if image)
     channels = Counter("alpha" if image.channels == 4 else "no alpha" for image in images if image)
-    masks = sum(frame.mask is not None for frame in capture.frames)
+    masks = sum(frame.mask is not None or frame.ignored is not None for frame in capture.frames)
     checked = "" if len(images) == len(capture.frames) else f"; {len(images)} were checked"
     counts = ", ".join(f"{len(chosen)} {name}" for name, chosen in splits.items())
     return [
@@ -159,6 +160,8 @@ def _image_facts(capture, available, images):
         *(("read", choice) for choice in capture.choices),
         ("views", f"{len(capture.frames)}: {counts}{checked}"),
         ("images", f"{_counted(sizes)} px; {_counted(channels)}; {masks or 'no'} masks"),
+        *([("rays", rays)] if (rays := image_facts.rays_of(capture)) else []),
+        *([("time", TIME_UNUSED)] if any(frame.time is not None for frame in capture.frames) else []),
     ]
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from jaxnerf.core.views import Views
+from jaxnerf.data import dataset
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
 from jaxnerf.options import read, values_of
 from jaxnerf.runtime import atomic_files
@@ -22,7 +23,8 @@ class ExportSource(NamedTuple):
         run: with an occupancy grid: that of training, or else one that is extracted from its visible density.
         step: of the checkpoint.
         variables: its parameters and grid, for `run.render_image`.
-        views: of the split "train", with the cameras that the run has refined.
+        views: of the split "train", with the cameras that the run has refined; without pixels if the dataset is not
+            there.
         settings: the exporter's options; a box is relative to `Views.file_origin`.
         say: called with a line of text for the user.
     """
@@ -82,7 +84,7 @@ def export_run(
     if run.experiment.model.grid_schedule is None:  # whole rays through a dense network would take hours
         run = restore_run(workdir, data_dir=data_dir, settings={"bake_occupancy": True})
     variables = cleaned(run, workdir, max_uncertainty).variables(step)
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    views = refined_views(run, run.experiment.load_split("train", images=None), "train", variables[0])
     target.parent.mkdir(exist_ok=True)
     with atomic_files.partial_folder(target) as partial:
         if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
@@ -93,6 +95,15 @@ def export_run(
         if any(views.file_origin):
             (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
     return target
+
+
+def can_be_scored(source: ExportSource) -> bool:
+    """Returns whether the dataset is there, to score an export on the split `eval.split`; says so if it is not."""
+    data, split = source.run.experiment.config.data, source.run.experiment.config.eval.split
+    found = dataset.is_there(data)
+    if not found:
+        source.say(f"not scored, as that needs the images of the split {split!r}; give --data_dir of the dataset")
+    return found
 
 
 def check_memory(needed: float, available: float | None, remedy: str) -> None:

@@ -19,8 +19,8 @@ _KIND = flags.DEFINE_string(
     "kind", None, f"What to export: {', '.join(EXPORTERS.names())}, or a registered exporter.", required=True
 )
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
-_STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is exported.")
-_MAX_UNCERTAINTY = cli.define_number("max_uncertainty", run_flags.MAX_UNCERTAINTY)
+_STEP = cli.define_step("The checkpoint's step. When it is not given, the newest is exported.")
+_MAX_UNCERTAINTY = cli.define_fraction("max_uncertainty", run_flags.MAX_UNCERTAINTY)
 _NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an existing folder of that name.")
 

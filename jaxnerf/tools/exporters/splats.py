@@ -20,7 +20,7 @@ from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.options import is_auto
 from jaxnerf.runtime import stages
-from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.base import ExportSource, can_be_scored
 from jaxnerf.tools.exporters.gaussians import Gaussians, rasterize, read_spz, write_gaussians, write_spz
 from jaxnerf.tools.exporters.points import surface_points, thinned
 from jaxnerf.tools.exporters.splat_fit import fit_gaussians
@@ -59,13 +59,14 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
         gaussians = fit_gaussians(gaussians, images, background, box=box, steps=settings.fit_steps)
     write_gaussians(folder / "splats.ply", gaussians)
     write_spz(folder / "splats.spz", gaussians)
-    value, count = score(source, gaussians)
-    rounded, of_run = score(source, read_spz(folder / "splats.spz"))[0], score(source, None)[0]
-    split = source.run.experiment.config.eval.split
-    source.say(
-        f"{len(points):,} Gaussians; PSNR {value:.2f} dB, as SPZ {rounded:.2f} dB, over {count} views of {split}, "
-        f"where the run has {of_run:.2f} dB"
-    )
+    measured = ""
+    if can_be_scored(source):
+        value, count = score(source, gaussians)
+        rounded, of_run = score(source, read_spz(folder / "splats.spz"))[0], score(source, None)[0]
+        split = source.run.experiment.config.eval.split
+        measured = f"; PSNR {value:.2f} dB, as SPZ {rounded:.2f} dB, over {count} views of {split}, "
+        measured += f"where the run has {of_run:.2f} dB"
+    source.say(f"{len(points):,} Gaussians{measured}")
 
 
 def make_gaussians(points: np.ndarray, normals: np.ndarray, extinction: np.ndarray, colors: np.ndarray) -> Gaussians:

@@ -25,7 +25,7 @@ from jaxnerf.evaluation.restore import TrainedRun, refined_views
 from jaxnerf.fields.hash_grid import HashGrid
 from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters import web_scene
-from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.base import ExportSource, can_be_scored
 from jaxnerf.tools.exporters.web_scene import WebScene
 
 MAGIC = b"JAXNERF1"
@@ -49,25 +49,29 @@ def export_web(source: ExportSource, folder: pathlib.Path) -> None:
     """Writes index.html, which holds the scene; with `split` the scene is in scene.bin beside it."""
     experiment = source.run.experiment
     split = experiment.config.eval.split
-    views = refined_views(source.run, experiment.load_split(split), split, source.variables[0])
+    views = None
+    if can_be_scored(source):
+        views = refined_views(source.run, experiment.load_split(split), split, source.variables[0])
+    quality = measured = ""
     for precision in web_scene.PRECISIONS:
         with stages.stage(f"packing features of {precision}"):
             scene = scene_of(source.run, source.variables, precision)
+        if views is None:
+            break
         score = measure(source, scene, views)
+        quality = f"PSNR {score.of_page:.1f} dB on {score.num_views} test views"
+        measured = f"{score.of_page:.2f} dB on {score.num_views} test views, where the run has {score.of_run:.2f} dB"
+        measured = f"PSNR {measured}; "
         if score.of_run - score.of_page <= MAX_LOSS:
             break
         source.say(f"features of {precision} would lose {score.of_run - score.of_page:.2f} dB")
-    quality = f"PSNR {score.of_page:.1f} dB on {score.num_views} test views"
     with stages.stage("compressing the scene"):
         data = encode(scene, about(source, scene, quality))
     (folder / "index.html").write_text(page(None if source.settings.split else data))
     if source.settings.split:
         (folder / _DATA_FILE).write_bytes(data)
     size = sum(path.stat().st_size for path in folder.iterdir())
-    source.say(
-        f"PSNR {score.of_page:.2f} dB on {score.num_views} test views, where the run has {score.of_run:.2f} dB; "
-        f"features of {scene.precision}; {size:,} bytes"
-    )
+    source.say(f"{measured}features of {scene.precision}; {size:,} bytes")
     if source.settings.split:
         source.say("put both files on a web server: a browser reads no file beside a page that is opened from a folder")
 

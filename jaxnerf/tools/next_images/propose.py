@@ -147,7 +147,7 @@ def propose_images(
     run = restore_run(workdir, data_dir=data_dir, settings={"bake_occupancy": True})
     step = newest_step(run, workdir, step)
     variables = run.variables(step)
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    views = refined_views(run, run.experiment.load_split("train", images=False), "train", variables[0])
     if views.time is not None:
         raise ValueError(
             f"{workdir}: the scene moves, so that each image shows another instant, expected one that stays as it is; "

@@ -10,10 +10,12 @@ import itertools
 import math
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +24,7 @@ from jaxnerf.runtime.atomic_files import open_regular
 
 SEED = 0
 _MIN_INLIERS, _MAX_DEGREES = 50, 60.0  # of a pair that can contradict a model, and the angle at which it does
+_QUERY_SECONDS = 10.0
 _PAIRS_AT_A_TIME = 200  # after which matches are committed; an interruption loses no more
 
 
@@ -86,7 +89,42 @@ def call(stage: Callable, *arguments, log: Path, progress: Callable[[int | None]
     finally:
         process.terminate()
         process.join()
-    raise ValueError(f"{log}: COLMAP failed ({reason}); its messages are there. The same command continues")
+    raise ValueError(
+        f"{log}: COLMAP failed ({reason}); its messages are there. The same command continues from what is complete; "
+        f"if it fails again, remove {log.parent} to begin again"
+    )
+
+
+def check_database(database: Path) -> None:
+    """Checks that a database, if it exists, has nothing but the tables and indices that COLMAP makes.
+
+    A view, a trigger, or a table that is computed, could make any query of a stranger's database run for ever.
+
+    Raises:
+        ValueError: names the database and what it has.
+    """
+    if not database.exists():
+        return
+    try:
+        with _opened(database, "mode=ro") as connection:
+            parts = connection.execute("SELECT type, name, coalesce(sql, '') FROM sqlite_master").fetchall()
+    except sqlite3.Error as error:
+        raise ValueError(f"{database}: is no database of COLMAP ({error}); remove {database.parent}") from None
+    computed = re.compile(r"\bVIRTUAL\b|\bAS\s*\(", re.IGNORECASE)
+    for kind, name, sql in parts:
+        if kind not in ("table", "index") or computed.search(sql):
+            raise ValueError(
+                f"{database}: has the {kind} {name!r}, expected tables as COLMAP makes them; remove {database.parent}"
+            )
+
+
+@contextlib.contextmanager
+def _opened(database, mode):
+    """Yields a connection whose queries end with an sqlite3.Error after some seconds."""
+    end = time.monotonic() + _QUERY_SECONDS
+    with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?{mode}", uri=True)) as connection:
+        connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
+        yield connection
 
 
 def count_rows(database: Path, table: str, condition: str = "1", *, running: bool = False) -> int:
@@ -100,7 +138,7 @@ def count_rows(database: Path, table: str, condition: str = "1", *, running: boo
     """
     mode = "immutable=1" if running else "mode=ro"
     try:
-        with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?{mode}", uri=True)) as connection:
+        with _opened(database, mode) as connection:
             return connection.execute(f"SELECT COUNT(*) FROM {table} WHERE {condition}").fetchone()[0]
     except sqlite3.Error:  # not created yet, or read while it was changed
         return 0

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from jaxnerf.data.readers import colmap
 from jaxnerf.registry import READERS
-from jaxnerf.runtime.atomic_files import check_tree, partial_file, read_bytes, sweep, write_text
+from jaxnerf.runtime.atomic_files import check_tree, partial_file, read_bytes, remove, sweep, write_text
 from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.runtime.printed_text import printable
 from jaxnerf.tools.structure_from_motion import colmap_process
@@ -165,6 +165,7 @@ class _Stages:
         self.database, self.log, self.seconds = self.work / "database.db", self.work / "log.txt", {}
         self.work.mkdir(parents=True, exist_ok=True)
         self._claim()
+        colmap_process.check_database(self.database)
 
     def prepare_images(self, paths, in_place):
         """Copies and checks the images, and creates the database; returns their names, and notes."""
@@ -245,7 +246,7 @@ class _Stages:
 
     def _map(self, database, names, folder):
         models = self.work / folder
-        shutil.rmtree(models, ignore_errors=True)
+        remove(models)
         models.mkdir()
         progress = _Progress(self.say, "mapping", "images", len(names))
         arguments = (database, self.images, names, models, self.num_threads)
@@ -335,8 +336,9 @@ def _check_names(paths):
     wrong = [path.name for path in paths if path.name != images_module.copy_name(path)]
     if wrong:
         raise ValueError(
-            f"{wrong[0]!r}: the name has white space, expected none in images that are used where they are; rename "
-            "the image, or choose another --out, where copies are made"
+            f"{wrong[0]!r}: the name has characters that COLMAP's list of pairs cannot hold, expected "
+            f"{images_module.copy_name(Path(wrong[0]))!r} of an image that is used where it is; rename it, or choose "
+            "another --out, where copies are made"
         )
 
 
@@ -344,13 +346,13 @@ def _publish(model: Path, sparse: Path, work: Path) -> None:
     """Moves a complete model to sparse/0; what was in sparse before is deleted at the end."""
     new, old = work / "sparse.tmp", work / "replaced.tmp"
     for path in (new, old):
-        shutil.rmtree(path, ignore_errors=True)
+        remove(path)
     new.mkdir()
     os.replace(model, new / "0")
     if sparse.exists():
         os.replace(sparse, old)
     os.replace(new, sparse)
-    shutil.rmtree(old, ignore_errors=True)
+    remove(old)
     if not any(model.parent.iterdir()):
         model.parent.rmdir()
 

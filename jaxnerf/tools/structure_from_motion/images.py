@@ -2,7 +2,6 @@
 
 import filecmp
 import os
-import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -45,8 +44,12 @@ def find_images(folder: Path) -> tuple[list[Path], str]:
 
 
 def copy_name(path: Path) -> str:
-    """Returns the name of an image's copy: white space, which COLMAP's list of pairs cannot hold, becomes _."""
-    return re.sub(r"\s", "_", path.name)
+    """Returns the name of an image's copy: what COLMAP's list of pairs cannot hold becomes _.
+
+    That is white space, characters that are not printable or not UTF-8, and # at the start, which begins a comment.
+    """
+    name = "_" + path.name[1:] if path.name.startswith("#") else path.name
+    return "".join("_" if character.isspace() or not character.isprintable() else character for character in name)
 
 
 def check_images(paths: Sequence[Path], progress: Callable[[int], None]) -> None:

@@ -29,10 +29,14 @@ _MATCHING = flags.DEFINE_string(
     "video; auto is exhaustive for up to 200 images.",
 )
 _MAX_SIZE = flags.DEFINE_integer(
-    "max_size", 1600, "The longer side in px at which features are extracted.", lower_bound=64
+    "max_size", 1600, "The longer side in px at which features are extracted.", lower_bound=64, upper_bound=65_536
 )
 _NUM_THREADS = flags.DEFINE_integer(
-    "num_threads", None, "The number of threads. When it is not given, one for each core.", lower_bound=1
+    "num_threads",
+    None,
+    "The number of threads. When it is not given, one for each core.",
+    lower_bound=1,
+    upper_bound=4096,
 )
 _OVERWRITE = flags.DEFINE_bool(
     "overwrite", False, "Whether to replace the cameras, copies and features that OUT holds from other calls."

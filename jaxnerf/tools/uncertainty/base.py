@@ -21,7 +21,8 @@ class UncertaintySource(NamedTuple):
     Attributes:
         run: any.
         variables: (params, grid) of the checkpoint, for `run.render_image`.
-        views: of the split "train", with the cameras that the run has refined.
+        views: of the split "train", with the cameras that the run has refined; without pixels if the dataset is not
+            there.
         members: workdirs of other runs of the same config, which differ in seed.
         folder: of files that belong to this checkpoint, where an estimator may keep what takes long to compute.
         fingerprint: text that is equal for the same field and parameters, whatever grid they are rendered with.
@@ -48,7 +49,7 @@ class UncertaintySource(NamedTuple):
         say: Callable[[str], None] = print,
     ) -> "UncertaintySource":
         """Makes the source of a checkpoint, which reads the training views; its folder is not made."""
-        views, cameras = run.experiment.load_split("train"), run.experiment.cameras
+        views, cameras = run.experiment.load_split("train", images=None), run.experiment.cameras
         if cameras is not None:
             views = cameras.refined_views(variables[0], views, "train")
         key = fingerprint_of(run, variables[0])

@@ -216,12 +216,15 @@ def load(path: pathlib.Path, key: str) -> Calibration:
         raise ValueError(f"{path}: was calibrated for other parameters, another field or other members; {_AGAIN}")
     try:
         found = Calibration(**{name: tuple(v) if isinstance(v, list) else v for name, v in content.items()})
-        numbers = np.array([*found.scores, *found.errors, found.factor, found.coverage], float)
-        valid = len(found.scores) == len(found.errors) > 0 and np.isfinite(numbers).all()
-    except (ValueError, TypeError):
+        numbers = [*found.scores, *found.errors, found.factor, found.coverage, found.num_pixels]
+        valid = all(type(number) in (int, float) and 0 <= number < math.inf for number in numbers)
+        valid = valid and len(found.scores) == len(found.errors) > 0 and found.coverage < 1
+        valid = valid and all(list(each) == sorted(each) for each in (found.scores, found.errors))
+        valid = valid and all(isinstance(name, str) for name in found.views)
+    except TypeError:
         valid = False
     if not valid:
-        raise ValueError(f"{path}: is damaged, expected numbers; {_AGAIN}")
+        raise ValueError(f"{path}: is damaged, expected numbers of at least 0, in ascending order; {_AGAIN}")
     return found
 
 

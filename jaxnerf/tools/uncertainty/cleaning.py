@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxnerf.core import contraction
 from jaxnerf.core.occupancy.grid import OccupancyGrid
+from jaxnerf.core.views import check_pixels
 from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.options import is_auto
@@ -83,6 +84,7 @@ def _lowest_limit(source, uncertainty):
 
     Rays through masked pixels count, too.
     """
+    check_pixels(source.views, "max_uncertainty='auto'")
     run, (params, grid) = source.run, source.variables
     given, positions = run.experiment.config.data, jnp.arange(_NUM_RAYS)
     options = {"pixel_offset": given.pixel_offset, "ndc": given.ndc, "needs": run.experiment.model.needs}

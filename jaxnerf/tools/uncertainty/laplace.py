@@ -24,6 +24,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxnerf.core import contraction
 from jaxnerf.core.types import Rays, Vector
+from jaxnerf.core.views import check_pixels
 from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
@@ -134,14 +135,25 @@ def _stored(path, key, say=lambda line: None):
         try:
             with np.load(path, allow_pickle=False) as stored:
                 if str(stored["key"]) == key:
-                    return Deformation(jnp.asarray(stored["std"]), jnp.asarray(stored["noise"]))
+                    return _checked(stored["std"], stored["noise"])
         except Exception:  # a damaged zip file raises almost any exception
             say(f"{path}: is damaged, and computed again")
     return None
 
 
+def _checked(std, noise):
+    """Returns the posterior of two arrays of a file; ValueError if they cannot be one."""
+    shapes = std.shape == (RESOLUTION + 1,) * 3 + (3,) and noise.shape == ()
+    if not (shapes and std.dtype.kind == noise.dtype.kind == "f"):
+        raise ValueError("other arrays")
+    if not (std.min() >= 0 and std.max() <= 1 and 0 < noise < np.inf):  # not NaN either
+        raise ValueError("other numbers")
+    return Deformation(jnp.asarray(std, jnp.float32), jnp.asarray(noise, jnp.float32))
+
+
 def fit_deformation(source: UncertaintySource) -> Deformation:
     """Computes the posterior in one pass over NUM_BATCHES batches of random training rays."""
+    check_pixels(source.views, "the uncertainty 'laplace', which is computed once for each checkpoint,")
     experiment = source.run.experiment
     model = source.run.model_with({}, deform(*_box_of(experiment.config), experiment.config.scene.contracted))
     params, grid = source.variables

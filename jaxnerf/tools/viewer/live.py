@@ -57,7 +57,7 @@ def view_run(
     run = cleaned(restore_with_grid(workdir, data_dir=data_dir), workdir, max_uncertainty)
     first = newest_step(run, workdir, step)
     variables = run.variables(first)
-    views = refined_views(run, run.experiment.load_split("train"), "train", variables[0])
+    views = refined_views(run, run.experiment.load_split("train", images=None), "train", variables[0])
     viewer = Viewer(workdir, run, views, data_dir=data_dir)
 
     def show(step, variables):
@@ -93,8 +93,9 @@ def _follow(run, viewer, show_newest, ended):
                 show_newest(steps)
                 reported = ""
         except Exception as error:  # the run may have been removed, replaced or damaged in any way
-            if steps and steps[-1] not in run.steps():  # training has deleted it as too old
-                continue
+            with contextlib.suppress(OSError):
+                if steps and steps[-1] not in run.steps():  # training has deleted it as too old
+                    continue
             failed = steps[-1] if steps else None
             kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
             line = kind + " ".join(str(error).split())[:500]

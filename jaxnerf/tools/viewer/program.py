@@ -10,8 +10,8 @@ from jaxnerf.runtime import cli
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
-_STEP = flags.DEFINE_integer("step", None, "The checkpoint's step. When it is not given, the newest is shown.")
-_MAX_UNCERTAINTY = cli.define_number("max_uncertainty", run_flags.MAX_UNCERTAINTY)
+_STEP = cli.define_step("The checkpoint's step. When it is not given, the newest is shown.")
+_MAX_UNCERTAINTY = cli.define_fraction("max_uncertainty", run_flags.MAX_UNCERTAINTY)
 _HOST = flags.DEFINE_string(
     "host", "127.0.0.1", "The address to listen on. 0.0.0.0 lets other machines connect, without a password."
 )

@@ -193,17 +193,35 @@ def test_the_form_of_a_png_is_read_without_its_pixels(tmp_path, place):
 
 
 @pytest.mark.parametrize("turn", range(1, 9))
-def test_exif_orientation_is_followed_unless_only_the_stored_size_fits_the_camera(tmp_path, turn):
+def test_exif_orientation_is_followed_if_only_the_upright_size_fits_the_camera(tmp_path, turn):
     stored, exif = pixels(0, 4, 7), Image.Exif()
     exif[0x0112] = turn
     path = tmp_path / "turned.png"
     Image.fromarray(stored).save(path, exif=exif)
     upright = np.asarray(ImageOps.exif_transpose(Image.open(path)))
     np.testing.assert_array_equal(read_image(path), upright)
-    np.testing.assert_array_equal(read_image(path, camera_size=upright.shape[:2]), upright)
     assert image_size(path) == upright.shape[1::-1]
-    if turn >= 5:
-        np.testing.assert_array_equal(read_image(path, camera_size=(4, 7)), stored)
+    for size, expected in (((8, 14), stored), ((14, 8), upright if turn >= 5 else stored), ((7, 7), stored)):
+        np.testing.assert_array_equal(read_image(path, camera_size=size), expected)
+    assert image_size(path, center=np.array([2.0, 3.6])) == (upright.shape[1::-1] if turn >= 5 else (7, 4))
+    assert image_size(path, center=np.array([3.4, 2.0])) == (7, 4)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "webp"])
+def test_where_both_sizes_fit_pixels_are_those_that_are_stored(tmp_path, kind):
+    """Programs that find poses ignore EXIF orientation."""
+    capture = a_capture(tmp_path, [pixels(index, 8, 8) for index in range(2)])
+    exif, frames = Image.Exif(), []
+    exif[0x0112] = 3
+    for frame in capture.frames:
+        image = Image.open(frame.image)
+        path = frame.image.with_suffix(f".{kind}")
+        image.save(path, exif=exif)
+        frames.append(frame._replace(image=path))
+    capture = capture._replace(frames=tuple(frames))
+    views = load_images.load_capture(capture, hold=9)
+    stored = np.asarray(Image.open(frames[1].image))
+    np.testing.assert_array_equal(views.pixels[:64, :3].reshape(8, 8, 3), stored[..., :3])
 
 
 def test_a_mask_is_true_where_the_image_is_bright(tmp_path):

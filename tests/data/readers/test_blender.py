@@ -275,3 +275,17 @@ def test_wrong_times_are_named(dataset, times, message):
     for read in (load_blender, read_capture):
         with pytest.raises(ValueError, match=message):
             read(folder)
+
+
+def test_bounds_that_cannot_be_the_cameras_are_said(dataset):
+    """Cameras that look outwards, all within a hundredth of near, say nothing of how far away the scene is."""
+
+    def shrunk(scale):
+        def change(content):
+            for index, frame in enumerate(content["frames"]):
+                frame["transform_matrix"] = [[1, 0, 0, scale * index], *_POSE[1:]]
+
+        return change
+
+    assert read_capture(dataset(shrunk(0.004))).bounds_reason == "although all cameras are within 0.004: see data.near"
+    assert not read_capture(dataset(shrunk(1.0))).bounds_reason

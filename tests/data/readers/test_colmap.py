@@ -179,7 +179,7 @@ def test_every_lens_agrees_with_colmap(tmp_path, pycolmap, number, name, rest, l
         (6, (90, 95, 31, 25, *BROWN, 0.01, 0, 0.1, 0), r"FULL_OPENCV has k4, k5, k6 = .*image_undistorter"),
         (7, (90, 95, 31, 25, 0.1), "FOV is not supported.*image_undistorter"),
         (10, (90, 95, 31, 25, *[0.1] * 8), "THIN_PRISM_FISHEYE is not supported.*image_undistorter"),
-        (17, (64, 48), "EQUIRECTANGULAR is not supported"),
+        (17, (64, 48), "EQUIRECTANGULAR is not supported.*; panoramas are not read: .*panorama_sfm.py"),
         (99, (), "model number 99, expected 0 to 17.*image_undistorter"),
         (1, (0, 95, 31, 25), "focal length"),
         (1, (90, np.nan, 31, 25), "focal length"),
@@ -191,6 +191,20 @@ def test_unsupported_cameras_are_errors(tmp_path, number, params, message):
     cameras[0] = (7, number, "", 64, 48, params)
     with pytest.raises(ValueError, match=f"cameras.bin, camera 7: .*{message}"):
         colmap.read_capture(put(tmp_path, binary(cameras, images, points)))
+
+
+@pytest.mark.parametrize(
+    "name, todo", [("EQUIRECTANGULAR", "panorama"), ("SPHERICAL", "panorama"), ("NEW", "undistort")]
+)
+def test_the_advice_for_a_camera_model_leads_somewhere(tmp_path, name, todo):
+    """COLMAP's undistorter copies panoramas and keeps their camera model."""
+    folder = put(tmp_path, text(*model()))
+    path = folder / "sparse/0/cameras.txt"
+    others = [line for line in path.read_text().splitlines() if not line.startswith("7 ")]
+    path.write_text("\n".join([f"7 {name} 64 48 64 48", *others]))
+    with pytest.raises(ValueError, match=f"cameras.txt, line 1, camera 7: .*{name}") as error:
+        colmap.read_capture(folder)
+    assert todo in str(error.value) and ("image_undistorter" in str(error.value)) == (todo == "undistort")
 
 
 @pytest.mark.parametrize("base", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."])

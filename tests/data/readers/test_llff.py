@@ -108,6 +108,7 @@ def changed(array, row, column, value):
     "content, message",
     [
         (rows()[:, :16], r"expected floats \[N, 17\]"),
+        (rows()[:, :14], "NeX.s form: append h, w and f of its hwf_cxcy.npy"),
         (rows()[0], r"expected floats \[N, 17\]"),
         (rows()[:0], r"expected floats \[N, 17\]"),
         (np.array([{"poses": 1}], dtype=object), "unreadable"),

@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from PIL import Image
 
 import captures
 from jaxnerf.data import dataset
@@ -101,3 +103,75 @@ def test_masks_may_differ_in_case_from_their_images(tmp_path, shots, names):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     frames = base.read_capture(tmp_path).frames
     assert [frame.mask for frame in frames] == [tmp_path / "masks" / names.format(name) for name in NAMES]
+
+
+def painted(value, mode):
+    """Returns an image of 32 x 24 px that is black but for 8 rows of a value."""
+    pixels = np.zeros((24, 32), np.uint8)
+    pixels[8:16] = value
+    image = Image.fromarray(pixels)
+    if mode == "P":
+        palette = image.convert("P")
+        palette.putpalette([0, 0, 0] * value + [9, 0, 0] * (256 - value))
+        return palette
+    return image.point(bool, "1") if mode == "1" else image.convert(mode)
+
+
+@pytest.mark.parametrize("value, mode", [(255, "L"), (1, "L"), (7, "RGBA"), (255, "LA"), (3, "P"), (1, "1")])
+@pytest.mark.parametrize("format", ["transforms", "colmap", "llff", "blender"])
+def test_pixels_that_instant_ngps_masks_show_are_ignored(tmp_path, shots, value, mode, format):
+    """dynamic_mask_NAME.png beside an image: every pixel that is not black, whatever its alpha; no view is a mask."""
+    if format == "blender":
+        captures.write_blender(tmp_path, shots)
+    elif format == "colmap":
+        captures.write_colmap(tmp_path, shots)
+    else:
+        write(tmp_path, shots, format)
+        shutil.rmtree(tmp_path / "masks")
+    if format == "transforms":
+        for frame in base.read_capture(tmp_path).frames:
+            frame.image.rename(frame.image.with_suffix(".jpg"))
+        text = (tmp_path / "transforms.json").read_text()
+        (tmp_path / "transforms.json").write_text(text.replace(".png", ".jpg"))
+    before = base.read_capture(tmp_path)
+    for frame in before.frames[1:]:  # one has none
+        painted(value, mode).save(frame.image.with_name(f"dynamic_mask_{frame.image.stem}.png"))
+    capture = base.read_capture(tmp_path)
+    assert [frame.image for frame in capture.frames] == [frame.image for frame in before.frames]
+    assert "dynamic_mask_" in capture.choices[-1] and "7 of 8 images have such a mask" in capture.choices[-1]
+    assert base.fingerprint(capture) != base.fingerprint(before)
+    views = dataset.load_dataset(tmp_path, split="train", background="none")
+    mask = views.mask[-24 * 32 :].reshape(24, 32)
+    assert not mask[8:16].any() and mask[:8].all() and mask[16:].all()
+    halved = dataset.load_dataset(tmp_path, split="train", background="none", factor=2).mask[-12 * 16 :].reshape(12, 16)
+    assert not halved[4:8].any() and halved[:4].all() and halved[8:].all()
+
+
+def test_masks_that_a_file_states_win_over_instant_ngps(tmp_path, shots):
+    captures.write_transforms(tmp_path, shots, masks=True)
+    for frame in base.read_capture(tmp_path).frames:
+        painted(255, "L").save(frame.image.with_name(f"dynamic_mask_{frame.image.stem}.png"))
+    views = dataset.load_dataset(tmp_path, split="train")
+    np.testing.assert_array_equal(views.mask[: 24 * 32].reshape(24, 32), captures.hidden(24, 32))
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_pixels_beyond_the_crop_radius_are_ignored(tmp_path, shots, factor):
+    """The radius is in px of the stated size, which may be twice that of the images."""
+    content = captures.write_transforms(tmp_path, shots, extra={"fisheye_crop_radius": 20.0})
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        content[key] *= 2
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    views = dataset.load_dataset(tmp_path, split="train", factor=2 * factor)
+    height, width = 24 // factor, 32 // factor
+    mask = views.mask[: height * width].reshape(height, width)
+    y, x = np.mgrid[:height, :width] + 0.5
+    radius = np.hypot(x - width / 2, y - height / 2) * factor
+    assert not mask[radius > 10 + factor].any() and mask[radius < 10 - factor].all()
+    assert "pixels beyond fisheye_crop_radius, 20 px, are ignored" in base.read_capture(tmp_path).choices[-1]
+    (tmp_path / "transforms.json").write_text(json.dumps(content | {"fisheye_crop_radius": 41}))
+    assert dataset.load_dataset(tmp_path, split="train", factor=2).mask is None
+    for wrong in (0, -3, "20", float("nan")):
+        (tmp_path / "transforms.json").write_text(json.dumps(content | {"fisheye_crop_radius": wrong}))
+        with pytest.raises(ValueError, match="fisheye_crop_radius is .*, expected px above 0"):
+            base.read_capture(tmp_path)

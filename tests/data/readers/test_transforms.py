@@ -131,6 +131,39 @@ def test_absolute_paths_of_another_computer_are_found_in_the_folder(tmp_path, sh
     assert found.notes[0].endswith(" as images/000.png")
 
 
+@pytest.mark.parametrize(
+    "center, right",
+    [
+        ((16, 12), True),
+        ((15.1, 12.7), True),
+        ((20, 11), True),  # cropped at the left
+        ((13, 10), True),
+        ((32, 24), False),  # twice the size: at the corner
+        ((64, 48), False),
+        ((24, 18), False),
+        ((8, 6), False),
+        ((40, 12), False),
+        ((16, -3), False),
+    ],
+)
+@pytest.mark.parametrize("in_frames", [False, True])
+def test_a_principal_point_of_another_size_without_w_and_h_is_an_error(tmp_path, shots, center, right, in_frames):
+    content = captures.write_transforms(tmp_path, shots)
+    del content["w"], content["h"]
+    center = dict(zip(("cx", "cy"), center, strict=True))
+    for level in content["frames"] if in_frames else [content]:
+        level |= center
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    if right:
+        assert read_capture(tmp_path).frames[0].camera.center.tolist() == list(center.values())
+        return
+    with pytest.raises(ValueError, match="cx, cy are .* without w and h, expected 16, 12 or so.* 32 x 24 px; add w"):
+        read_capture(tmp_path)
+    content |= {"w": 32, "h": 24}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert read_capture(tmp_path).frames[0].camera.center.tolist() == list(center.values())
+
+
 def test_images_of_a_folder_of_another_name_are_found_in_images(tmp_path, shots):
     content = captures.write_transforms(tmp_path, shots)
     for frame in content["frames"]:
@@ -152,7 +185,7 @@ def test_file_paths_may_lack_extension_or_begin_with_a_dot(tmp_path, shots, kind
 
 
 def test_the_size_is_the_images_if_it_is_needed_and_not_stated(tmp_path, shots):
-    """The size is that of the upright image."""
+    """The size is that of the stored image, or of the upright one if the centre fits that."""
     content = captures.write_transforms(tmp_path, shots, kind="jpg", orientation=6)
     with Image.open(tmp_path / "images" / "000.jpg") as image:
         assert image.size == (24, 32)
@@ -161,8 +194,8 @@ def test_the_size_is_the_images_if_it_is_needed_and_not_stated(tmp_path, shots):
     content["camera_angle_x"] = 0.8
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read_capture(tmp_path).frames[0].camera
-    assert (camera.height, camera.width) == (24, 32) and camera.center.tolist() == [16, 12]
-    np.testing.assert_allclose(camera.focal, 16 / math.tan(0.4))
+    assert (camera.height, camera.width) == (32, 24) and camera.center.tolist() == [12, 16]
+    np.testing.assert_allclose(camera.focal, 12 / math.tan(0.4))
     content |= {"fl_x": 50.0, "cx": 15.0, "cy": 11.0}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read_capture(tmp_path).frames[0].camera
@@ -405,8 +438,12 @@ def _frame(key, value):
         (_set("k4", 0.1), "k4 is 0.1, expected 0, as a perspective lens"),
         (_set("distortion_params", [0.1]), r"distortion_params is \[0.1\]"),
         (_set("distortion_params", [0, 0, 0, 0, 0, "x"]), "p2 is 'x'"),
-        (_set("camera_model", "EQUIRECTANGULAR"), "camera_model is 'EQUIRECTANGULAR', expected SIMPLE_PINHOLE"),
-        (_set("camera_model", "ORTHOPHOTO"), "camera_model is 'ORTHOPHOTO'"),
+        (
+            _set("camera_model", "EQUIRECTANGULAR"),
+            "camera_model is 'EQUIRECTANGULAR', .*PINHOLE.*panorama_sfm.py",
+        ),
+        (_set("camera_model", "VR180_L"), "camera_model is 'VR180_L', .*panorama_sfm.py"),
+        (_set("camera_model", "ORTHOPHOTO"), "camera_model is 'ORTHOPHOTO'.*; undistort the images"),
         (_set("camera_model", ["OPENCV"]), r"camera_model is \['OPENCV'\]"),
         (_set("is_fisheye", True), "is_fisheye is True, expected the value that camera_model PINHOLE implies"),
         (_set("is_fisheye", 1), "is_fisheye is 1"),

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import os
 import pathlib
+import random
 import shutil
 import signal
 import subprocess
@@ -26,18 +27,32 @@ from jaxnerf.training import auto_config, build, workdir  # noqa: E402
 from jaxnerf.training.checkpoint import Checkpoints  # noqa: E402
 from jaxnerf.training.metric_log import read_rows  # noqa: E402
 from jaxnerf.training.state import create_state  # noqa: E402
-from runs import free_port  # noqa: E402
+from runs import PACKED, as_flags, free_port, module_of  # noqa: E402
 
 OPTIONS = {"save_every": 10, "log_every": 1, "max_to_keep": 1000}
 TRAIN = ("--config=configs/smoke.py", *(f"--config.train.{name}={value}" for name, value in OPTIONS.items()))
 FOREVER = (*TRAIN, "--config.train.max_steps=1000000")
+# Programs of a trained run: flags, and where the run has what they write.
+VIEWS = ("--num_views=2", "--size=16")
+PROGRAMS = {
+    "eval": ("eval", (), "eval/20"),
+    "render": ("render", ("--frames=3", "--width=16", "--video=gif"), "renders/turntable-20"),
+    "mesh": ("export", ("--kind=mesh", "--format=glb", "--resolution=24", "--texture=512", *VIEWS), "exports/mesh-20"),
+    "points": ("export", ("--kind=points", "--num_points=500", *VIEWS), "exports/points-20"),
+    "depth": ("export", ("--kind=depth", *VIEWS), "exports/depth-20"),
+    "splats": ("export", ("--kind=splats", "--num_points=500", "--fit_steps=2", *VIEWS), "exports/splats-20"),
+    "web": ("export", ("--kind=web",), "exports/web-20"),
+    "next": ("check", (), "camera_paths"),
+}
+FREE = (0, 2**14, 2**17)  # bytes
 
 
-def main(out):
+def main(out, only=""):
     out = pathlib.Path(out)
     out.mkdir(parents=True)
     logging.disable()  # orbax logs each file that it cannot read
-    for fault in (damage, second, signals, full_disk, read_only, devices, hangs):
+    faults = (damage, second, signals, full_disk, read_only, full_disks, kills, devices, hangs)
+    for fault in [fault for fault in faults if only in ("", fault.__name__)]:
         for line in fault(out):
             print(f"{fault.__name__:9}  {line}", flush=True)
 
@@ -131,6 +146,82 @@ def read_only(out):
             yield f"{program} in {name}: exit 1, {err[-1]}"
 
 
+def full_disks(out):
+    """Programs of a run on a disk with little space: one line, no half result, and success once there is more."""
+    run, held = trained_run(out), 0
+    for name, (program, flags, written) in PROGRAMS.items():
+        codes = []
+        for free in FREE:
+            with disk(out / f"disk_{name}_{free}", size="24m") as place:
+                copy, options = shutil.copytree(run, place / "run"), (*flags, *plot_of(program, place))
+                fill(place, free)
+                code, err = finish(program, copy, *options)
+                assert code == 0 or (code == 1 and err[-1].startswith("error: ")), err
+                os.remove(place / "filler")
+                complete = (copy / written).exists() and program == "export"
+                again, err = finish(program, copy, *options, *["--overwrite"] * (complete or code == 0))
+                assert again == 0 and (copy / written).exists(), err
+                assert code == 1 or not complete or files_of(copy / written), name
+                assert not leftovers(copy), leftovers(copy)
+                codes.append(code)
+                held += 1
+        yield f"{name} with {FREE} bytes free: exit {codes}; then exit 0, and nothing left behind"
+    yield f"{held} tried, {held} held"
+
+
+def kills(out, seed=0, count=3):
+    """Programs of a trained run that are ended at random moments: the same command then gives the same files."""
+    random_, run, held = random.Random(seed), trained_run(out), 0
+    for name, (program, flags, written) in PROGRAMS.items():
+        whole, ended = shutil.copytree(run, out / f"whole_{name}"), []
+        options, started = (*flags, *plot_of(program, whole)), time.monotonic()
+        code, err = finish(program, whole, *options)
+        seconds, expected = time.monotonic() - started, files_of(whole / written)
+        assert code == 0 and expected, err
+        for number in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT) * count:
+            copy = shutil.copytree(run, out / "ended", dirs_exist_ok=False)
+            process = start(program, copy, *flags, *plot_of(program, copy))
+            time.sleep(random_.uniform(0.1 * seconds, 1.1 * seconds))
+            process.send_signal(number)
+            said = process.communicate(timeout=300)[1]
+            assert process.returncode in (0, -number, 128 + number) and "Traceback" not in said, said
+            complete = process.returncode == 0 or (program == "export" and (copy / written).exists())
+            if complete:
+                assert files_of(copy / written) == expected, name
+            again, err = finish(program, copy, *flags, *plot_of(program, copy), *["--overwrite"] * complete)
+            if again and "exists already" in err[-1]:  # it was finished, and the signal came while it said so
+                again = 0
+            assert again == 0 and files_of(copy / written) == expected, (name, err, files_of(copy / written))
+            assert not leftovers(copy), leftovers(copy)
+            ended.append(process.returncode)
+            held += 1
+            shutil.rmtree(copy)
+        yield f"{name}, ended within {seconds:.0f} s: exit {ended}; then complete, and nothing left behind"
+    yield f"{held} tried, {held} held"
+
+
+def trained_run(out):
+    """Returns the workdir of a run that every program can use."""
+    folder = out / "trained"
+    if not folder.exists():
+        code, err = finish("train", folder, *TRAIN, *as_flags(PACKED), "--config.train.max_to_keep=1")
+        assert code == 0, err
+    return folder
+
+
+def plot_of(program, place):
+    """Returns the flag for the plot of jaxnerf-check, which it would write to the working folder."""
+    return [f"--out={place / 'check.png'}"] if program == "check" else []
+
+
+def files_of(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+def leftovers(folder):
+    return [path for path in folder.rglob("*") if ".tmp" in path.name or path.name.endswith(".old")]
+
+
 def devices(out):
     """Trains on four devices, then two, then one, and compares with one and with four throughout."""
     runs_of_counts = {"mixed": (4, 2, 1), "one": (1, 1, 1), "four": (4, 4, 4)}
@@ -167,7 +258,7 @@ def hangs(out):
 
 
 def start(program, folder, *flags):
-    command = [sys.executable, "-m", f"jaxnerf.{program}", f"--workdir={folder}", *map(str, flags)]
+    command = [sys.executable, "-m", module_of(program), f"--workdir={folder}", *map(str, flags)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
@@ -208,10 +299,12 @@ def disk(place, size="8m"):
         subprocess.run(["umount", "-l", place], check=True)
 
 
-def fill(place):
+def fill(place, free=0):
+    """Fills a disk but for some bytes."""
     with contextlib.suppress(OSError), open(place / "filler", "wb", buffering=0) as file:
         while file.write(bytes(2**12)):
             pass
+    os.truncate(place / "filler", os.path.getsize(place / "filler") - free)
 
 
 def state(folder, step):
@@ -233,4 +326,5 @@ def change(path):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--out", required=True)
+    parser.add_argument("--only", default="", help="the name of one fault")
     main(**vars(parser.parse_args()))

@@ -9,7 +9,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from PIL import Image, ImageColor, ImageFilter
+from PIL import Image, ImageCms, ImageColor, ImageFilter
 
 import captures
 from jaxnerf.core import cameras, types
@@ -432,6 +432,31 @@ def test_test_views_among_the_training_views_and_unused_facts_are_reported(folde
     )
     (unused,) = (finding for finding in report.findings if finding.kind == "skipped")
     assert "camera_angle_x 1.5 is a focal length of 85.874 of 160 px, 192 px is stated, too, and used" in unused.found
+
+
+def test_what_files_state_and_training_does_not_follow_is_reported(folders, tmp_path):
+    """EXIF orientations, colour profiles, a principal point outside, a lens that folds, times."""
+
+    def plant(folder):
+        path, exif = folder / "transforms.json", Image.Exif()
+        content = json.loads(path.read_text())
+        exif[0x0112] = 3
+        profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+        profile = profile.replace(b"s\0R\0G\0B", b"p\0R\0G\0B").replace(b"sRGB", b"pRGB")
+        for index, frame in enumerate(content["frames"]):
+            image = Image.open(folder / frame["file_path"])
+            image.save(folder / frame["file_path"], exif=exif, icc_profile=bytes(profile) if index < 5 else None)
+            frame["time"] = 0.0
+        content["frames"][0] |= {"cx": -900.0}
+        content["k1"] = -3.0
+        path.write_text(json.dumps(content))
+
+    text = planted(folders, tmp_path, "transforms", plant).text()
+    assert "WARNING EXIF orientation of 12 of 12 images (3 in 000.png) is not followed" in text
+    assert "WARNING colour profiles differ, and images are read as they are: 5 pRGB" in text and "7 sRGB" in text
+    assert "WARNING the principal point of 000 is -900, 80 px in an image of 160, 160 px, so outside" in text
+    assert "% of the pixels have no ray: " in text and "expected a ray for each" in text
+    assert "time       images state one, which is not used: the scene is trained as static" in text
 
 
 def test_split_files_with_full_intrinsics_are_checked_as_one_file_is(folders, tmp_path):

@@ -19,7 +19,7 @@ from PIL import Image
 import captures
 import runs
 from jaxnerf.data.readers.base import read_capture
-from jaxnerf.tools.structure_from_motion import colmap_process
+from jaxnerf.tools.structure_from_motion import colmap_process, estimate
 from jaxnerf.tools.structure_from_motion import images as images_module
 from jaxnerf.tools.structure_from_motion.colmap_process import Model
 from jaxnerf.tools.structure_from_motion.estimate import CAMERA_MODELS, Report, Settings, estimate_cameras
@@ -106,10 +106,44 @@ def test_a_database_of_other_settings_is_not_used(images, tmp_path, pycolmap):
     assert files(tmp_path) == before
 
 
+@pytest.mark.parametrize(
+    "sql, found",
+    [
+        (
+            "CREATE VIEW descriptors AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x+1 FROM c) SELECT * FROM c",
+            "view",
+        ),
+        ("CREATE TABLE a (b); CREATE TRIGGER t AFTER INSERT ON a BEGIN DELETE FROM a; END", "the trigger 't'"),
+        ("CREATE TABLE images (name, size AS (length(name)))", "the table 'images'"),
+        ("CREATE VIRTUAL TABLE images USING fts5(name)", "the table 'images'"),
+        (None, "is no database of COLMAP"),
+    ],
+)
+def test_a_database_of_anything_but_tables_is_refused(images, tmp_path, pycolmap, monkeypatch, sql, found):
+    monkeypatch.setattr(estimate._Stages, "_claim", lambda self: None)  # as if the settings were the same
+    database = tmp_path / "out" / "cameras" / "database.db"
+    database.parent.mkdir(parents=True)
+    if sql:
+        with contextlib.closing(sqlite3.connect(database)) as connection:
+            connection.executescript(sql)
+    else:
+        database.write_text("no database")
+    with pytest.raises(ValueError, match=f"database.db: .*{found}.*; remove .*cameras"):
+        estimate_cameras(images, tmp_path / "out", say=lambda line: None)
+
+
+def test_a_query_without_an_end_is_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(colmap_process, "_QUERY_SECONDS", 0.1)
+    endless = "(WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x+1 FROM c) SELECT x FROM c)"
+    with contextlib.closing(sqlite3.connect(tmp_path / "a.db")) as connection:
+        connection.execute("CREATE TABLE a (b)")
+    assert colmap_process.count_rows(tmp_path / "a.db", endless) == 0
+
+
 def test_white_space_in_names_is_reported_where_images_are_used_in_place(tmp_path, images, pycolmap):
     (images / "a.png").rename(images / "a 1.png")
     images = images.rename(tmp_path / "images")
-    with pytest.raises(ValueError, match="'a 1.png': the name has white space, expected none"):
+    with pytest.raises(ValueError, match="'a 1.png': the name has characters that .* expected 'a_1.png'"):
         estimate_cameras(images, tmp_path)
 
 

@@ -10,6 +10,7 @@ from PIL import Image
 from jaxnerf.data.images.image_files import read_image
 from jaxnerf.tools.structure_from_motion.images import (
     copy_images,
+    copy_name,
     find_images,
     group_by_size,
     image_pairs,
@@ -57,6 +58,21 @@ def test_copies_are_exact_named_without_white_space_and_made_once(tmp_path):
     before = (out / "c.jpg").stat()
     copy_images(paths, out, overwrite=True, progress=done.append)
     assert (out / "c.jpg").stat().st_ino == before.st_ino
+
+
+@pytest.mark.parametrize(
+    "name, copied",
+    [
+        ("#1.png", "_1.png"),
+        ("# 1#.png", "__1#.png"),
+        ("a\nb\t\u3000.png", "a_b__.png"),
+        ("\x1b\u202e\udcff.png", "___.png"),
+        ("é'\"\\,;$().png", "é'\"\\,;$().png"),
+    ],
+)
+def test_a_copy_has_a_name_that_a_list_of_pairs_can_hold(tmp_path, name, copied):
+    """COLMAP takes lines that begin with # as comments, and white space separates two names."""
+    assert copy_name(tmp_path / name) == copied
 
 
 def test_rotated_jpegs_are_copied_upright(tmp_path):

@@ -1,6 +1,7 @@
 """Predicted errors: calibration, sparsification, the deformation, and what is refused."""
 
 import dataclasses
+import math
 import re
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -121,6 +122,26 @@ def test_a_stored_calibration_is_refused_for_another_checkpoint(tmp_path):
         calibration.load(path, "this")
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [{"factor": value} for value in (-1.0, math.nan, math.inf, "2", True, None, [1.0], {})]
+    + [{name: value} for name in ("scores", "errors") for value in ([], [1.0], "1", [-1.0], [math.nan], [["1"]], 3)]
+    + [
+        {"coverage": 1.5},
+        {"coverage": "0.9"},
+        {"num_pixels": "many"},
+        {"num_pixels": -5},
+        {"views": 3},
+        {"views": [3]},
+    ],
+)
+def test_a_calibration_of_other_values_is_damaged(tmp_path, wrong):
+    path = tmp_path / "laplace.json"
+    calibration.save(path, calibrated()._replace(**wrong), "this")
+    with pytest.raises(ValueError, match="laplace.json: is damaged, expected numbers"):
+        calibration.load(path, "this")
+
+
 def test_ause_is_zero_for_true_errors_and_larger_the_less_the_score_says():
     error = np.random.default_rng(0).exponential(size=5000)
     noisy = error + np.random.default_rng(1).normal(size=5000)
@@ -166,11 +187,29 @@ def test_a_deformed_field_is_the_field_until_it_is_moved(contracted):
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:100], lambda data: data[:70] + b"?" + data[71:], lambda _: b""])
-def test_a_damaged_posterior_is_computed_again(tmp_path, damage):
+def test_a_damaged_posterior_is_computed_again(tmp_path, monkeypatch, damage):
+    monkeypatch.setattr(laplace, "RESOLUTION", 1)
     path, lines = tmp_path / "laplace.npz", []
     np.savez(path, key="a", std=np.ones((2, 2, 2, 3), np.float32), noise=np.float32(1))
     assert laplace._stored(path, "a", lines.append) is not None and laplace._stored(path, "b", lines.append) is None
     path.write_bytes(damage(path.read_bytes()))
+    assert laplace._stored(path, "a", lines.append) is None
+    assert lines == [f"{path}: is damaged, and computed again"]
+
+
+_STD = np.ones((2, 2, 2, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [{"std": std} for std in (_STD[..., :2], _STD[0], np.ones((3, 3, 3, 3)), -_STD, 2 * _STD, np.nan * _STD)]
+    + [{"std": std} for std in (_STD.astype(int), _STD.astype(str), np.float32(1), _STD.astype(complex))]
+    + [{"noise": noise} for noise in (np.float32(-1), np.float32(0), np.nan, np.inf, "1", np.ones(1), np.ones(9))],
+)
+def test_a_posterior_of_other_arrays_is_computed_again(tmp_path, monkeypatch, arrays):
+    monkeypatch.setattr(laplace, "RESOLUTION", 1)
+    path, lines = tmp_path / "laplace.npz", []
+    np.savez(path, **{"key": "a", "std": _STD, "noise": np.float32(1), **arrays})
     assert laplace._stored(path, "a", lines.append) is None
     assert lines == [f"{path}: is damaged, and computed again"]
 
@@ -190,7 +229,7 @@ def stub_run(grid, hold_out=0):
     config = SimpleNamespace(data=data)
     views = Views(**dict.fromkeys(field.name for field in dataclasses.fields(Views)))
     model = SimpleNamespace(needs=())
-    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split: views, model=model)
+    experiment = SimpleNamespace(config=config, cameras=None, load_split=lambda split, **options: views, model=model)
     fields = dict.fromkeys(TrainedRun._fields) | {"experiment": experiment, "identity": "fixed", "settings": {}}
     return TrainedRun(**fields | {"steps": lambda: [5], "variables": lambda step: (np.ones(3), grid)})
 
