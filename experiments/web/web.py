@@ -30,7 +30,7 @@ from absl import flags
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
-from jaxnerf.core.cameras import pixel_grid, rays_from_pixels
+from jaxnerf.core.cameras import ndc_rays, pixel_grid, rays_from_pixels
 from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.types import Camera
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
@@ -47,6 +47,7 @@ RUNS = {
     "lego_400": ["--config=lego_fast", "--config.data.factor=2", "--config.train.max_seconds=90"],
     "fox": ["--config=capture", "--data_dir=fox", "--config.train.max_seconds=120"],
     "can": ["--config=capture", "--data_dir=can", "--config.train.max_seconds=60"],
+    "fern": ["--config=capture", "--data_dir=fern", "--config.train.max_seconds=60"],
 }
 FOLDER = pathlib.Path("runs/web")
 
@@ -129,7 +130,7 @@ def compare(page, path: pathlib.Path, workdir: str, size: int) -> dict:
     open_page(page, path)
     found = {"psnr": [], "page": [], "eval": []}
     for index in range(min(NUM_VIEWS, len(views.size))):
-        view, rays = view_of(views, index, size)
+        view, rays = view_of(views, index, size, ndc=run.experiment.config.data.ndc)
         run.render_image(variables, rays)  # compiles
         started = time.perf_counter()
         image = np.asarray(run.render_image(variables, rays).rgb)
@@ -144,7 +145,7 @@ def compare(page, path: pathlib.Path, workdir: str, size: int) -> dict:
     return found
 
 
-def view_of(views, index: int, size: int):
+def view_of(views, index: int, size: int, *, ndc: bool = False):
     """Returns a view without its lens, for the page, and its Rays [H, W]."""
     camera = jax.tree.map(lambda leaf: np.asarray(leaf)[index], views.cameras)
     scale = size / max(views.size[index])
@@ -154,6 +155,8 @@ def view_of(views, index: int, size: int):
     )
     near, far = float(views.near[index]), float(views.far[index])
     rays = rays_from_pixels(pinhole, pixel_grid(height, width), near=near, far=far)
+    if ndc:  # which the view's own lens defines
+        rays = ndc_rays(rays, views.camera(index))
     view = {"pose": pinhole.to_world.reshape(-1).tolist(), "width": width, "height": height, "near": near}
     return view | {"far": far, "focal": pinhole.focal.tolist(), "center": pinhole.center.tolist()}, rays
 

@@ -211,8 +211,9 @@ def fuse(
     """
     voxel, shape = grid_shape(box, resolution)
     truncation = _TRUNCATION * voxel
-    surfaces = [(image.points(), *image.normals()) for image in images]
-    index = _vertices_near([points[cosine > 0] for points, _, cosine in surfaces], box[0], voxel, shape)
+    with stages.stage("finding voxels near surfaces"):
+        surfaces = [(image.points(), *image.normals()) for image in images]
+        index = _vertices_near([points[cosine > 0] for points, _, cosine in surfaces], box[0], voxel, shape)
     x = np.float32(box[0] + voxel * np.stack(np.unravel_index(index, shape), axis=-1))
     x = jnp.asarray(np.resize(x, (-(-max(len(x), 1) // _CHUNK), _CHUNK, 3)))  # padded with copies of the first
     total = jnp.zeros((*x.shape[:2], 3), jnp.float32)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters.base import ExportSource
 from jaxnerf.tools.exporters.surfaces import DepthImage, export_box, inside, render_depth_images
 
@@ -21,8 +22,9 @@ def export_points(source: ExportSource, folder: pathlib.Path) -> None:
     settings = source.settings
     images = render_depth_images(source, settings.image_size)
     box = export_box(source, images)
-    points, normals, rgb = surface_points(images, box)[:3]
-    chosen = thinned(points, settings.num_points)
+    with stages.stage("selecting points"):
+        points, normals, rgb = surface_points(images, box)[:3]
+        chosen = thinned(points, settings.num_points)
     write_ply(
         folder / "points.ply",
         {

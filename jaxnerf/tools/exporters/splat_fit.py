@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Camera, Vector
-from jaxnerf.runtime.stages import Progress
+from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters.gaussians import MAX_ALPHA, Gaussians, colors_at, project, visible_pairs
 from jaxnerf.tools.exporters.surfaces import DepthImage, inside
 
@@ -82,22 +82,23 @@ def fit_gaussians(
         updates = {name: RATES[name] * update for name, update in updates.items()}
         return optax.apply_updates(parameters, updates), state
 
-    state, rng, progress = adam.init(parameters), np.random.default_rng(seed), Progress(steps)
+    state, rng = adam.init(parameters), np.random.default_rng(seed)
     weights = [_weights(image, box) for image in images]
     count, order = 0, []
-    while count < steps:
-        order = order or rng.permutation(len(images)).tolist()
-        group, order = order[:_GROUP], order[_GROUP:]
-        now = jax.tree.map(np.asarray, _gaussians(parameters, *initial))
-        listed = {index: _listed(now, images[index].camera) for index in group}
-        for index in rng.permutation(group * _VISITS)[: steps - count]:
-            camera = [np.float32(getattr(images[index].camera, name)) for name in ("to_world", "focal", "center")]
-            parameters, state = step(
-                parameters, state, initial, camera, listed[index], images[index].rgb, weights[index]
-            )
-            count += 1
-        progress.show(count, "steps of fitting splats")
-    progress.close()
+    with stages.stage("fitting splats, by steps") as stage:
+        while count < steps:
+            order = order or rng.permutation(len(images)).tolist()
+            group, order = order[:_GROUP], order[_GROUP:]
+            now = jax.tree.map(np.asarray, _gaussians(parameters, *initial))
+            listed = {index: _listed(now, images[index].camera) for index in group}
+            for index in rng.permutation(group * _VISITS)[: steps - count]:
+                camera = [np.float32(getattr(images[index].camera, name)) for name in ("to_world", "focal", "center")]
+                parameters, state = step(
+                    parameters, state, initial, camera, listed[index], images[index].rgb, weights[index]
+                )
+                count += 1
+                stage.update(count, steps)
+        jax.block_until_ready(parameters)
     return jax.tree.map(np.asarray, _gaussians(parameters, *initial))
 
 

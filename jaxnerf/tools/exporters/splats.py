@@ -19,6 +19,7 @@ from jaxnerf.evaluation.restore import refined_views
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.fields.hash_grid import harmonics
 from jaxnerf.options import is_auto
+from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters.base import ExportSource, can_be_scored
 from jaxnerf.tools.exporters.gaussians import Gaussians, rasterize, read_spz, write_gaussians, write_spz
 from jaxnerf.tools.exporters.points import surface_points, thinned
@@ -48,8 +49,9 @@ def export_splats(source: ExportSource, folder: pathlib.Path) -> None:
     size = min(settings.image_size, longest) if is_auto(settings.size) else settings.size
     images = render_depth_images(source, size)
     box = export_box(source, images)
-    points, normals, _, extinction, field_x = surface_points(images, box)
-    chosen = thinned(points, settings.num_points)
+    with stages.stage("selecting points"):
+        points, normals, _, extinction, field_x = surface_points(images, box)
+        chosen = thinned(points, settings.num_points)
     points, normals, extinction, field_x = (each[chosen] for each in (points, normals, extinction, field_x))
     gaussians = make_gaussians(points, normals, extinction, colors_of(source, field_x, normals))
     if settings.fit_steps:
@@ -111,9 +113,11 @@ def colors_of(source: ExportSource, field_x: np.ndarray, normals: np.ndarray) ->
         return jnp.linalg.solve(square, jnp.einsum("nd,dk,ndc->nkc", weights, basis, rgb - 0.5))
 
     count, parts = len(field_x), []
-    for start in range(0, count, _CHUNK):
-        index = np.minimum(np.arange(start, start + _CHUNK), count - 1)  # one compiled shape
-        parts.append(np.asarray(fit(params, grid, np.float32(field_x[index]), np.float32(normals[index]))))
+    with stages.stage("evaluating colours from all directions") as stage:
+        for start in range(0, count, _CHUNK):
+            index = np.minimum(np.arange(start, start + _CHUNK), count - 1)  # one compiled shape
+            parts.append(np.asarray(fit(params, grid, np.float32(field_x[index]), np.float32(normals[index]))))
+            stage.update(min(start + _CHUNK, count), count)
     return np.concatenate(parts)[:count]
 
 
@@ -126,14 +130,16 @@ def score(source: ExportSource, gaussians: Gaussians | None) -> tuple[float, int
     views = refined_views(run, run.experiment.load_split(split), split, source.variables[0])
     count = min(_NUM_SCORED, len(views.size))
     values = []
-    for index in map(int, np.arange(count) * len(views.size) // count):
-        if gaussians is None:
-            pixels = pixel_grid(*(int(side) for side in views.size[index]))
-            image = render_pixels(run, source.variables, views, index, pixels)[0].rgb
-        else:
-            image = _image_of(source, gaussians, views, index)
-        image = np.clip(image, 0, 1).astype(np.float32)
-        values.append(float(psnr(jnp.asarray(image), views.image(index), mask=pixel_mask(views, index))))
+    with stages.stage(f"scoring the {'run' if gaussians is None else 'splats'}, by images") as stage:
+        for index in map(int, np.arange(count) * len(views.size) // count):
+            if gaussians is None:
+                pixels = pixel_grid(*(int(side) for side in views.size[index]))
+                image = render_pixels(run, source.variables, views, index, pixels)[0].rgb
+            else:
+                image = _image_of(source, gaussians, views, index)
+            image = np.clip(image, 0, 1).astype(np.float32)
+            values.append(float(psnr(jnp.asarray(image), views.image(index), mask=pixel_mask(views, index))))
+            stage.update(len(values), count)
     return float(np.mean(values)), count
 
 

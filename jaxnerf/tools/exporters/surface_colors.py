@@ -1,4 +1,4 @@
-"""Colours of points on the surfaces of a run: what its training views see there, on average."""
+"""Colours of points on the surfaces of a run: what most of its training views see there, on average."""
 
 from collections.abc import Callable, Sequence
 
@@ -17,7 +17,8 @@ from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters.base import ExportSource
 from jaxnerf.tools.exporters.surfaces import DepthImage
 
-_NUM_VIEWS = 4  # that see a point best; the field is evaluated for each
+_NUM_VIEWS = 8  # that see a point best; the field is evaluated for each
+_AGREEING = 0.1  # largest difference of a channel from the colour that is nearest to those of all views
 _NUM_SAMPLES = 4  # of the field along the ray of each view
 _MIN_COSINE = 0.15  # between ray and normal; a view at a steeper angle does not count
 _OTHER_POSES = 1e-3  # weight of a pose that is not of a training view: the field was not trained for it
@@ -33,11 +34,13 @@ def surface_colors(
     normals: Float[np.ndarray, "N 3"],
     reach: float,
 ) -> UInt8[np.ndarray, "N 3"]:
-    """Computes the mean colour of points on surfaces, over the views that see them at the steepest angles.
+    """Computes the mean colour of points on surfaces, over most of the views that see them at the steepest angles.
 
     The colour that a view sees is that of the field along the view's ray, from `reach` in front of the point to as far
     behind it, composited as in an image (Eq. 3 of arXiv:2003.08934). Views count by the cosine between ray and normal
-    and by the opacity there. What the field looks like in detail does not depend on the size of the images.
+    and by the opacity there. Those whose colour is far from that of most others do not count: a view whose matte cuts
+    the object has taught the field to show the background from there. What the field looks like in detail does not
+    depend on the size of the images.
 
     Args:
         source: the run.
@@ -60,7 +63,7 @@ def surface_colors(
         weight, view = jax.lax.top_k(weights.T, min(_NUM_VIEWS, len(images)))
         offset = points[:, None] - cameras.to_world[view, :, 3]
         rgba = evaluate(params, grid, points, offset / norm(offset)[..., None])
-        total = (weight[..., None] * rgba).sum(axis=1)
+        total = (_of_most(weight, rgba)[..., None] * rgba).sum(axis=1)
         seen = total[:, 3:] > _OTHER_POSES * _MIN_OPACITY
         rgb = total[:, :3] / jnp.where(seen, total[:, 3:], 1)
         return jnp.rint(255 * jnp.clip(jnp.where(seen, rgb, 0), 0, 1)).astype(jnp.uint8), seen[:, 0]
@@ -76,6 +79,16 @@ def surface_colors(
     if seen.any() and not seen.all():
         rgb[~seen] = rgb[seen][cKDTree(points[seen]).query(points[~seen])[1]]
     return rgb
+
+
+def _of_most(weight, rgba):
+    """Returns weights [N, K] of views, 0 for those whose colour [N, K, 4] is far from the one nearest to all others."""
+    opacity = rgba[..., 3]
+    rgb = rgba[..., :3] / jnp.where(opacity > 0, opacity, 1)[..., None]
+    apart = jnp.abs(rgb[:, :, None] - rgb[:, None]).max(axis=-1)
+    middle = ((weight * opacity)[:, None] * apart).sum(axis=-1)
+    middle = jnp.where(weight * opacity > 0, middle, jnp.inf).argmin(axis=1)
+    return jnp.where(jnp.take_along_axis(apart, middle[:, None, None], axis=1)[:, 0] <= _AGREEING, weight, 0)
 
 
 def _weights(cameras, surfaces, trained, points, normals, reach):

@@ -15,6 +15,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from jaxnerf.runtime import stages
+
 _GUTTER = 3  # texels around a chart with the colours of its border, which bilinear filters and mipmaps mix
 _ROUNDS = 8  # in which parts of charts that overlap in the projection become charts of their own
 _VOTES = 8  # rounds in which a triangle takes over the direction of its neighbours, so that charts are large
@@ -69,7 +71,8 @@ def textured(
     Raises:
         ValueError: if the image has no room for all charts.
     """
-    atlas, texels = unwrap(mesh, size)
+    with stages.stage("unwrapping the surface"):
+        atlas, texels = unwrap(mesh, size)
     corners = mesh.vertices[mesh.faces[texels.face]]
     image = np.zeros((size * size, 3), np.uint8)
     image[texels.index] = colors((texels.weights[..., None] * corners).sum(axis=1))

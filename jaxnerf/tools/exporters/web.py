@@ -19,10 +19,11 @@ from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import path_poses
-from jaxnerf.data.geometry.poses import gaze_center, up_of
+from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import TrainedRun, refined_views
 from jaxnerf.fields.hash_grid import HashGrid
+from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters import web_scene
 from jaxnerf.tools.exporters.base import ExportSource, can_be_scored
 from jaxnerf.tools.exporters.web_scene import WebScene
@@ -31,6 +32,7 @@ MAGIC = b"JAXNERF1"
 MAX_LOSS = 0.05  # dB that 8-bit features may cost; otherwise they have 16
 _NUM_SCORED = 4  # test views
 _MAX_CAMERAS, _TOUR_FRAMES = 100, 48
+_SWING = 0.1, 0.6  # radians: range of the angle up to which a camera turns in a scene that is seen from one side
 _DATA_FILE = "scene.bin"
 _TYPES = {"uint8": "u8", "float16": "f16", "float32": "f32", "uint32": "u32"}
 
@@ -52,7 +54,8 @@ def export_web(source: ExportSource, folder: pathlib.Path) -> None:
         views = refined_views(source.run, experiment.load_split(split), split, source.variables[0])
     quality = measured = ""
     for precision in web_scene.PRECISIONS:
-        scene = scene_of(source.run, source.variables, precision)
+        with stages.stage(f"packing features of {precision}"):
+            scene = scene_of(source.run, source.variables, precision)
         if views is None:
             break
         score = measure(source, scene, views)
@@ -62,7 +65,8 @@ def export_web(source: ExportSource, folder: pathlib.Path) -> None:
         if score.of_run - score.of_page <= MAX_LOSS:
             break
         source.say(f"features of {precision} would lose {score.of_run - score.of_page:.2f} dB")
-    data = encode(scene, about(source, scene, quality))
+    with stages.stage("compressing the scene"):
+        data = encode(scene, about(source, scene, quality))
     (folder / "index.html").write_text(page(None if source.settings.split else data))
     if source.settings.split:
         (folder / _DATA_FILE).write_bytes(data)
@@ -84,8 +88,6 @@ def network_of(run: TrainedRun) -> HashGrid:
         reason = f"field is {config.field!r}, expected a hash grid"
     elif model.grid_schedule is None:
         reason = f"sampler is {config.sampler!r}, expected one that trains with an occupancy grid"
-    elif config.data.ndc:
-        reason = "data.ndc is True, expected False: the page has no normalised device coordinates"
     elif model.needs:
         reason = f"the field asks for {', '.join(model.needs)}, expected position and direction"
     if reason:
@@ -105,6 +107,7 @@ def scene_of(run: TrainedRun, variables: tuple, precision: str) -> WebScene:
         step_size=experiment.model.grid_schedule.step_size / view.sample_multiplier,
         early_stop_eps=view.early_stop_eps,
         background=experiment.background,
+        ndc=experiment.config.data.ndc,
     )
 
 
@@ -137,21 +140,36 @@ def about(source: ExportSource, scene: WebScene, quality: str) -> dict[str, Any]
     name = pathlib.PurePath(config.data.dir).name or "embedded scene"
     names = views.names or tuple(f"view {index}" for index in range(len(poses)))
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MAX_CAMERAS)).round().astype(int))
-    kind, _ = path_poses.default_kind(poses, camera_path.up_direction(None, views))
-    path = camera_path.make_path(kind, views, num_frames=_TOUR_FRAMES)
+    up = camera_path.up_direction(config.data.up or None, views)
+    tour = _tour(views, poses, config.data.up or None)
+    target, swing = gaze_center(poses), None
+    if look_one_way(poses):
+        pose, radii, focus = path_poses.forward_frame(poses)
+        target, swing = pose[:, 3] - focus * pose[:, 2], float(np.clip(2 * np.arctan(radii[:2].max() / focus), *_SWING))
     how = [f"trained for {source.step:,} steps on {len(poses)} images", quality, "made with jaxnerf"]
     return {
         "name": name,
         "step": source.step,
         "how": "; ".join(filter(None, how)),
         "cameras": [_camera(views, index, names[index]) for index in some],
-        "tour": [_numbers(pose) for pose in path.poses],
-        "target": _numbers(gaze_center(poses)),
-        "up": _numbers(up_of(poses)),
+        "tour": [_numbers(pose) for pose in tour],
+        "target": _numbers(target),
+        "swing": swing,
+        "up": _numbers(up_of(poses) if up is None else up),
+        "ndc_scale": _numbers(2 * np.asarray(views.cameras.focal)[0] / np.asarray(views.size)[0, ::-1]),
         "near": float(np.min(views.near)),
         "far": float(min(np.max(views.far), 1e9)),
         "operations": web_scene.operations_per_sample(scene),
     }
+
+
+def _tour(views, poses, up):
+    """Returns the poses of the path that `jaxnerf-render` selects; the first camera's where cameras define none."""
+    try:
+        kind, _ = path_poses.default_kind(poses, camera_path.up_direction(up, views))
+        return camera_path.make_path(kind, views, num_frames=_TOUR_FRAMES, up=up).poses
+    except ValueError:
+        return poses[:1]
 
 
 def _camera(views, index, name):

@@ -52,6 +52,7 @@ class WebScene(NamedTuple):
         step_size: world units.
         early_stop_eps: see `render_packed`.
         background: [3].
+        ndc: whether positions are in normalised device coordinates.
     """
 
     levels: tuple[TableLevel, ...]
@@ -64,6 +65,7 @@ class WebScene(NamedTuple):
     step_size: float
     early_stop_eps: float
     background: tuple[float, float, float]
+    ndc: bool = False
 
     @property
     def groups(self) -> int:
@@ -93,6 +95,7 @@ def pack(
     step_size: float,
     early_stop_eps: float,
     background: tuple[float, float, float] | None,
+    ndc: bool = False,
 ) -> WebScene:
     """Packs a hash grid for a browser.
 
@@ -102,6 +105,7 @@ def pack(
         grid: in whose occupied cells the field is evaluated.
         precision: of a feature, one of PRECISIONS. 8 bits divide the range of each level evenly.
         step_size, early_stop_eps, background: see `render_with_grid`.
+        ndc: whether rays are in normalised device coordinates.
 
     Raises:
         ValueError: if a number is not finite, or a texture would be too large for browsers.
@@ -140,6 +144,7 @@ def pack(
         step_size=float(step_size),
         early_stop_eps=float(early_stop_eps),
         background=tuple(map(float, background or (0, 0, 0))),
+        ndc=ndc,
     )
 
 
@@ -196,7 +201,7 @@ def _constants(scene):
     numbers = {"TABLE_WIDTH": TABLE_WIDTH, "WEIGHTS_WIDTH": WEIGHTS_WIDTH, "BITS_WIDTH": BITS_WIDTH, "COARSE": COARSE}
     numbers |= {"GROUPS": scene.groups, "MAX_SEGMENTS": int(most)}
     numbers |= {"GROUP": _SLOT_SAMPLES[scene.early_stop_eps >= _HIGH_EPS]}
-    lines = [f"#define CONTRACTED {int(grid.contracted)}"]
+    lines = [f"#define CONTRACTED {int(grid.contracted)}", f"#define NDC {int(scene.ndc)}"]
     lines += [f"const int {name} = {value};" for name, value in numbers.items()]
     lines += [f"const ivec3 CELLS = ivec3{tuple(cells)};", f"const ivec3 CUBES = ivec3{_cubes(cells)};"]
     lines += [f"const float STEP = {_number(scene.step_size)};"]

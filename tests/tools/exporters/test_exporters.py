@@ -11,6 +11,7 @@ from PIL import Image
 from export_sources import CENTER, RADIUS, SIZE, source_of
 from jaxnerf.core.types import Camera
 from jaxnerf.fields.base import Field
+from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters import base, gaussians, surfaces
 from jaxnerf.tools.exporters.base import export_run
 from jaxnerf.tools.exporters.depth import export_depth
@@ -214,8 +215,9 @@ def test_thinned_keeps_at_most_so_many():
     assert 80 < len(thinned(points, 100)) <= 100 and len(thinned(0 * points, 5)) == 1
 
 
-def test_splats_look_like_the_scene(images, tmp_path):
-    lines = []
+def test_splats_look_like_the_scene(images, tmp_path, monkeypatch):
+    lines, said, stage = [], [], stages.stage
+    monkeypatch.setattr(stages, "stage", lambda text: said.append(text) or stage(text))
     export_splats(source_of(num_points=3000, fit_steps=0, say=lines.append), tmp_path)
     data = trimesh.load(tmp_path / "splats.ply").metadata["_ply_raw"]["vertex"]["data"]
     assert data.dtype.names == (
@@ -225,6 +227,8 @@ def test_splats_look_like_the_scene(images, tmp_path):
         *(f"rot_{i}" for i in range(4)),
     )
     assert "PSNR" in lines[0]
+    scored = [f"scoring the {each}, by images" for each in ("splats", "splats", "run")]
+    assert said == ["selecting points", "evaluating colours from all directions", *scored]
     read = splats_of(data)
     image = images[3]
     drawn = gaussians.rasterize(read, image.camera)

@@ -3,6 +3,7 @@
 test_web_in_browser.py and experiments/web/web.py draw pages in a browser.
 """
 
+import dataclasses
 import gzip
 import json
 from types import SimpleNamespace
@@ -12,12 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from export_sources import source_of
 from jaxnerf.core.contraction import contract
 from jaxnerf.core.occupancy.grid import create_grid
+from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.fields.base import Field, contract_field
 from jaxnerf.fields.hash_grid import HashGrid, harmonics, hash_grid_field
 from jaxnerf.tools.exporters import web, web_scene
+from jaxnerf.training.config import changed
 
 BOX = {"lower": (-1.0, -1.5, -0.5), "upper": (1.0, 1.0, 1.5)}
 SMALL = {"resolutions": (5, 9), "table_size": 2**12, "width": 12, "view_width": 8, **BOX}
@@ -32,7 +36,7 @@ FIELDS = {
 }
 
 
-def packed(options, precision="16 bits", contracted=False, as_scene=False):
+def packed(options, precision="16 bits", contracted=False, as_scene=False, ndc=False):
     """Returns the function that evaluates a field with random parameters, and its WebScene; as_scene: it is a scene."""
     network, field = HashGrid(**options), hash_grid_field(**options)
     params = jax.jit(field.init)(jax.random.key(1))
@@ -43,9 +47,8 @@ def packed(options, precision="16 bits", contracted=False, as_scene=False):
     occupied = rng.uniform(size=(9, 11, 10)) < 0.3
     lower, upper = (np.float32(options[name]) for name in ("lower", "upper"))
     grid = create_grid(lower, upper, occupied, initial_density=1.0, contracted=contracted)
-    scene = web_scene.pack(
-        network, params, grid, precision=precision, step_size=0.02, early_stop_eps=0.01, background=None
-    )
+    march = {"step_size": 0.02, "early_stop_eps": 0.01, "background": None}
+    scene = web_scene.pack(network, params, grid, precision=precision, ndc=ndc, **march)
     field = contract_field(field, lower, upper) if contracted else field
     decoded = scene.decoded(params)
 
@@ -116,7 +119,7 @@ def test_the_twin_contracts_as_the_field_does():
     field, scene = packed(FIELDS["hashed"], contracted=True)
     for found, expected in zip(shaded(scene, *places(reach=30)), field(*places(reach=30)), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
-    assert "#define CONTRACTED 1" in web_scene.shader(scene)
+    assert "#define CONTRACTED 1" in web_scene.shader(scene) and "#define NDC 0" in web_scene.shader(scene)
 
 
 def test_features_have_the_precision_that_is_stated():
@@ -185,6 +188,28 @@ def test_the_page_holds_everything_and_loads_nothing():
     assert "scene.bin" in web.page(None)
 
 
+def test_the_page_tours_as_the_run_does_and_turns_little_where_cameras_look_one_way():
+    source = source_of()
+    described = web.about(source, packed(FIELDS["dense"])[1], "")
+    path = camera_path.make_path("turntable", source.views, num_frames=len(described["tour"]))
+    np.testing.assert_allclose(described["tour"], path.poses.reshape(-1, 12), atol=1e-6)
+    assert described["swing"] is None and described["up"] == [0, 0, 1]
+    upright = source_of()
+    upright.run.experiment.config = changed(upright.run.experiment.config, {"data.up": "+x"})
+    found = web.about(upright, packed(FIELDS["dense"])[1], "")  # x of the files is -y of the run
+    np.testing.assert_allclose(found["up"], [0, -1, 0], atol=1e-6)
+    poses = np.tile(np.eye(3, 4, dtype=np.float32), (14, 1, 1))
+    poses[:, :2, 3] = np.random.default_rng(0).uniform(-0.3, 0.3, (14, 2))
+    ahead = dataclasses.replace(source.views.cameras, to_world=poses)
+    forward = source._replace(views=dataclasses.replace(source.views, cameras=ahead))
+    described = web.about(forward, packed(FIELDS["dense"], ndc=True)[1], "")
+    assert 0 < described["swing"] <= 0.6 and described["target"][2] < -0.5
+    np.testing.assert_allclose(described["ndc_scale"], [4.4, 4.4], rtol=1e-6)
+    alone = dataclasses.replace(ahead, to_world=np.tile(poses[:1], (14, 1, 1)))  # defines no path
+    alone = source._replace(views=dataclasses.replace(source.views, cameras=alone))
+    assert len(web.about(alone, packed(FIELDS["dense"])[1], "")["tour"]) == 1
+
+
 def test_a_table_that_no_texture_holds_is_refused(monkeypatch):
     monkeypatch.setattr(web_scene, "MAX_TEXTURE_SIDE", 0)
     with pytest.raises(ValueError, match="a browser's texture holds 0; train with a smaller hash_grid.table_size"):
@@ -204,7 +229,6 @@ def test_parameters_that_are_not_finite_are_refused():
     [
         ({"fields": {"fine": Field(None, None)}}, "web: field is 'other', expected a hash grid"),
         ({"grid_schedule": None}, "web: sampler is 'other', expected one that trains with an occupancy grid"),
-        ({"ndc": True}, "web: data.ndc is True"),
         ({"needs": ("time",)}, "web: the field asks for time, expected position and direction"),
     ],
 )
@@ -212,8 +236,8 @@ def test_a_run_that_the_page_cannot_render_is_refused(change, message):
     model = {"fields": {"fine": hash_grid_field(**SMALL)}, "image_networks": ("fine",)}
     model |= {"grid_schedule": (), "needs": ()}
 
-    def run_of(ndc=False, **change):
-        config = SimpleNamespace(field="other", sampler="other", data=SimpleNamespace(ndc=ndc))
+    def run_of(**change):
+        config = SimpleNamespace(field="other", sampler="other")
         experiment = SimpleNamespace(config=config, model=SimpleNamespace(**{**model, **change}))
         return TrainedRun(*[None] * len(TrainedRun._fields))._replace(experiment=experiment)
 

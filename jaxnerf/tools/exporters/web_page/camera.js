@@ -14,11 +14,12 @@ function turned(vector, axis, angle) {
 }
 
 class OrbitCamera {
-  // pose: to begin with; target: what it turns around; up: unit vector; slope: half the height of the image over the
-  // focal length.
-  constructor(pose, target, up, slope) {
-    Object.assign(this, {up, slope});
+  // pose: to begin with; target: what it turns around; up: unit vector; swing: radians, the largest angle from the
+  // first direction, in a scene that is seen from one side; null: any.
+  constructor(pose, target, up, swing) {
+    Object.assign(this, {up, swing});
     this.set(pose, target);
+    this.home = this.back;
   }
 
   set(pose, target) {
@@ -34,6 +35,9 @@ class OrbitCamera {
   get target() { return add(this.eye, times(this.back, -this.distance)); }
 
   turn(across, down) {
+    const before = [this.right, this.above, this.back], angle = () => Math.acos(Math.min(dot(this.back, this.home), 1));
+    const start = angle(), pace = this.swing ? Math.min(2 * this.swing, 1) : 1;  // a drag crosses a small range, too
+    [across, down] = [pace * across, pace * down];
     const steep = dot(this.back, this.up);
     const limit = Math.asin(Math.max(-1, Math.min(1, steep))) + down;
     if (Math.abs(limit) > 1.5) down = 0;  // not over the poles
@@ -41,6 +45,7 @@ class OrbitCamera {
     this.back = unit(way(this.back));
     this.right = unit(turned(this.right, this.up, -across));
     this.above = cross(this.back, this.right);
+    if (this.swing && angle() > Math.max(this.swing, start)) [this.right, this.above, this.back] = before;
   }
 
   orbit(across, down) {

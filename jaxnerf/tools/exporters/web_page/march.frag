@@ -1,7 +1,8 @@
 #version 300 es
 // Renders one pixel of a hash grid through its occupancy grid. exporters/web.py replaces the lines that begin with
 // "//@" by constants and functions of one scene. The arithmetic follows core/occupancy/ray_marching.py (where samples
-// are), core/occupancy/packed.py (early termination) and fields/hash_grid.py (what is evaluated there).
+// are), core/occupancy/packed.py (early termination), fields/hash_grid.py (what is evaluated there) and, for forward-facing
+// scenes, core/cameras.py (normalised device coordinates).
 precision highp float;
 precision highp int;
 precision highp sampler2D;
@@ -14,7 +15,8 @@ uniform mat3 turn;         // camera's axes (right, up, back) to world
 uniform vec2 focal;        // px of this image
 uniform vec2 center;       // px
 uniform float image_height;  // px
-uniform float near, far;   // in t, the distance along the camera's axis
+uniform float near, far;   // in t, the distance along the camera's axis; not used in NDC
+uniform vec2 ndc_scale;    // 2 focal / size of the lens that defines NDC; used in NDC only
 uniform int shown;         // 0: colour, 1: depth, 2: normals
 uniform vec2 depth_range;  // in t, drawn black and white
 
@@ -79,6 +81,27 @@ vec3 contract(vec3 x) {
 
 //@field
 
+// The ray of the pixel: origin + t * direction for t from first to last, world units, or NDC.
+vec3 origin;
+float first, last;
+
+// Returns the direction of the ray in the coordinates of the field; toward: in the world, to the plane at distance 1.
+vec3 prepare_line(vec3 toward) {
+#if NDC
+  bool forward = toward.z < -1e-6;  // NDC hold nothing of rays that point backwards
+  vec2 slant = toward.xy / (forward ? toward.z : -1.0);
+  origin = vec3(ndc_scale * (eye.xy - (1.0 + eye.z) * slant), -1.0);
+  first = 1.0 - 1.0 / max(-eye.z, 1.0);  // an eye beyond the near plane does not see what is behind it
+  last = forward ? 1.0 : first;
+  return vec3(ndc_scale * (eye.z * slant - eye.xy), 2.0);
+#else
+  origin = eye;
+  first = near;
+  last = far;
+  return toward;
+#endif
+}
+
 // Where the rays of a pixel have their samples: edge k is at t = edge(k), and the last at t_far.
 float t_near, t_far, t_step;
 #if CONTRACTED
@@ -93,16 +116,16 @@ void place_samples(vec3 direction) {
   vec3 middle = 0.5 * (LOWER + UPPER), side = UPPER - LOWER;
   float half_side = 0.5 * max(max(side.x, side.y), side.z);
   float squares = dot(direction, direction);
-  t_nearest = dot(middle - eye, direction) / squares;
-  vec3 away = eye + t_nearest * direction - middle;
+  t_nearest = dot(middle - origin, direction) / squares;
+  vec3 away = origin + t_nearest * direction - middle;
   float smallest = half_side / sqrt(squares);
   t_scale = max(sqrt(dot(away, away) / squares), smallest);
-  t_near = near;
-  t_far = far;
+  t_near = first;
+  t_far = last;
   t_step = STEP / sqrt(squares) * t_scale / smallest;
-  float last = t_scale - 0.5 * t_step;
-  s_near = min(compressed(near - t_nearest), last);
-  s_far = min(compressed(far - t_nearest), last);
+  float s_last = t_scale - 0.5 * t_step;
+  s_near = min(compressed(first - t_nearest), s_last);
+  s_far = min(compressed(last - t_nearest), s_last);
 }
 
 float edge(int k) {
@@ -118,16 +141,16 @@ int segment_before(float t) { return int((compressed(t - t_nearest) - s_near) / 
 void place_samples(vec3 direction) {
   bvec3 level = equal(direction, vec3(0.0));
   vec3 safe = mix(direction, vec3(1.0), vec3(level));
-  vec3 first = (LOWER - eye) / safe, second = (UPPER - eye) / safe;
-  vec3 enter = min(first, second), leave = max(first, second);
+  vec3 low = (LOWER - origin) / safe, high = (UPPER - origin) / safe;
+  vec3 enter = min(low, high), leave = max(low, high);
   for (int axis = 0; axis < 3; ++axis) {
     if (level[axis]) {
-      enter[axis] = eye[axis] >= LOWER[axis] && eye[axis] < UPPER[axis] ? -1e30 : 1e30;
+      enter[axis] = origin[axis] >= LOWER[axis] && origin[axis] < UPPER[axis] ? -1e30 : 1e30;
       leave[axis] = 1e30;
     }
   }
-  t_near = clamp(max(max(enter.x, enter.y), enter.z), near, far);
-  t_far = clamp(min(min(leave.x, leave.y), leave.z), t_near, far);
+  t_near = clamp(max(max(enter.x, enter.y), enter.z), first, last);
+  t_far = clamp(min(min(leave.x, leave.y), leave.z), t_near, last);
   t_step = STEP / length(direction);
 }
 
@@ -143,7 +166,7 @@ int segment_before(float t) { return int((t - t_near) / t_step - 1.0); }
 bool is_occupied(vec3 direction, float t, out float skip_to) {
   skip_to = -1e30;
   vec3 per_unit = vec3(CELLS) / (UPPER - LOWER);
-  vec3 place = (eye - LOWER) * per_unit + t * (direction * per_unit);
+  vec3 place = (origin - LOWER) * per_unit + t * (direction * per_unit);
   bool straight = true;  // whether the ray is straight in the coordinates of the cells
 #if CONTRACTED
   vec3 along = place * (4.0 / vec3(CELLS)) - 2.0;
@@ -178,10 +201,11 @@ vec3 depth_color(float value) {
 void main() {
   vec2 pixel = vec2(gl_FragCoord.x, image_height - gl_FragCoord.y);  // y down, centres at .5
   vec2 plane = (pixel - center) / focal;
-  vec3 direction = turn * vec3(plane.x, -plane.y, -1.0);
+  vec3 toward = turn * vec3(plane.x, -plane.y, -1.0);
+  vec3 direction = prepare_line(toward);
   float speed = length(direction);
   place_samples(direction);
-  prepare_ray(direction / speed);
+  prepare_ray(normalize(toward));
   float transmittance = 1.0, opacity = 0.0, depth = 0.0;
   vec3 rgb = vec3(0.0);
   bool opaque = false;
@@ -195,7 +219,7 @@ void main() {
     }
     float density;
     vec3 emitted;
-    evaluate(eye + t * direction, density, emitted);
+    evaluate(origin + t * direction, density, emitted);
     float through = exp(-density * (high - low) * speed);
     float part = transmittance * (1.0 - through);
     rgb += part * emitted;
@@ -212,16 +236,22 @@ void main() {
   if (opaque && opacity > 0.0) {  // the remaining light is assumed to look like the rest of the ray
     rgb /= opacity;
     depth /= opacity;
+    opacity = 1.0;
     transmittance = 0.0;
   }
+#if NDC
+  depth = opacity > 0.0 ? depth / opacity : 1.0;  // the light that is left comes from infinity
+  depth = -(1.0 + eye.z + depth / max(1.0 - depth, 1e-6)) / min(toward.z, -1e-6);
+#else
   depth += transmittance * t_far;
+#endif
   if (shown == 0) {
     color = vec4(rgb + transmittance * BACKGROUND, 1.0);
   } else if (shown == 1) {
     float value = clamp((depth - depth_range.x) / (depth_range.y - depth_range.x), 0.0, 1.0);
     color = vec4(mix(depth_color(value), vec3(1.0), transmittance), 1.0);
   } else {
-    vec3 point = eye + depth * direction;
+    vec3 point = eye + depth * toward;
     vec3 normal = cross(dFdx(point), dFdy(point));
     normal = dot(normal, normal) > 0.0 ? normalize(normal) : vec3(0.0);
     color = vec4(mix(0.5 + 0.5 * normal, vec3(1.0), transmittance), 1.0);

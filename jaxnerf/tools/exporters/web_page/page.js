@@ -52,9 +52,9 @@ class Page {
     this.content = scene.content;
     this.canvas = element("view");
     this.renderer = new Renderer(this.canvas, scene, (text) => { say(text); this.redraw(); });
-    const {cameras, target, up} = this.content, first = cameras[0];
-    const slope = first.height / (2 * first.focal[1]);
-    this.camera = new OrbitCamera(first.pose, target, up, slope);
+    const {cameras, tour, target, up, swing} = this.content;
+    this.lens = cameras[0];  // its image is shown whole
+    this.camera = new OrbitCamera(tour[0], target, up, swing);
     this.shown = 0;
     this.tourTime = null;
     this.changed = true;   // the frame that is shown is not that of the camera
@@ -103,11 +103,12 @@ class Page {
     const width = Math.max(Math.round(this.canvas.width * scale), 1);
     const height = Math.max(Math.round(this.canvas.height * scale), 1);
     // The whole of the dataset's image is in the window, also where that is narrow.
-    const first = this.content.cameras[0];
-    const focal = Math.min(height / (2 * this.camera.slope), width / (2 * this.camera.slope * first.width / first.height));
+    const lens = this.lens, ratio = Math.min(width / lens.width, height / lens.height);
+    const focal = times(lens.focal, ratio);
+    const center = [width / 2 + ratio * (lens.center[0] - lens.width / 2),
+                    height / 2 + ratio * (lens.center[1] - lens.height / 2)];
     const {near, far} = this.content, range = [near, Math.min(far, near + 3 * this.camera.distance)];
-    return {pose: this.camera.pose, focal: [focal, focal], center: [width / 2, height / 2], width, height, near, far,
-            shown: this.shown, range};
+    return {pose: this.camera.pose, focal, center, width, height, near, far, shown: this.shown, range};
   }
 
   // Shows newer parameters of the viewer as they come. Until their frame is complete, the one before is shown.
@@ -253,13 +254,16 @@ class Page {
     on(element("camera"), "change", (event) => {
       const camera = this.content.cameras[event.target.value];
       this.stopTour();
-      if (camera) this.camera.set(camera.pose, this.content.target);
+      if (camera) {
+        this.lens = camera;
+        this.camera.set(camera.pose, this.content.target);
+      }
       this.redraw();
     });
     on(element("tour"), "click", () => {
       const starts = this.tourTime === null;
       this.moved();
-      if (starts) this.tourTime = performance.now();
+      if (starts) [this.tourTime, this.lens] = [performance.now(), this.content.cameras[0]];
       element("tour").setAttribute("aria-pressed", String(starts));
     });
     on(element("share"), "click", () => this.share());
@@ -277,7 +281,7 @@ class Page {
     const here = [event.clientX, event.clientY], by = [here[0] - last[0], here[1] - last[1]];
     const other = [...pointers].find(([id]) => id !== event.pointerId);
     pointers.set(event.pointerId, here);
-    const size = 2 * this.camera.slope / this.canvas.clientHeight;
+    const {height, focal} = this.lens, size = height / focal[1] / this.canvas.clientHeight;
     if (other) {
       const apart = (point) => Math.hypot(point[0] - other[1][0], point[1] - other[1][1]) || 1;
       this.camera.zoom(apart(last) / apart(here));

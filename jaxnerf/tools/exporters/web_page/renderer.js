@@ -191,6 +191,7 @@ class Renderer {
     gl.uniform1f(names.image_height, view.height);
     gl.uniform1f(names.near, view.near);
     gl.uniform1f(names.far, view.far);
+    gl.uniform2fv(names.ndc_scale, this.scene.content.ndc_scale || [1, 1]);
     gl.uniform1i(names.shown, view.shown || 0);
     gl.uniform2fv(names.depth_range, view.range || [view.near, view.far]);
     this.fill();
