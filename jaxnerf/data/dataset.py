@@ -295,6 +295,7 @@ def load_split(
     max_views: int | None = None,
     capture: Capture | None = None,
     fingerprint: str = "",
+    with_pixels: bool = True,
 ) -> Views:
     """Reads the Views of a split of the dataset that options describe.
 
@@ -307,6 +308,7 @@ def load_split(
         max_views: read at most so many of its views, spread evenly; None: all.
         capture: of the dataset, as `resolve` returns it; None: it is read.
         fingerprint: that the dataset has to have, see `fingerprint`; "": any.
+        with_pixels: see `load_capture`.
 
     Raises:
         ValueError: names the field or file, what was found, what is expected and what to do.
@@ -334,7 +336,8 @@ def load_split(
     nearest = {frame.name: frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)}
     capture = bounds.override_bounds(capture, near, data.far, to_file)
     background = background_of(data)
-    views = load_images.load_capture(capture, split=source, factor=data.factor, background=background, select=select)
+    options = {"factor": data.factor, "background": background, "select": select, "with_pixels": with_pixels}
+    views = load_images.load_capture(capture, split=source, **options)
     return dataclasses.replace(
         views,
         to_file=None if capture.normalised else np.float32(to_file),

@@ -1,6 +1,5 @@
 """Finished views of an evaluation, and the results.json that is made from them; see `evaluate`."""
 
-import json
 import math
 import os
 import pathlib
@@ -55,7 +54,7 @@ def mark_finished(
     height, width = np.shape(truth)[:2]
     content = {"row": row, "first": first, "rays": height * width}
     with atomic_files.partial_file(_row_file(folder, index)) as partial:
-        partial.write_text(json.dumps(content))
+        partial.write_text(atomic_files.to_json(content))
 
 
 def view_files(folder: pathlib.Path, index: int, *, count: int, errors: bool) -> list[pathlib.Path]:
@@ -133,7 +132,7 @@ def merge(
     rows = [read_stored(_contact_sheet_file(partial, index)) for index in _on_contact_sheet(count)]
     output_images.write_contact_sheet(partial / "contact_sheet.png", rows)
     with atomic_files.partial_file(partial / "results.json") as file:
-        file.write_text(json.dumps(results, indent=2) + "\n")
+        file.write_text(atomic_files.to_json(results))
     old = target.with_name(target.name + ".old")
     if overwrite and target.exists():  # a process killed between the two moves loses neither result
         atomic_files.remove(old)  # left by such a process

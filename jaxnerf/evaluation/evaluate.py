@@ -7,6 +7,7 @@ finished writes results.json and moves the folder to eval/<step>/.
 
 import errno
 import functools
+import math
 import os
 import pathlib
 import shutil
@@ -244,6 +245,9 @@ def summary(results: dict[str, Any]) -> str:
         metrics += f" ({results['psnr_aligned']:.2f} dB, {results['ssim_aligned']:.4f} after colour alignment)"
     shared = results.get("conventions", {}).get("shared_with_training")
     note = f"; note: {shared['note']}" if shared else ""
+    exact = [row["psnr"] == math.inf for row in results["images"]]
+    if any(exact):
+        note += f"; note: {sum(exact)} images equal their references in 8 bits, so their PSNR and its mean are infinite"
     paired = "" if results.get("paired_by", "name") == "name" else f", paired by {results['paired_by']}"
     found = results.get("uncertainty", {})
     errors = f"; AUSE {found['ause_rmse']:.3f} (RMSE), {found['ause_mae']:.3f} (MAE)" if found else ""

@@ -63,6 +63,7 @@ class Previews:
         run, rows = self._run, metric_log.read_rows(self._workdir)
         options, step = run.experiment.config.train, newest_step(run, self._workdir)
         row = next((row for row in rows if row["step"] == step), {"seconds": 0.0})
+        seen = row.get("rays", math.inf) / max(_num_pixels(views), 1)
         if step >= options.max_steps:
             limit, more = "train.max_steps", 2 * step
             why = f"it reached train.max_steps = {options.max_steps:,}"
@@ -71,11 +72,16 @@ class Previews:
             why = f"train.max_seconds = {options.max_seconds:g} have passed at step {metric_log.of_all(step, options)}"
         return [
             f"done          {why}: {row.get('rays', 0):,} rays in {row['seconds']:.1f} s of training",
+            *([f"note          {self._few(seen)}"] if seen < 1 else []),
             *self._cameras(step, views),
             *self._scores(step, views),
             f"workdir       {self._workdir.absolute()}: {', '.join(self._contents())}",
-            *self._commands(f"--config.{limit}={more:.10g}"),
+            *self._commands(f"--config.{limit}={more:.10g}", is_early=seen < 1),
         ]
+
+    def _few(self, seen):
+        remedy = "train longer, or on smaller images (--config.data.factor, with a new --workdir)"
+        return f"training saw at most {seen:.0%} of the pixels of its images, so it may show little yet: {remedy}"
 
     def evaluated_run(self) -> TrainedRun:
         """Returns the run as evaluation restores it: the one of the previews, whose program is compiled and whose
@@ -139,13 +145,15 @@ class Previews:
         names = ("metrics.jsonl", "config.json", "previews", "eval", "tensorboard")
         return [f"checkpoints ({steps})", *(name for name in names if (self._workdir / name).exists())]
 
-    def _commands(self, more):
+    def _commands(self, more, is_early):
         split, held_out, _ = self._held_out
         workdir = f"--workdir={shlex.quote(str(self._workdir))}"
         option = "" if split == self._run.experiment.config.eval.split else f" --split={split}"
         commands = [f"jaxnerf-eval {workdir}{option}"] if held_out is not None else []
         commands += [f"jaxnerf-render {workdir}", f"jaxnerf-train {workdir} {more}"]
         purposes = ["scores all held-out images", "renders a video", "trains longer"][-len(commands) :]
+        if is_early:
+            commands, purposes = [commands[-1], *commands[:-1]], [purposes[-1], *purposes[:-1]]
         width = max(map(len, commands))
         lines = [f"{command:{width}}  {purpose}" for command, purpose in zip(commands, purposes, strict=True)]
         return [("next          " if not index else 14 * " ") + line for index, line in enumerate(lines)]
@@ -186,6 +194,13 @@ class Previews:
             elif time.perf_counter() - started > self._run.experiment.config.eval.summary_seconds:
                 break
         return f"PSNR {np.mean(scores):.2f} dB over {len(scores)}"
+
+
+def _num_pixels(views):
+    """Returns how many pixels of Views are neither ignored nor transparent."""
+    pixels = np.asarray(views.pixels)
+    shown = pixels[:, 3] > 0 if pixels.shape[1] == 4 else np.ones(len(pixels), bool)
+    return int(shown.sum() if views.mask is None else (shown & np.asarray(views.mask)).sum())
 
 
 def _on_one_device(tree):

@@ -10,6 +10,7 @@ import itertools
 import json
 import os
 import pathlib
+import re
 import secrets
 import shutil
 import stat
@@ -71,6 +72,12 @@ def parse_json(content: str | bytes) -> Any:
         if not level:
             return found
     raise ValueError(f"nested more than {_MAX_DEPTH} levels deep")
+
+
+def to_json(content: Any) -> str:
+    """Returns JSON, in which an infinite number is 1e999: Infinity is no JSON, and 1e999 is read back as infinite."""
+    text = json.dumps(content, indent=2) + "\n"
+    return re.sub(r'("(?:\\.|[^"\\])*")|Infinity', lambda found: found[1] or "1e999", text)
 
 
 def _parse_int(digits):

@@ -14,7 +14,7 @@ import pytest
 import captures
 import oracle
 from jaxnerf import load_dataset, load_scene, pixel_grid, render_image
-from jaxnerf.evaluation import external
+from jaxnerf.evaluation import aggregate, external
 from jaxnerf.evaluation.evaluate import score_run, summary, watch
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.restore import restore_run
@@ -147,7 +147,12 @@ def test_predictions_have_the_metrics_of_the_evaluation_that_wrote_them(scored, 
         ([f"pred_{index}" for index in range(12)], [f"gt_{index:03d}" for index in range(12)], "number", range(12)),
         (["7", "8", "9", "10"], ["a9", "a7", "a10", "a8"], "number", [2, 0, 3, 1]),
         ([f"r_{index}" for index in range(5, 13)], [f"{index:03d}" for index in range(8)], "order", range(8)),
-        (["b", "a"], ["x", "y"], "order", [1, 0]),
+        (["cam1_0", "cam2_0", "cam10_0"], ["cam1/0", "cam10/0", "cam2/0"], "name", [0, 2, 1]),
+        (["a__b.jpg", "B.c"], ["A/b", "b/c"], "name", [0, 1]),
+        (["a/0", "b/0", "b/1"], ["images/b/0", "images/a/0", "images/b/1"], "name", [1, 0, 2]),
+        (["cam10000", "cam20000"], ["cam2/0000", "cam1/0000"], "name", [1, 0]),
+        (["0008", "0000"], ["cam1/0000", "cam2/0008"], "name", [1, 0]),
+        (["c2-8", "c1-8"], ["cam1/0008", "cam2/0008"], "number", [1, 0]),
         (["1_1", "2_1"], ["a", "b"], "order", [0, 1]),
     ],
 )
@@ -156,13 +161,35 @@ def test_predictions_are_paired_by_name_or_number_or_in_natural_order(tmp_path, 
     for index, place in enumerate(pairs):
         level = np.full((12, 12, 3), 10 * index, np.uint8)
         for folder, name in ((tmp_path / "color", found[place]), (tmp_path / "gt-color", expected[index])):
-            folder.mkdir(exist_ok=True)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             iio.imwrite(folder / f"{name}.png", level)
     results = external.score_folder(tmp_path)
     assert results["paired_by"] == how and results["psnr"] == np.inf
     warned = [record.getMessage() for record in caplog.records if "paired by" in record.getMessage()]
     assert len(warned) == (how != "name")
     assert (f"paired by {how}" in summary(results)) == (how != "name")
+    assert f"{len(found)} images equal their references" in summary(results)
+    written = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)  # Infinity is no JSON
+    assert written == results == aggregate.read_results(tmp_path, "")
+
+
+@pytest.mark.parametrize(
+    "found, expected",
+    [
+        (["b", "a"], ["x", "y"]),
+        (["cam1_0000", "cam2_0003"], ["cam1/0000", "cam2/0008"]),
+        (["cam1_0001", "cam2_0000"], ["cam1/0000", "cam2/0001"]),
+        (["frame_1", "frame_2"], ["frame_0", "frame_1"]),
+        (["a_b_c", "d"], ["a/b_c", "a_b/c"]),
+    ],
+)
+def test_predictions_whose_names_state_other_references_are_refused(tmp_path, found, expected):
+    for folder, names in (("color", found), ("gt-color", expected)):
+        for name in names:
+            (tmp_path / folder / name).parent.mkdir(parents=True, exist_ok=True)
+            iio.imwrite(tmp_path / folder / f"{name}.png", np.zeros((12, 12, 3), np.uint8))
+    with pytest.raises(ValueError, match="color: .* do not pair up with the references"):
+        external.score_folder(tmp_path)
 
 
 def test_predictions_without_a_reference_and_missing_ones_are_named(tmp_path):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from helpers import compiled
 from jaxnerf import Camera, Views, pixel_grid
 from jaxnerf.core import poses as poses_module
+from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import up_of
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.evaluation.paths import camera_path as camera_paths
@@ -198,6 +199,17 @@ def test_an_ellipse_passes_through_cameras_on_one():
         center = camera_paths.make_path("turntable", views_of(cameras), num_frames=16).poses
         assert_rigid(center)
         np.testing.assert_allclose(center[:, :, 3] @ tilt @ UP, 2, atol=0.05)
+
+
+def test_a_turntable_frames_the_scene_as_the_cameras_nearby_do():
+    """Cameras on one side look at a point above the others', as at the top of an object that is not level."""
+    poses = np.array(ring(12))
+    for index in np.flatnonzero(poses[:, 0, 3] > 0):
+        poses[index] = np.asarray(poses_module.look_at(np.float32(poses[index, :, 3]), np.float32([0, 0, 0.8]), UP))
+    found = np.asarray(path_poses.make_poses("turntable", poses, 24), np.float64)
+    axes, eyes = found[:, :, 2], found[:, :, 3]
+    aims = eyes - (eyes * axes).sum(axis=1, keepdims=True) * axes
+    assert aims[eyes[:, 0] > 1.5, 2].min() > aims[eyes[:, 0] < -1.5, 2].max() + 0.3
 
 
 def test_up_is_across_the_horizons_of_an_arc_and_the_mean_of_views_that_look_one_way():

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnerf.evaluation import output_images
+from jaxnerf.evaluation import output_images, previews
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import restore_run
@@ -43,7 +43,8 @@ def with_summary(folder):
     return Previews(folder)
 
 
-def test_the_summary_has_the_psnr_of_the_evaluation_and_the_next_commands(folder, views):
+def test_the_summary_has_the_psnr_of_the_evaluation_and_the_next_commands(folder, views, monkeypatch):
+    monkeypatch.setattr(previews, "_num_pixels", lambda _: 1280)
     lines = with_summary(folder).summary(views)
     psnr = evaluate(folder)["psnr"]
     assert [line[:14].strip() for line in lines] == [*NAMES, "", ""]
@@ -67,7 +68,16 @@ def test_the_summary_has_the_psnr_of_the_evaluation_and_the_next_commands(folder
     assert not any(line.startswith("held-out") for line in again)
 
 
-def test_the_summary_states_that_the_time_has_passed(folder, views):
+def test_a_run_that_saw_few_of_its_pixels_says_so_and_advises_to_train_longer_first(folder, views):
+    lines = Previews(folder).summary(views)
+    seen = 1280 / (np.asarray(views.pixels)[:, 3] > 0).sum()
+    assert lines[1].startswith(f"note          training saw at most {seen:.0%} of the pixels of its images")
+    (first,) = (line for line in lines if line.startswith("next"))
+    assert f"jaxnerf-train --workdir={folder}" in first and first.endswith("trains longer")
+
+
+def test_the_summary_states_that_the_time_has_passed(folder, views, monkeypatch):
+    monkeypatch.setattr(previews, "_num_pixels", lambda _: 1280)
     text = (folder / "config.json").read_text().replace('"max_steps": 20', '"max_steps": 1000')
     (folder / "config.json").write_text(text.replace('"max_seconds": 0.0', '"max_seconds": 0.5'))
     lines = Previews(folder).summary(views)
@@ -81,6 +91,7 @@ def test_without_held_out_views_training_views_are_shown(folder, views, monkeypa
         raise ValueError(f"no split {split!r}")
 
     monkeypatch.setattr("jaxnerf.data.dataset.load_split", missing)
+    monkeypatch.setattr(previews, "_num_pixels", lambda _: 1280)
     lines = with_summary(folder).summary(views)
     assert "dB on the training image train_030" in lines[2]
     assert lines[3].startswith("held-out      no images (no split 'test'); --config.data.hold_out=8 with a new")

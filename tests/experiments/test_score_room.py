@@ -34,7 +34,9 @@ def known_run(folder, *, fog=0.0, too_deep=0.0):
 
     model = SimpleNamespace(grid_schedule=SCHEDULE, scene=lambda *variables: scene)
     experiment = SimpleNamespace(
-        model=model, load_split=lambda split, **options: load_dataset(folder, split=split), view_rays=ray_batches.view_rays
+        model=model,
+        load_split=lambda split, **options: load_dataset(folder, split=split),
+        view_rays=ray_batches.view_rays,
     )
     return SimpleNamespace(experiment=experiment, variables=lambda step: (None, None), render_image=render_image)
 

@@ -25,7 +25,7 @@ _DIRECTIONS = 2048  # in which the hull of the cameras is bounded
 _FRAMES = {"turntable": 48, "arc": 96, "spiral": 120, "ellipse": 120}
 KINDS = (*_FRAMES, "interpolate")
 
-_look_at = jax.jit(jax.vmap(core_poses.look_at, in_axes=(0, None, None)))
+_look_at = jax.jit(jax.vmap(core_poses.look_at, in_axes=(0, 0, None)))
 _mean_pose = jax.jit(core_poses.mean_pose)
 _llff_spiral = jax.jit(core_poses.spiral, static_argnums=0)
 _MOST_FRAMES = 240  # unless more are asked for
@@ -41,6 +41,7 @@ class Coverage(NamedTuple):
         azimuth: [V] around up, from any fixed direction.
         elevation: [V] above the plane through the center that is perpendicular to up.
         distance: [V] from the center, world units.
+        aim: [V, 3] the point of each camera's axis that is nearest to the center.
         gap: the largest angle of azimuth without a camera.
         arc: the first and the last azimuth of the most cameras without a gap above MAX_GAP between them; a whole
             turn apart if there is no such gap at all.
@@ -51,6 +52,7 @@ class Coverage(NamedTuple):
     azimuth: Float[np.ndarray, " V"]
     elevation: Float[np.ndarray, " V"]
     distance: Float[np.ndarray, " V"]
+    aim: Float[np.ndarray, "V 3"]
     gap: float
     arc: tuple[float, float]
 
@@ -69,9 +71,11 @@ def coverage(poses: Float[Array | np.ndarray, "V 3 4"], up: Float[np.ndarray, "3
     distance = np.linalg.norm(offset, axis=1)
     elevation = np.arcsin(np.clip(offset @ up / np.maximum(distance, 1e-30), -1, 1))
     azimuth = np.arctan2(offset @ ahead, offset @ right)
+    axes = poses[:, :, 2]
+    aim = poses[:, :, 3] - (offset * axes).sum(axis=1, keepdims=True) * axes
     turns = np.sort(azimuth[np.abs(elevation) < _STEEP])
     if not len(turns):
-        return Coverage(center, up, azimuth, elevation, distance, 2 * np.pi, (0.0, 0.0))
+        return Coverage(center, up, azimuth, elevation, distance, aim, 2 * np.pi, (0.0, 0.0))
     gaps = np.diff(np.append(turns, turns[0] + 2 * np.pi))
     breaks = np.flatnonzero(gaps > MAX_GAP)
     if not len(breaks):
@@ -82,7 +86,7 @@ def coverage(poses: Float[Array | np.ndarray, "V 3 4"], up: Float[np.ndarray, "3
         start = first[counts.argmax()]
         around = np.concatenate([turns, turns + 2 * np.pi])
         arc = around[start], around[start + counts.max() - 1]
-    return Coverage(center, up, azimuth, elevation, distance, float(gaps.max()), (float(arc[0]), float(arc[1])))
+    return Coverage(center, up, azimuth, elevation, distance, aim, float(gaps.max()), (float(arc[0]), float(arc[1])))
 
 
 def default_kind(
@@ -160,8 +164,8 @@ def make_poses(
     """Makes the poses of a path, with a level horizon.
 
     "turntable" is one turn around the point that the cameras look at, and "arc" a swing through 90 % of the azimuth
-    that they cover. On both, elevation and distance at each azimuth are means over the cameras nearby. "spiral" is the
-    path of the LLFF code (Mildenhall et al. 2019) around the mean camera, and "ellipse" follows the spread of
+    that they cover. On both, elevation, distance and aim at each azimuth are means over the cameras nearby. "spiral" is
+    the path of the LLFF code (Mildenhall et al. 2019) around the mean camera, and "ellipse" follows the spread of
     the cameras in the horizontal plane. Both are scaled down, if need be, until they leave the convex hull of the
     cameras' positions by no more than half the median distance between neighbours.
 
@@ -217,7 +221,7 @@ def natural_key(name: str) -> list[int | str]:
 
 def _turntable(poses, num_frames, up):
     cover = coverage(poses, up)
-    return _look_at(_eyes(cover, 2 * np.pi * np.arange(num_frames) / num_frames), cover.center, cover.up)
+    return _look_at(*_eyes_and_aims(cover, 2 * np.pi * np.arange(num_frames) / num_frames), cover.up)
 
 
 def _arc(poses, num_frames, up):
@@ -225,11 +229,13 @@ def _arc(poses, num_frames, up):
     first, last = cover.arc
     angle = 2 * np.pi * np.arange(num_frames) / num_frames
     azimuth = (first + last) / 2 + _ARC_PART * (last - first) / 2 * np.sin(angle)
-    return _look_at(_eyes(cover, azimuth, _LIFT * np.cos(angle)), cover.center, cover.up)
+    return _look_at(*_eyes_and_aims(cover, azimuth, _LIFT * np.cos(angle)), cover.up)
 
 
-def _eyes(cover, azimuth, lift=0.0):
-    """Returns positions [N, 3] at azimuths [N], at the cameras' elevation and distance there.
+def _eyes_and_aims(cover, azimuth, lift=0.0):
+    """Returns positions [N, 3] at azimuths [N], at the cameras' elevation and distance there, and what they look at.
+
+    Each looks at what the cameras there look at, in the mean, so that it frames the scene as they do.
 
     The elevation is lift standard deviations above the weighted mean. Weights are those of von Mises.
     """
@@ -243,7 +249,7 @@ def _eyes(cover, azimuth, lift=0.0):
     right, ahead = level_axes(cover.up)
     level = np.cos(azimuth)[:, None] * right + np.sin(azimuth)[:, None] * ahead
     away = np.cos(elevation)[:, None] * level + np.sin(elevation)[:, None] * cover.up
-    return cover.center + distance[:, None] * away
+    return cover.center + distance[:, None] * away, weights @ cover.aim
 
 
 def forward_frame(
@@ -279,7 +285,7 @@ def _ellipse(poses, num_frames, up):
     angle = 2 * np.pi * np.arange(num_frames)[:, None] / num_frames
     around = np.cos(angle) * axes[0] + np.sin(angle) * axes[1]
     eyes = middle + _scale_into_hull(middle + around, middle, positions) * around
-    return _look_at(eyes, gaze_center(poses), up)
+    return _look_at(eyes, np.broadcast_to(gaze_center(poses), eyes.shape), up)
 
 
 def _scale_into_hull(eyes, middle, positions):

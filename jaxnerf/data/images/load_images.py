@@ -60,6 +60,7 @@ def load_capture(
     hold: int = 8,
     background: Sequence[float] | None = None,
     select: Callable[[int], Iterable[int]] | None = None,
+    with_pixels: bool = True,
 ) -> Views:
     """Reads one split of a Capture with all its pixels, see `fill_pixels`.
 
@@ -74,6 +75,7 @@ def load_capture(
             images are used.
         background: red, green, blue in [0, 1] behind images with alpha; None drops alpha.
         select: maps the number of the split's frames to the indices of those to read; None: all.
+        with_pixels: False: only what the first bytes of each image tell is read and checked; no pixel and no mask is.
 
     Returns:
         Views in the order of the frames; near and far are the frames' bounds.
@@ -90,7 +92,9 @@ def load_capture(
     chosen = chosen if select is None else [chosen[index] for index in select(len(chosen))]
     if capture.rendered:
         _check_rendered(chosen, factor, background)
-    return _load_frames(chosen, shrink, background=background, source=capture.source, points=capture.points)
+    return _load_frames(
+        chosen, shrink, with_pixels, background=background, source=capture.source, points=capture.points
+    )
 
 
 def split_rule(capture: Capture) -> str:
@@ -98,7 +102,7 @@ def split_rule(capture: Capture) -> str:
     return "all that the dataset's own lists name" if capture.splits else "every 8th by name, from the first"
 
 
-def _load_frames(chosen, shrink, *, background, source, points):
+def _load_frames(chosen, shrink, with_pixels, *, background, source, points):
     """Reads frames, whose cameras have a height and width, with sparse points as `load_capture` does."""
     with ThreadPoolExecutor(num_workers()) as pool:
         forms = list(pool.map(functools.partial(_form, shrink=shrink, background=background), chosen))
@@ -107,10 +111,12 @@ def _load_frames(chosen, shrink, *, background, source, points):
     if ends[-1] >= 2**31:  # offsets and pixel ids are int32
         raise ValueError(f"{source}: has {ends[-1]} pixels, expected fewer than 2^31; raise data.factor")
     offset = np.append(0, ends[:-1]).astype(np.int32)
-    pixels = _read_pixels(chosen, forms, offset, shrink, background)
+    pixels = np.zeros((0, max(form.channels for form in forms)), np.uint8)
+    if with_pixels:
+        pixels = _read_pixels(chosen, forms, offset, shrink, background)
     bounds = np.float32([frame.bounds for frame in chosen])
     cameras = [_scaled_camera(frame, form, shrink) for frame, form in zip(chosen, forms, strict=True)]
-    masks = _read_masks(chosen, forms, shrink, pixels_with_rays(cameras))
+    masks = _read_masks(chosen, forms, shrink, pixels_with_rays(cameras)) if with_pixels else None
     return Views(
         pixels=pixels,
         offset=offset,

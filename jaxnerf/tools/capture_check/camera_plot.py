@@ -16,6 +16,7 @@ from jaxnerf.tools.capture_check.report import Report
 
 CAMERA, FLAGGED, POINT, PATH, NEXT = "#2060c0", "#e02020", "#9a9a9a", "#20a040", "#d06000"
 _SOFTWARE = "jaxnerf-check"
+_ON_AXIS = np.cos(np.radians(5.0))  # of the angle between a direction and a world axis that stands for it
 
 
 def plot_cameras(report: Report) -> Figure:
@@ -113,7 +114,8 @@ def new_path(out: str | None, folder: pathlib.Path, *, is_run: bool, overwrite: 
     """Returns the path of a plot to be written.
 
     Args:
-        out: given by the user; None: check-FOLDER.png, here.
+        out: given by the user; None: check-FOLDER.png or, of a run, next-images-FOLDER.png, here. If that is another
+            plot, as of a folder of the same name elsewhere, the parent folder's name is added.
         folder: of the dataset or the run.
         is_run: whether it is that of a run, which may hold the plot.
         overwrite: whether a file that is no plot of the folder is replaced.
@@ -121,7 +123,10 @@ def new_path(out: str | None, folder: pathlib.Path, *, is_run: bool, overwrite: 
     Raises:
         ValueError: if the plot would lie in the folder of a dataset, or replace another file.
     """
-    path = pathlib.Path(out or f"check-{folder.resolve().name}.png")
+    place, kind = folder.resolve(), "next-images" if is_run else "check"
+    path = pathlib.Path(out or f"{kind}-{place.name}.png")
+    if not out and path.exists() and not is_plot_of(path, folder):
+        path = pathlib.Path(f"{kind}-{place.parent.name}-{place.name}.png")
     if path.suffix.lower() != ".png":
         raise ValueError(f"--out is {str(path)!r}, expected a name that ends in .png; correct it")
     if not path.parent.is_dir():
@@ -151,11 +156,20 @@ def is_plot_of(path: str | os.PathLike, folder: str | os.PathLike) -> bool:
 
 
 def _axes(mean: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the signed world axes that point right, away and up in the plots, as rows; near an up direction."""
+    """Returns unit vectors that point right, away and up in the plots, as rows.
+
+    They are signed world axes if an up direction is close to one, otherwise level directions close to these and up.
+    """
     up = int(np.abs(mean).argmax())
     right, deep, up = np.roll(np.eye(3), -1 - up, axis=0)
     sign = -1.0 if mean @ up < 0 else 1.0
-    return np.stack([sign * right, deep, sign * up])
+    right, deep, up = sign * right, deep, sign * up
+    if mean @ up < _ON_AXIS * np.linalg.norm(mean):
+        up = mean / np.linalg.norm(mean)
+        right = right - (right @ up) * up
+        right /= np.linalg.norm(right)
+        deep = np.cross(up, right)
+    return np.stack([right, deep, up])
 
 
 def _frustum(camera: Camera, pose: Float[np.ndarray, "3 4"], length: float) -> Float[np.ndarray, "13 3"]:
@@ -168,4 +182,6 @@ def _frustum(camera: Camera, pose: Float[np.ndarray, "3 4"], length: float) -> F
 
 
 def _name(axis: Float[np.ndarray, "3"]) -> str:
+    if np.abs(axis).max() < _ON_AXIS:
+        return f"along ({', '.join(f'{value:.2f}' for value in axis)}) (world units)"
     return f"{'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]} (world units)"

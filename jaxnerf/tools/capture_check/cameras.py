@@ -28,6 +28,7 @@ from jaxnerf.tools.capture_check.tracks import (
     follow,
     keypoints_of,
     match,
+    neighbours,
     subset,
     triangulate,
 )
@@ -176,6 +177,14 @@ def as_intended(poses: Float[np.ndarray, "V 3 4"], axes: Axes) -> Float[np.ndarr
     return np.concatenate([turn @ axes.turn, eyes], axis=-1)
 
 
+def with_poses(evidence: Evidence, poses: Float[np.ndarray, "V 3 4"]) -> Evidence:
+    """Returns the Evidence with other poses, which choose other neighbours."""
+    near = neighbours(poses)
+    tracks = follow(evidence.keypoints, near)
+    fraction = _fitting(tracks, poses, evidence.scale)
+    return evidence._replace(near=near, tracks=tracks, poses=poses, fraction=fraction)
+
+
 def rank_axes(tracks: Tracks, poses: Float[np.ndarray, "V 3 4"], scale: Float[np.ndarray, " V"]) -> tuple[Axes, Axes]:
     """Returns the Axes as stored, and the best of the 95 alternatives."""
 
@@ -321,7 +330,7 @@ def _judge_all(capture, evidence):
         return []
     severity = "error" if fraction < _NONE else "warning"
     found = f"{capture.source}: {percent(fraction)} of {confirmed} matches confirmed by a third image fit the poses"
-    change = "the poses or the lens: no change of axes corrects them, so compute them again"
+    change = "the poses or the lens: compute them again, as other axes do not correct them"
     return [Finding(severity, "pose", found, "nearly all", change)]
 
 

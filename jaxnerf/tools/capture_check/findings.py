@@ -8,14 +8,16 @@ from jaxtyping import Float
 
 from jaxnerf.data.readers.base import CameraFiles, Capture
 
+NOTES = "jaxnerf_notes.txt"  # beside a COLMAP model: what jaxnerf-cameras found that may be wrong with it
+
 
 class Finding(NamedTuple):
     """One problem of a dataset.
 
     Attributes:
         severity: "error" where training would be useless, or "warning".
-        kind: "axes", "focal", "swap", "pose", "fold", "overlap", "points", "size", "file", "mask", "duplicate",
-            "blur", "bounds", "leak" or "skipped".
+        kind: "axes", "focal", "lens", "swap", "pose", "fold", "overlap", "points", "size", "file", "mask", "training",
+            "duplicate", "blur", "bounds", "leak" or "skipped".
         found: what the check found, with the name of the file.
         expected: what it expects there; empty for the note of a reader.
         change: the file, field or flag to change, and how.

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from jaxnerf.data.geometry.path_poses import natural_order
 from jaxnerf.data.readers.base import Capture
-from jaxnerf.tools.capture_check.findings import Finding
+from jaxnerf.runtime.atomic_files import read_bytes
+from jaxnerf.tools.capture_check.findings import NOTES, Finding
 from jaxnerf.tools.capture_check.tracks import INLIER, Evidence, count_fits, match
 
 _MIN_MATCHES = 40  # of two images between which the cameras may jump
@@ -22,6 +23,7 @@ _MIN_AGREEING = 3  # pairs of consecutive images in a group whose cameras are ri
 _MIN_FRACTION = 0.6  # of the matches of two images, which agree on one motion
 _MAX_TURN = np.radians(45.0)  # of this motion; without parallax its estimate is ambiguous, but then half a turn
 _MIN_OFF = np.radians(60.0)  # of the cameras' rotation from it
+_MOST_NOTES = 2000  # bytes that are repeated
 _FLIP = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes
 
 
@@ -66,6 +68,15 @@ def judge_folds(capture: Capture, evidence: Evidence, doubtful: Collection[int])
     )
     change = "find the cameras again: jaxnerf-cameras --images=DIR --out=NEW"
     return [Finding("warning", "fold", found, "cameras that move as the images do", change)]
+
+
+def noted(capture: Capture) -> list[Finding]:
+    """Returns a Finding for each contradiction that jaxnerf-cameras noted when it found the cameras."""
+    place = capture.source if capture.source.is_dir() else capture.source.parent
+    content = read_bytes(place / NOTES)[:_MOST_NOTES] if (place / NOTES).is_file() else b""
+    lines = content.decode(errors="replace").split("\n")
+    change = "compare the images that it names with the plot, or take more images between them"
+    return [Finding("warning", "fold", f"{place / NOTES}: {line}", "none", change) for line in lines if line.strip()]
 
 
 def _belongs(evidence, group):

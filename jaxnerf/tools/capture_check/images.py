@@ -21,6 +21,7 @@ from jaxnerf.tools.capture_check.findings import Finding, named
 _LONGEST = 512  # px of the reduced images, to whose pixels all pixel errors refer
 _MAX_CORNERS = 400  # of one image
 _THUMBNAIL = 24  # px
+_AROUND = 7  # px around a corner whose mean is its colour
 _SAME = 0.0015  # mean difference of thumbnails, in [0, 1], below which two images are the same
 _PLAIN = 1e-6  # sharpness of an image without texture
 _BLURRED = 0.25  # of the median sharpness of the neighbours
@@ -35,6 +36,7 @@ class ImageSummary(NamedTuple):
         reduced: (height, width) px of the reduced image.
         corners: [N, 2] px of the camera.
         descriptors: [N, 128] of length 1.
+        colors: [N, 3] around the corners, in [0, 1].
         thumbnail: grey.
         sharpness: standard deviation of the Laplacian of the reduced image.
     """
@@ -44,6 +46,7 @@ class ImageSummary(NamedTuple):
     reduced: tuple[int, int]
     corners: Float[np.ndarray, "N 2"]
     descriptors: Float[np.ndarray, "N 128"]
+    colors: Float[np.ndarray, "N 3"]
     thumbnail: Float[np.ndarray, "24 24"]
     sharpness: float
 
@@ -57,7 +60,7 @@ def read(capture: Capture) -> tuple[list[ImageSummary | None], list[Finding]]:
         try:
             return _summarize(item[1], longest), None
         except ValueError as error:
-            return None, _unreadable(item[0], str(error))
+            return None, refused(str(error), (item[0],))
 
     with ThreadPoolExecutor(2) as pool:  # decoding and OpenCV release Python's lock
         both = list(pool.map(one, enumerate(capture.frames)))
@@ -66,13 +69,26 @@ def read(capture: Capture) -> tuple[list[ImageSummary | None], list[Finding]]:
 
 def reduce(pixels: UInt[np.ndarray, "H W C"], longest: int) -> Float[np.ndarray, "h w"]:
     """Returns an image as grey float32 in [0, 1], resized to a longest side; alpha is composited over white."""
-    factor, limit = longest / max(pixels.shape[:2]), np.float32(np.iinfo(pixels.dtype).max)
-    has_alpha = pixels.shape[-1] == 4
+    limit, has_alpha = np.float32(np.iinfo(pixels.dtype).max), pixels.shape[-1] == 4
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGBA2GRAY if has_alpha else cv2.COLOR_RGB2GRAY) / limit
     if has_alpha:
         grey = 1 + pixels[..., 3] / limit * (grey - 1)
-    height, width = (max(round(side * factor), 1) for side in grey.shape)
-    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    return _resized(grey, longest)
+
+
+def _resized(image, longest):
+    factor = longest / max(image.shape[:2])
+    height, width = (max(round(side * factor), 1) for side in image.shape[:2])
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _colors_at(pixels, corners, longest):
+    """Returns the mean colours [N, 3] in [0, 1] around corners [N, 2] px of the reduced image."""
+    blurred = cv2.blur(_resized(pixels, longest), (_AROUND, _AROUND)) / np.float32(np.iinfo(pixels.dtype).max)
+    if pixels.shape[-1] == 4:
+        blurred[..., :3] = 1 + blurred[..., 3:] * (blurred[..., :3] - 1)
+    x, y = np.minimum(corners.astype(int), np.array(blurred.shape[1::-1]) - 1).T
+    return np.float64(blurred[y, x, :3])
 
 
 def find_corners(grey: Float[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 128"]]:
@@ -123,38 +139,61 @@ def _summarize(frame: Frame, longest: int) -> ImageSummary:
     check_size(frame.image, size, declared)
     grey = reduce(pixels, longest)
     corners, descriptors = find_corners(grey)
+    colors = _colors_at(pixels, corners, longest)
     corners *= np.array(size[::-1]) / grey.shape[::-1]
     mask = read_frame_mask(frame, size)
     if mask is not None:
         x, y = np.minimum(corners.astype(int), np.array(size[::-1]) - 1).T
-        corners, descriptors = corners[mask[y, x]], descriptors[mask[y, x]]
+        corners, descriptors, colors = (each[mask[y, x]] for each in (corners, descriptors, colors))
     thumbnail = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).std())
     scale = np.array(declared)[::-1] / size[::-1]
-    return ImageSummary(size, pixels.shape[-1], grey.shape, corners * scale, descriptors, thumbnail, sharpness)
+    return ImageSummary(size, pixels.shape[-1], grey.shape, corners * scale, descriptors, colors, thumbnail, sharpness)
 
 
-def _unreadable(index, message):
+def refused(message: str, frames: tuple[int, ...], kind: str = "file") -> Finding:
     """Returns the Finding for the message of a reader: "file: found, expected X; change"."""
     found, *rest = re.split("[,;] expected ", message, maxsplit=1)
     expected, _, change = "".join(rest).partition("; ")
-    kind = "size" if " x " in expected or "that size" in expected else "file"
+    kind = "size" if kind == "file" and (" x " in expected or "that size" in expected) else kind
     expected, change = expected or "a complete image file", change or "copy the file again"
-    return Finding("error", kind, found, expected, change, (index,))
+    return Finding("error", kind, found, expected, change, frames)
 
 
 def _odd_sizes(capture, images, readable):
-    usual = Counter(images[index].size for index in readable).most_common(1)
+    """Returns Findings about images of another size than most, beside the one that their cameras state."""
+    groups: dict[tuple, list[int]] = {}
+    for index in readable:  # cameras without a size are compared with those of the same lens
+        camera = capture.frames[index].camera
+        alone = capture.rendered or None not in (camera.height, camera.width)
+        group = () if alone else (*map(float, camera.focal), *map(float, camera.center))
+        groups.setdefault(group, []).append(index)
     findings = []
-    for index in readable:
-        (height, width), frame = images[index].size, capture.frames[index]
-        if (height, width) == usual[0][0] or usual[0][1] < 0.5 * len(readable):
-            continue
-        severity = "error" if capture.rendered else "warning"
-        expected = "{1} x {0} as most images".format(*usual[0][0])
-        found, change = f"{frame.image} is {width} x {height}", "that file: copy or render it again at that size"
-        findings.append(Finding(severity, "size", found, expected, change, (index,)))
+    for group, members in groups.items():
+        scaled = not capture.rendered and not group
+        sizes = [_over_camera(capture.frames[k], images[k]) if scaled else images[k].size for k in members]
+        (usual, count), *_ = Counter(sizes).most_common(1)
+        if count >= 0.5 * len(members):
+            odd = [index for index, size in zip(members, sizes, strict=True) if size != usual]
+            findings += [_odd_size(capture, index, images[index].size, usual) for index in odd]
     return findings
+
+
+def _over_camera(frame, image):
+    """Returns the size of an image over that which its camera states."""
+    return max(image.size) / max(frame.camera.height, frame.camera.width)
+
+
+def _odd_size(capture, index, size, usual):
+    (height, width), frame = size, capture.frames[index]
+    severity, of_camera = "error" if capture.rendered else "warning", ""
+    if isinstance(usual, tuple):
+        expected = f"{usual[1]} x {usual[0]} as most images"
+    else:
+        expected = f"{usual:.4g} times the size of its camera, as most images"
+        of_camera = f", its camera {frame.camera.width} x {frame.camera.height}"
+    found, change = f"{frame.image} is {width} x {height}{of_camera}", "that file: copy or render it again at that size"
+    return Finding(severity, "size", found, expected, change, (index,))
 
 
 def _odd_alpha(capture, images, readable):

@@ -30,8 +30,8 @@ _UP = flags.DEFINE_enum(
 _OUT = flags.DEFINE_string(
     "out",
     None,
-    "The PNG with the cameras and points. When it is not given, check-FOLDER.png is written here, FOLDER being the "
-    "dataset's or the run's.",
+    "The PNG with the cameras and points. When it is not given, check-FOLDER.png of a dataset or "
+    "next-images-FOLDER.png of a run is written here.",
 )
 _OVERWRITE = flags.DEFINE_bool(
     "overwrite", False, "Whether to replace the PNG if it is not an earlier plot of the same dataset or run."

@@ -13,18 +13,21 @@ from jaxnerf.data.geometry.bounds import known_bounds
 from jaxnerf.data.geometry.path_poses import coverage
 from jaxnerf.data.geometry.poses import axis_of, gaze_center, sideways, up_of
 from jaxnerf.data.geometry.world import looks_forward, poses_of
-from jaxnerf.data.images.load_images import split_indices
+from jaxnerf.data.images.load_images import scored_splits, split_indices
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import TIME_UNUSED, Capture
+from jaxnerf.options import AUTO, replaced
 from jaxnerf.runtime.printed_text import printable
-from jaxnerf.tools.capture_check import cameras, depths, folds, image_facts, tracks
+from jaxnerf.tools.capture_check import cameras, depths, exposure, folds, image_facts, mixed_axes, tracks
 from jaxnerf.tools.capture_check import images as images_module
+from jaxnerf.tools.capture_check import lenses as lenses_module
 from jaxnerf.tools.capture_check.findings import Finding, percent
 
 _SETS_UP = "--up sets it, and --config.data.up in training"
 _FEW_FIT = 0.2  # fraction of matched corners that fit; 35 to 74 % in lego, mic, fox, fern, can
 _OF_CAMERAS = ("axes", "focal", "overlap", "pose", "swap", "fold")  # kinds of findings that explain it
 _SAME = 3  # findings about single files of one kind that are shown
+_OFF_AXIS = 1.0  # degrees from the nearest axis of the files, from which up is stated as a vector
 _LOOKS_UP = 5.0  # degrees in the mean, above which images may be upside down; -34 to 0 in lego, mic, fox, fern, can
 _TILTED = 15.0  # degrees, in the median, by which images of a capture with a known up are not level
 _MAX_IMAGES = 500  # that are read, at a fifth of a second each on two cores
@@ -98,17 +101,20 @@ def inspect(
     images, findings = images_module.read(capture)
     near_views = tracks.neighbours(poses_of(capture))
     findings += images_module.compare(capture, images, near_views)
-    findings += depths.judge_model_points(capture)
+    findings += depths.judge_model_points(capture) + folds.noted(capture)
     evidence = cameras.gather(capture, images, near_views)
     wrong = cameras.judge_positions(capture)
     if not wrong:  # from one position, rays fit any axes and focal length
         wrong, evidence = cameras.judge_axes(capture, evidence)
+        mixed, evidence = mixed_axes.judge_mixed(capture, evidence)
+        wrong = mixed or wrong
         focal, evidence = cameras.judge_focal(capture, evidence)
         views = cameras.judge_views(capture, evidence)
         findings += focal + views
         if not wrong:
             flagged = {index for finding in views for index in finding.frames if finding.severity == "error"}
             findings += folds.judge_folds(capture, evidence, flagged)
+        findings += exposure.judge_exposure(capture, images, evidence)
     findings += wrong
     if evidence.fraction < _FEW_FIT and not any(finding.kind in _OF_CAMERAS for finding in findings):
         found = f"{capture.source}: only {percent(evidence.fraction)} of the matched corners fit the cameras"
@@ -120,7 +126,8 @@ def inspect(
     if stated or not wrong:  # bounds computed from wrong poses mean nothing
         findings += depths.judge_bounds(depth, bounds[point_tracks.views[:, 0]], stated)
     findings += depths.judge_box(capture, points)
-    findings += _judge_splits(whole)
+    findings += lenses_module.judge_lenses(capture)
+    findings += _judge_splits(whole) + _refused_by_training(folder, whole, near, far, findings)
     findings += [Finding("warning", "skipped", note, "", "") for note in dict.fromkeys(whole.notes)]
     findings += image_facts.judge_files(whole)
     path, line = _path(whole, given)
@@ -138,6 +145,21 @@ def _judge_splits(capture):
     change = "the lists of views of the splits, or remove the copies"
     notes = dict.fromkeys(found["note"] for found in shared.values())
     return [Finding("warning", "leak", note, expected, change) for note in notes]
+
+
+def _refused_by_training(folder, capture, near, far, findings):
+    """Returns a Finding for each split that training would refuse to read, unless one says it already."""
+    data = dataset.DataOptions(format=capture.format, factor=AUTO, background=AUTO, world=AUTO, ndc=AUTO)  # type: ignore
+    data = replaced(data, dir=str(folder), near=near or 0.0, far=far or 0.0)
+    known = {finding.found.split(": ")[0] for finding in findings if finding.severity == "error" and finding.frames}
+    refused = {}
+    for split in ("train", *scored_splits(capture)):
+        try:
+            dataset.load_split(data, split, with_pixels=False)
+        except ValueError as error:
+            finding = images_module.refused(str(error), (), "training")
+            refused[finding.found] = finding._replace(found=f"training refuses this: {finding.found}")
+    return [finding for found, finding in refused.items() if found.split(": ")[0] not in known]
 
 
 def subset(capture: Capture) -> Capture:
@@ -170,7 +192,6 @@ def _camera_facts(capture, evidence, images, up):
     first, poses = stack[0], evidence.poses
     focal = np.array([camera.focal for camera in stack]).mean(axis=0)
     size = np.array([first.width or 2 * first.center[0], first.height or 2 * first.center[1]])
-    angle = 2 * np.degrees(np.arctan(0.5 * size / focal))
     scale, stated = _scale_to_files(capture, images)
     off = scale * (np.asarray(first.center) - size / 2)
     lenses = _counted(Counter(camera.lens for camera in stack))
@@ -187,8 +208,8 @@ def _camera_facts(capture, evidence, images, up):
     return [
         (
             "lens",
-            f"focal length {scale * focal[0]:.5g}, {scale * focal[1]:.5g} px{stated}; field of view "
-            f"{angle[0]:.1f} x {angle[1]:.1f} degrees; principal point {off[0]:+.1f}, {off[1]:+.1f} px from the "
+            f"focal length {scale * focal[0]:.5g}, {scale * focal[1]:.5g} px{stated}; "
+            f"{lenses_module.describe(capture)}; principal point {off[0]:+.1f}, {off[1]:+.1f} px from the "
             f"image's centre; {lenses}",
         ),
         ("poses", f"{handed}; {_up_axis(poses, up)}"),
@@ -254,7 +275,9 @@ def _up_axis(poses, given):
     up, turned = up_of(poses), sideways(poses)
     axis = int(np.abs(up).argmax())
     angle = np.degrees(np.arccos(np.clip(abs(up[axis]), 0, 1)))
-    line = f"up is {'-' if up[axis] < 0 else '+'}{'xyz'[axis]} within {angle:.0f} degrees"
+    name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}"
+    vector = ", ".join(f"{value:.3f}" for value in up)
+    line = f"up is {name}" if angle < _OFF_AXIS else f"up is ({vector}), {angle:.0f} degrees from {name}"
     level = np.where(turned, np.abs(poses[:, :, 1] @ up), np.abs(poses[:, :, 0] @ up))
     tilt = np.degrees(np.arcsin(np.clip(np.median(level), 0, 1)))
     if turned.any():

@@ -27,10 +27,12 @@ class Keypoints(NamedTuple):
     Attributes:
         points: [N, 2] on the plane at distance 1 along the axis, without distortion: x right, y down.
         descriptors: [N, D] of length 1.
+        colors: [N, 3] around the corners, in [0, 1]; None: not known.
     """
 
     points: Float[np.ndarray, "N 2"]
     descriptors: Float[np.ndarray, "N D"]
+    colors: Float[np.ndarray, "N 3"] | None = None
 
 
 class Tracks(NamedTuple):
@@ -88,15 +90,15 @@ def keypoints_of(capture: Capture, images: Sequence[ImageSummary | None]) -> lis
     for frame, image in zip(capture.frames, images, strict=True):
         camera = frame.camera
         if image is None:
-            result.append(Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32)))
+            result.append(Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3))))
         elif camera.lens == "pinhole" or camera.distortion is None:
-            result.append(Keypoints((image.corners - camera.center) / camera.focal, image.descriptors))
+            result.append(Keypoints((image.corners - camera.center) / camera.focal, image.descriptors, image.colors))
         else:
             count = len(image.corners)
             padded = np.tile(np.float32(camera.center), (max(1024, count), 1))  # one shape to compile
             padded[:count] = image.corners
             points, valid = (np.asarray(value)[:count] for value in jax.jit(undistort)(camera, padded))
-            result.append(Keypoints(np.float64(points[valid]), image.descriptors[valid]))
+            result.append(Keypoints(np.float64(points[valid]), image.descriptors[valid], image.colors[valid]))
     return result
 
 
@@ -137,7 +139,7 @@ def follow(
         matches = [match(keypoints[view], keypoints[other]) for other in others]
         indices = np.stack([np.arange(len(keypoints[view].points)), *matches], axis=1)
         parts.append(_tracks(keypoints, (view, *others), indices[(indices >= 0).sum(axis=1) > 1]))
-    return _joined(parts)
+    return joined(parts)
 
 
 def count_fits(
@@ -155,13 +157,26 @@ def count_fits(
     parts = []
     for other in near[view]:
         if other not in (image, view):
-            matches = match(moved[view], moved[other])
-            first = np.flatnonzero(matches >= 0)
-            parts.append(_tracks(moved, (view, other), np.stack([first, matches[first]], axis=1)))
+            parts.append(pair_tracks(moved, view, int(other)))
     if not parts:
         return 0, 0
-    off = errors(_joined(parts), poses, scale)
+    off = errors(joined(parts), poses, scale)
     return int((off < 0.75 * INLIER).sum()), len(off)
+
+
+def pair_tracks(keypoints: Sequence[Keypoints], view: int, other: int) -> Tracks:
+    """Returns the Tracks [T, 2] of the matches of two views."""
+    matches = match(keypoints[view], keypoints[other])
+    first = np.flatnonzero(matches >= 0)
+    return _tracks(keypoints, (view, other), np.stack([first, matches[first]], axis=1))
+
+
+def fitting_matches(evidence: Evidence, view: int, other: int) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
+    """Returns the corners of two views that are matched and fit the cameras."""
+    matches = match(evidence.keypoints[view], evidence.keypoints[other])
+    first = np.flatnonzero(matches >= 0)
+    first = first[errors(pair_tracks(evidence.keypoints, view, other), evidence.poses, evidence.scale) < INLIER]
+    return first, matches[first]
 
 
 def circles(keypoints: Sequence[Keypoints], view: int, others: Int[np.ndarray, " N"]) -> Tracks | None:
@@ -177,7 +192,7 @@ def circles(keypoints: Sequence[Keypoints], view: int, others: Int[np.ndarray, "
         indices = np.stack([corners, matches[first][corners], matches[second][corners]], axis=1)
         closed = between[indices[:, 1]] == indices[:, 2]
         parts.append(_tracks(keypoints, (view, first, second), indices[closed]))
-    return _joined(parts) if parts else None
+    return joined(parts) if parts else None
 
 
 def triangulate(
@@ -239,5 +254,6 @@ def _tracks(keypoints, columns, indices):
     return Tracks(np.tile(columns, (len(indices), 1)), points, shown)
 
 
-def _joined(parts):
+def joined(parts: Sequence[Tracks]) -> Tracks:
+    """Returns one or more Tracks of the same number of views as one."""
     return Tracks(*(np.concatenate(part) for part in zip(*parts, strict=True)))

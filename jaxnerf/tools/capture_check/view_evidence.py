@@ -7,7 +7,7 @@ among its corners; that number is subtracted. An image is flagged only if anothe
 other cameras agree on, explains several times as many of them as its own does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -71,8 +71,8 @@ def find_alternative(evidence: Evidence, view: int, *, without: Sequence[int] = 
     pose, inliers = found
     if len(np.unique(sources[inliers])) < 2 or len(inliers) < _MIN_POINTS:
         return None
-    stated = support(evidence, view, evidence.poses[view], _nearest(evidence.poses, evidence.poses[view], doubtful))
-    other = support(evidence, view, pose, _nearest(evidence.poses, pose, doubtful))
+    stated = support(evidence, view, evidence.poses[view], nearest(evidence.poses, evidence.poses[view], doubtful))
+    other = support(evidence, view, pose, nearest(evidence.poses, pose, doubtful))
     return Alternative(pose, stated, other, len(inliers))
 
 
@@ -169,8 +169,8 @@ def _estimate_pose(points, places, tolerance):
     return (pose, inliers[:, 0]) if np.isfinite(pose).all() else None
 
 
-def _nearest(poses, pose, doubtful):
-    """Returns the views whose cameras are nearest to a pose; see `tracks.neighbours`."""
+def nearest(poses: Float[np.ndarray, "V 3 4"], pose: Float[np.ndarray, "3 4"], doubtful: Collection[int]) -> list[int]:
+    """Returns the views whose cameras are nearest to a pose, without doubtful ones; see `tracks.neighbours`."""
     cosine = (np.einsum("ij,bij->b", pose[:, :3], poses[:, :, :3]) - 1) / 2
     eyes = poses[:, :, 3]
     spread = np.median(np.linalg.norm(eyes - np.median(eyes, axis=0), axis=-1))

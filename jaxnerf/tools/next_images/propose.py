@@ -25,6 +25,8 @@ _THIN = 15.0  # degrees by which what is thinly covered has been seen from farth
 _MOST_THIN = 5  # groups that are named
 _MOST_CELLS = 6000  # that are plotted
 _FAR_IN_NDC = 0.8  # ten times as far away as the near plane, where 1 is at infinity
+_FOGGY = 20.0  # degrees of the images themselves, above which only differences from them say something
+_UNITS = "units of the dataset's files"
 _ZENITH = 85.0  # degrees, above which an azimuth says nothing
 
 
@@ -87,28 +89,47 @@ class CoverageReport(NamedTuple):
             f"cells    {self.counts.sum():,} occupied, {seen:,} seen; {few:.0%} of these from 1 to 3 of 64 directions",
             f"cameras  {self.candidates.kind}, as {self.candidates.reason}",
             "",
-            "From how far aside what a camera would show has been seen, in degrees, by where it would be",
-            f"({_PLACES[self.candidates.kind].format(first=_name(self.views, 0))}).",
-            f"The images themselves have {self.own_angle:.0f} degrees, by rounded directions and by fog:",
-            *_table(self.angles, self.candidates),
+            "From how far aside what a camera would show has been seen, in degrees" + self._beyond,
+            f"by where it would be ({_PLACES[self.candidates.kind].format(first=_name(self.views, 0))}).",
+            f"{self._own}:",
+            *_table(self.angles - self._base, self.candidates),
             "",
             *self._thin(),
             "",
             "Next images, each as if those before it had been taken:",
         ]
         for number, each in enumerate(self.proposals, 1):
-            seen = "nothing of it has been seen" if each.angle > 179 else f"seen from {each.angle:.0f} degrees aside"
+            seen = f"seen from {max(each.angle - self._base, 0):.0f} degrees{' farther' if self._base else ''} aside"
+            seen += " than the images themselves" if self._base else ""
+            seen = "nothing of it has been seen" if each.angle > 179 else seen
             lines.append(f"{number:3}. {each.words}; {seen}")
         return "\n".join(lines)
+
+    @property
+    def _base(self):
+        """The angle that counts as none: where light passes the scene, or fog is, the images' own says nothing."""
+        return self.own_angle if self.own_angle > _FOGGY else 0.0
+
+    @property
+    def _beyond(self):
+        return " beyond what the images themselves have" if self._base else ""
+
+    @property
+    def _own(self):
+        if self._base:
+            return "Light that passes the scene and fog count as unseen, so only differences say something"
+        return f"The images themselves have {self.own_angle:.0f} degrees, by rounded directions and by fog"
 
     def _thin(self):
         most = self.own_angle + _THIN
         rows, columns = np.nonzero(np.nan_to_num(self.angles) > most)
         if not len(rows):
-            return [f"thin     nowhere: everything has been seen from at most {most:.0f} degrees aside"]
+            limit = f"{most - self._base:.0f} degrees{self._beyond or ' aside'}"
+            return [f"thin     nowhere: everything has been seen from at most {limit}"]
         order = np.argsort(-self.angles[rows, columns])[:_MOST_THIN]
         names = [
-            f"{self.candidates.rows[row]}, {self.candidates.columns[column]} ({self.angles[row, column]:.0f})"
+            f"{self.candidates.rows[row]}, {self.candidates.columns[column]} "
+            f"({self.angles[row, column] - self._base:.0f} degrees)"
             for row, column in zip(rows[order], columns[order], strict=True)
         ]
         more = f"; and {len(rows) - len(order)} more" if len(rows) > len(order) else ""
@@ -275,11 +296,11 @@ def _words(candidates, index, views, up):
         moves = [move for move in moves if move] or ["a little aside"]
         distance = unit * np.linalg.norm(offset)
         place = f"{abs(height):.0f} degrees {'high' if height >= 0 else 'below the horizon'}"
-        return f"from {name} {' and '.join(moves)}: {place}, at a distance of {distance:.3g}"
+        return f"from {name} {' and '.join(moves)}: {place}, at a distance of {distance:.3g} {_UNITS}"
     if candidates.kind == "beside":
         x, y = unit * (pose[:, 3] - old[:, 3]) @ old[:, :2]
         side, way = "right" if x > 0 else "left", "up" if y > 0 else "down"
-        return f"from {name} {abs(x):.3g} to the {side} and {abs(y):.3g} {way}"
+        return f"from {name} {abs(x):.3g} {_UNITS} to the {side} and {abs(y):.3g} {way}"
     right = float(np.degrees(-azimuth_to_right(-pose[None, :, 2], -old[:, 2], up)[0]))
     pitch = _height(-pose[:, 2], up)
     level = "level" if abs(pitch) < 1 else f"{abs(pitch):.0f} degrees {'up' if pitch > 0 else 'down'}"
@@ -298,4 +319,4 @@ def _part(angle, positive, negative):
 
 
 def _name(views, index):
-    return views.names[index] if views.names else f"view {index}"
+    return f"'{views.names[index]}'" if views.names else f"view {index}"

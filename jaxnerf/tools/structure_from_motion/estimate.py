@@ -18,6 +18,7 @@ from jaxnerf.tools.structure_from_motion import colmap_process
 from jaxnerf.tools.structure_from_motion import images as images_module
 from jaxnerf.tools.structure_from_motion.colmap_process import Model
 
+_NOTES = "jaxnerf_notes.txt"  # beside the model, which jaxnerf-check repeats
 CAMERA_MODELS = (  # of which the reader's lenses have all parameters
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -242,7 +243,9 @@ class _Stages:
                 f"the scene repeats itself: a first model contradicted {example}; only the matches of images at most "
             )
             return again, [f"{note}{images_module.OVERLAP} places apart in the order of their names were used"]
-        return models, [f"the cameras may be wrong, as they contradict {example}: does the scene repeat itself?"]
+        note = f"the cameras may be wrong, as they contradict {example}: does the scene repeat itself?"
+        write_text(models[0].folder / _NOTES, note + "\n")
+        return models, [note]
 
     def _map(self, database, names, folder):
         models = self.work / folder

@@ -16,6 +16,7 @@ from jaxnerf.core import cameras, types
 from jaxnerf.core import poses as poses_module
 from jaxnerf.data.geometry import path_poses, world
 from jaxnerf.data.images import load_images
+from jaxnerf.data.images.image_files import read_image
 from jaxnerf.tools.capture_check import camera_plot, findings, images, tracks
 from jaxnerf.tools.capture_check.report import inspect
 
@@ -128,6 +129,124 @@ def test_a_dataset_without_defects_has_no_errors(folders, format):
     assert len(report.points) > 200
     off_walls = np.abs(report.points - [-2.0, 2.0, -1.0]).min(axis=1)
     assert np.median(off_walls) < 0.02
+    assert not {"exposure", "lens", "training"} & {finding.kind for finding in report.findings}
+
+
+def change_frames(change):
+    """Returns a function that calls change(index, frame, image file) for each frame of a transforms.json."""
+
+    def plant(folder):
+        content = json.loads((folder / "transforms.json").read_text())
+        for index, frame in enumerate(content["frames"]):
+            change(index, frame, folder / frame["file_path"])
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+    return plant
+
+
+def rewrite(file, change):
+    pixels = read_image(file)[..., :3]
+    pixels = change(np.uint8(pixels >> 8 if pixels.dtype == np.uint16 else pixels))
+    file.unlink()  # it is a link to the file of the dataset without defects
+    Image.fromarray(pixels).save(file)
+
+
+def test_what_training_refuses_is_an_error(folders, tmp_path):
+    lens = {"camera_model": "OPENCV_FISHEYE", **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0)}
+    report = planted(
+        folders, tmp_path, "transforms", change_frames(lambda k, frame, _: frame.update(lens if k % 4 == 1 else {}))
+    )
+    (found,) = (finding for finding in report.findings if finding.kind == "training")
+    assert found.severity == "error" and "training refuses this: the images mix lenses" in found.line()
+
+
+def test_images_of_the_size_of_their_own_cameras_are_not_odd(folders, tmp_path):
+    def crop(index, frame, file):
+        if index % 3 == 2:
+            frame |= {"w": 120, "h": SIZE}
+            rewrite(file, lambda pixels: pixels[:, :120])
+
+    report = planted(folders, tmp_path, "transforms", change_frames(crop))
+    assert not any(finding.kind == "size" for finding in report.findings), report.text()
+
+
+@pytest.mark.parametrize("size, accepted", [(SIZE, True), (SIZE // 2, True), (100, False)])
+def test_masks_of_the_full_size_are_read_beside_smaller_images_as_in_training(folders, tmp_path, size, accepted):
+    def shrink(index, frame, file):
+        rewrite(file, lambda pixels: pixels[::2, ::2])
+        frame["mask_path"] = f"masks/{index:03d}.png"
+        mask = file.parents[1] / frame["mask_path"]
+        mask.parent.mkdir(exist_ok=True)
+        Image.new("L", (size, size), 255).save(mask)
+
+    report = planted(folders, tmp_path, "transforms", change_frames(shrink))
+    assert any("export the mask again" in finding.change for finding in report.findings) != accepted
+
+
+@pytest.mark.parametrize("gains", [[1, 1, 1, 0.6], [(1, 1, 1), (1, 0.9, 0.75)]])
+def test_images_of_other_exposures_or_white_balances_are_found(folders, tmp_path, gains):
+    def expose(index, frame, file):
+        rewrite(file, lambda pixels: np.uint8(pixels * np.array(gains[index % len(gains)])))
+
+    report = planted(folders, tmp_path, "transforms", change_frames(expose))
+    (found,) = (finding for finding in report.findings if finding.kind == "exposure")
+    assert "times" in found.found and "--config.cameras.exposure=True" in found.change
+
+
+_OPENCV, _ROLLED = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
+_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    "chosen, read, says",
+    [
+        (lambda k: 5 <= k < 10, lambda pose: pose @ _OPENCV, "5 of 12 images, 005 to 009, are in OpenCV's axes"),
+        (lambda k: k in (0, 2, 4, 6, 8), lambda pose: pose @ _OPENCV, "000, 002, 004, 006, 008, are in OpenCV's axes"),
+        (lambda k: k < 7, lambda pose: pose @ _OPENCV, "7 of 12 images, 000 to 006, are in OpenCV's axes"),
+        (lambda k: k in (3, 8), lambda pose: pose @ _ROLLED, "2 of 12 images, 003, 008, are in axes turned"),
+        (lambda k: 6 < k < 10, np.linalg.inv, "3 of 12 images, 007 to 009, are in world-to-camera matrices"),
+        (lambda k: 6 < k < 10, lambda pose: _Y_UP @ pose, "3 of 12 images, 007 to 009, are in a world turned by right"),
+    ],
+)
+def test_images_whose_poses_are_in_other_axes_than_the_rest_are_named(folders, tmp_path, chosen, read, says):
+    """The last two of the images share too little with the others to be judged."""
+
+    def turn(index, frame, file):
+        if chosen(index):
+            frame["transform_matrix"] = read(np.array(frame["transform_matrix"])).tolist()
+
+    report = planted(folders, tmp_path, "transforms", change_frames(turn))
+    assert kinds(report) == {"axes"}, report.text()
+    (found,) = (finding for finding in report.findings if finding.kind == "axes")
+    assert says in found.found and found.change.startswith("of these images only, "), found
+    whole = inspect(folders / "transforms")
+    np.testing.assert_allclose(report.poses[:10], whole.poses[:10], atol=1e-6)
+
+
+def test_what_was_noted_when_the_cameras_were_found_is_repeated(folders, tmp_path):
+    def note(folder):
+        place = next(path.parent for path in folder.rglob("images.*") if path.is_file())
+        (place / findings.NOTES).write_text("the cameras may be wrong, as they contradict a and b\n")
+
+    report = planted(folders, tmp_path, "colmap", note)
+    assert any(finding.kind == "fold" and "as they contradict a and b" in finding.found for finding in report.findings)
+
+
+def test_plots_of_folders_of_one_name_do_not_collide_and_show_up_as_up(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one, other = tmp_path / "one" / "scene", tmp_path / "other" / "scene"
+    options = {"is_run": False, "overwrite": False}
+    first = camera_plot.new_path(None, one, **options)
+    camera_plot.save(camera_plot.Figure(), first, one)
+    names = [str(camera_plot.new_path(None, folder, **options)) for folder in (one, other)]
+    names.append(str(camera_plot.new_path(None, one, is_run=True, overwrite=False)))
+    assert names == ["check-scene.png", "check-other-scene.png", "next-images-scene.png"]
+    up = np.array([0.0, 0.57, 0.82]) / np.hypot(0.57, 0.82)
+    axes = camera_plot._axes(up)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(axes[2], up)
+    assert np.linalg.det(axes) > 0
+    np.testing.assert_array_equal(camera_plot._axes(np.array([0.0, 0.02, -1.0]))[2], [0, 0, -1])
 
 
 @pytest.mark.slow

@@ -103,5 +103,7 @@ def test_the_reconstruction_of_the_dataset_raises_the_bar():
 def test_up_is_that_of_the_paths_that_render_selects():
     found = evidence().poses
     found[:, :, :3] = found[:, :, :3] @ np.array([[1, 0, 0], [0, 0.6, -0.8], [0, 0.8, 0.6]])  # all look far down
-    degrees = np.degrees(np.arccos(path_poses.coverage(found).up[2]))
-    assert report._up_axis(found, None).startswith(f"up is +z within {degrees:.0f} degrees")
+    assert report._up_axis(found, None).startswith("up is +z")
+    found = np.array([[1, 0, 0], [0, 0.8, 0.6], [0, -0.6, 0.8]]) @ found
+    np.testing.assert_allclose(path_poses.coverage(found).up, [0, 0.6, 0.8], atol=1e-6)
+    assert report._up_axis(found, None).startswith("up is (0.000, 0.600, 0.800), 37 degrees from +z")
