@@ -58,7 +58,7 @@ _SHARD = flags.DEFINE_string(
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.evaluation import evaluate, external, quality_search
+    from jaxnerf.evaluation import evaluate, external
     from jaxnerf.runtime import shards
 
     shard = shards.parse(_SHARD.value)
@@ -76,7 +76,9 @@ def main(argv):
         target = {"split": split, "step": _RUN.step.value, "overwrite": overwrite}
         budget, found = _ERROR_BUDGET.value, {}
         if budget is not None:
-            found = quality_search.choose(workdir, restore, budget, **target)
+            from jaxnerf.tools.quality_search.search import choose
+
+            found = choose(workdir, restore, budget, **target)
         run = restore(found)
         results = evaluate.score_run(run, workdir, shard=shard, predictor=predictor and predictor(run), **target)
     if results is None:

@@ -36,6 +36,7 @@ ALLOWED = {
 # Where the method hands over to a tool, in a lazy import.
 HANDS_OVER = {
     ("jaxnerf.train", "tools.viewer"),
+    ("jaxnerf.eval", "tools.quality_search"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
     ("jaxnerf.extend", "tools.uncertainty"),

@@ -7,9 +7,9 @@ import pytest
 
 from jaxnerf import create_grid
 from jaxnerf.data.ray_batches import random_rays
-from jaxnerf.evaluation import quality_search
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.models import occupancy
+from jaxnerf.tools.quality_search import search as quality_search
 from runs import run_forked
 
 pytest_plugins = ["run_fixtures"]
