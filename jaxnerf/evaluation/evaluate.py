@@ -245,7 +245,7 @@ def summary(results: dict[str, Any]) -> str:
         metrics += f" ({results['psnr_aligned']:.2f} dB, {results['ssim_aligned']:.4f} after colour alignment)"
     shared = results.get("conventions", {}).get("shared_with_training")
     note = f"; note: {shared['note']}" if shared else ""
-    exact = [row["psnr"] == math.inf for row in results["images"]]
+    exact = [row["psnr"] == math.inf for row in results.get("images", ())]
     if any(exact):
         note += f"; note: {sum(exact)} images equal their references in 8 bits, so their PSNR and its mean are infinite"
     paired = "" if results.get("paired_by", "name") == "name" else f", paired by {results['paired_by']}"

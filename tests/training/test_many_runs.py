@@ -75,6 +75,7 @@ def test_datasets_of_the_same_shapes_have_one_compiled_step_and_other_options_an
     assert difference(folders[2], tmp_path / "alone") > 0
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_the_last_and_the_same_call_continues(tmp_path, monkeypatch, capsys):
     configs, folders = [config_of(seed) for seed in range(2)], [tmp_path / "a", tmp_path / "b"]
     train = evaluate.train

@@ -79,6 +79,7 @@ def test_masks_lenses_and_times_are_stored(run, tmp_path):
     assert found.mask.dtype == bool
 
 
+@pytest.mark.slow
 def test_frames_and_exports_are_the_same_without_the_dataset(run, alone):
     made = {}
     for folder in (run, alone):

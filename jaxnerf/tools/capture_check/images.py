@@ -21,6 +21,7 @@ from jaxnerf.tools.capture_check.findings import Finding, named
 _LONGEST = 512  # px of the reduced images, to whose pixels all pixel errors refer
 _MAX_CORNERS = 400  # of one image
 _THUMBNAIL = 24  # px
+_MATTE = 128  # px, longest side
 _AROUND = 7  # px around a corner whose mean is its colour
 _SAME = 0.0015  # mean difference of thumbnails, in [0, 1], below which two images are the same
 _PLAIN = 1e-6  # sharpness of an image without texture
@@ -39,6 +40,7 @@ class ImageSummary(NamedTuple):
         colors: [N, 3] around the corners, in [0, 1].
         thumbnail: grey.
         sharpness: standard deviation of the Laplacian of the reduced image.
+        matte: mean alpha of the pixels of a small image, in [0, 1]; None without alpha.
     """
 
     size: tuple[int, int]
@@ -49,6 +51,7 @@ class ImageSummary(NamedTuple):
     colors: Float[np.ndarray, "N 3"]
     thumbnail: Float[np.ndarray, "24 24"]
     sharpness: float
+    matte: Float[np.ndarray, "h2 w2"] | None
 
 
 def read(capture: Capture) -> tuple[list[ImageSummary | None], list[Finding]]:
@@ -148,7 +151,14 @@ def _summarize(frame: Frame, longest: int) -> ImageSummary:
     thumbnail = cv2.resize(grey, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).std())
     scale = np.array(declared)[::-1] / size[::-1]
-    return ImageSummary(size, pixels.shape[-1], grey.shape, corners * scale, descriptors, colors, thumbnail, sharpness)
+    found = corners * scale, descriptors, colors, thumbnail, sharpness, _matte(pixels)
+    return ImageSummary(size, pixels.shape[-1], grey.shape, *found)
+
+
+def _matte(pixels):
+    if pixels.shape[-1] == 3:
+        return None
+    return _resized(pixels[..., 3] / np.float32(np.iinfo(pixels.dtype).max), min(_MATTE, max(pixels.shape)))
 
 
 def refused(message: str, frames: tuple[int, ...], kind: str = "file") -> Finding:

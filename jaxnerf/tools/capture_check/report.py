@@ -18,7 +18,7 @@ from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import TIME_UNUSED, Capture
 from jaxnerf.options import AUTO, replaced
 from jaxnerf.runtime.printed_text import printable
-from jaxnerf.tools.capture_check import cameras, depths, exposure, folds, image_facts, mixed_axes, tracks
+from jaxnerf.tools.capture_check import cameras, depths, exposure, folds, image_facts, mattes, mixed_axes, tracks
 from jaxnerf.tools.capture_check import images as images_module
 from jaxnerf.tools.capture_check import lenses as lenses_module
 from jaxnerf.tools.capture_check.findings import Finding, percent
@@ -126,6 +126,8 @@ def inspect(
     if stated or not wrong:  # bounds computed from wrong poses mean nothing
         findings += depths.judge_bounds(depth, bounds[point_tracks.views[:, 0]], stated)
     findings += depths.judge_box(capture, points)
+    if not wrong:
+        findings += mattes.judge_mattes(capture, [image and image.matte for image in images], bounds)
     findings += lenses_module.judge_lenses(capture)
     findings += _judge_splits(whole) + _refused_by_training(folder, whole, near, far, findings)
     findings += [Finding("warning", "skipped", note, "", "") for note in dict.fromkeys(whole.notes)]
