@@ -253,7 +253,8 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
     local = (to_world[:, :3].reshape(*lead, 3, 3) * offset[..., None]).sum(axis=-2)
     depth = -local[..., 2]
     across = jnp.stack([local[..., 0], -local[..., 1]], axis=-1)
-    steepest = focal * (1 + jnp.abs(across / depth[..., None])) / depth[..., None]
+    ahead = jax.lax.stop_gradient(jnp.where(depth > 0, depth, 1))[..., None]
+    steepest = focal * (1 + jnp.abs(jax.lax.stop_gradient(across) / ahead)) / ahead
     seen = (depth > 0) & jnp.isfinite(jax.lax.stop_gradient(steepest)).all(axis=-1)
     points = divide(across, jnp.broadcast_to(jnp.where(seen, depth, 1)[..., None], across.shape))
     if camera.distortion is not None and camera.lens != "pinhole":

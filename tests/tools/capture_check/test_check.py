@@ -477,16 +477,16 @@ def test_the_program_reports_and_does_not_touch_the_dataset(folders, tmp_path):
 
 @pytest.mark.slow
 def test_the_program_replaces_no_other_file_than_its_own_plot(folders, tmp_path):
-    plot = tmp_path / "check-llff.png"
+    plot = tmp_path / "plot.png"
     other = camera_plot.plot_cameras(inspect(folders / "llff"))
     camera_plot.save(other, tmp_path / "another_dataset.png", folders / "colmap")
     Image.new("RGB", (2, 2)).save(tmp_path / "image.png")
     for content in ((tmp_path / "another_dataset.png").read_bytes(), (tmp_path / "image.png").read_bytes(), b"text"):
         plot.write_bytes(content)
-        refused = run(f"--data_dir={folders / 'llff'}", cwd=tmp_path)
+        refused = run(f"--data_dir={folders / 'llff'}", f"--out={plot}", cwd=tmp_path)
         assert refused.returncode == 1 and refused.stderr.count("\n") == 1 and "--overwrite" in refused.stderr
         assert plot.read_bytes() == content and not refused.stdout
-    done = run(f"--data_dir={folders / 'llff'}", "--overwrite", cwd=tmp_path)
+    done = run(f"--data_dir={folders / 'llff'}", f"--out={plot}", "--overwrite", cwd=tmp_path)
     assert done.returncode == 0 and camera_plot.is_plot_of(plot, folders / "llff")
 
 
