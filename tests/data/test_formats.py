@@ -300,6 +300,10 @@ def test_near_and_far_are_in_the_files_units(tmp_path):
 def test_errors_of_the_data_section(tmp_path):
     with pytest.raises(ValueError, match="holds no dataset, expected transforms_train.json"):
         dataset.resolve(a_data(tmp_path))
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "IMG_1.JPG").touch()
+    with pytest.raises(ValueError, match=r"images without cameras.*jaxnerf-cameras --images=\S+/images --out="):
+        dataset.resolve(a_data(tmp_path))
     captures.write_transforms(tmp_path, captures.noise(captures.orbit(8)))
     with pytest.raises(ValueError, match="there is no dataset format 'dslr'"):
         dataset.load_split(a_data(tmp_path, format="dslr"), "train")

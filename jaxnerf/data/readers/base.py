@@ -152,6 +152,13 @@ def detect_formats(folder: str | os.PathLike) -> list[str]:
     found = [name for name in READERS.names() if READERS.get(name).detect(folder)]
     if not found:
         check_complete(folder)
+        places = [place for place in (folder, folder / "images") if place.is_dir()]
+        photos = [place for place in places for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+        if photos:
+            raise ValueError(
+                f"{folder}: holds images without cameras, expected the camera of each; find them with "
+                f"jaxnerf-cameras --images={photos[0]} --out=DATASET, and give that folder"
+            )
         raise ValueError(
             f"{folder}: holds no dataset, expected transforms_train.json (Blender), transforms.json, a COLMAP "
             "model in sparse/0 or dense/0/sparse, or poses_bounds.npy (LLFF); correct the folder, or import the "
