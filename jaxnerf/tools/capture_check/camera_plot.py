@@ -1,5 +1,6 @@
 """Plots the cameras of a dataset and what its images show, from above and from a side."""
 
+import glob
 import os
 import pathlib
 
@@ -141,6 +142,9 @@ def new_path(out: str | None, folder: pathlib.Path, *, is_run: bool, overwrite: 
 def save(figure: Figure, path: str | os.PathLike, folder: str | os.PathLike) -> None:
     """Writes a PNG that names the dataset's folder; see `is_plot_of`."""
     metadata = {"Software": _SOFTWARE, "Source": printable(pathlib.Path(folder).resolve())}
+    path = pathlib.Path(path)
+    for left in path.parent.glob(f"{glob.escape(path.name)}.*.tmp"):  # by a process that was killed
+        left.unlink(missing_ok=True)
     with partial_file(path) as partial:
         figure.savefig(partial, format="png", metadata=metadata)
 

@@ -486,8 +486,9 @@ def test_the_program_replaces_no_other_file_than_its_own_plot(folders, tmp_path)
         refused = run(f"--data_dir={folders / 'llff'}", f"--out={plot}", cwd=tmp_path)
         assert refused.returncode == 1 and refused.stderr.count("\n") == 1 and "--overwrite" in refused.stderr
         assert plot.read_bytes() == content and not refused.stdout
+    (tmp_path / "plot.png.0123.tmp").touch()  # of a process that was killed
     done = run(f"--data_dir={folders / 'llff'}", f"--out={plot}", "--overwrite", cwd=tmp_path)
-    assert done.returncode == 0 and camera_plot.is_plot_of(plot, folders / "llff")
+    assert done.returncode == 0 and not list(tmp_path.glob("*.tmp")) and camera_plot.is_plot_of(plot, folders / "llff")
 
 
 def test_the_program_names_packages_that_are_missing(folders, tmp_path):
