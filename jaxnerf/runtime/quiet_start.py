@@ -8,12 +8,13 @@ jax is imported, which takes a second or more, as `signals` does later; so does 
 import os
 import sys
 
-# While `python -m` imports the packages of a module, argv[0] is "-m".
-_by_module = sys.argv[0] == "-m" and sys.orig_argv[sys.orig_argv.index("-m") + 1].startswith("jaxnerf.")
-_folder = os.path.join(sys.path[0], "")
-if _by_module and not sys.flags.safe_path and not __file__.startswith(_folder):
+_program = "".join(sys.argv[:1])
+# While `python -m` imports the packages of a module, it is "-m"; the option may be -um or without a space.
+_command = " ".join(sys.orig_argv[1:])
+_by_module = _program == "-m" and ("m jaxnerf." in _command or "mjaxnerf." in _command)
+if _by_module and not sys.flags.safe_path and not __file__.startswith(os.path.join(sys.path[0], "")):
     del sys.path[0]
-if _by_module or os.path.basename(sys.argv[0]).startswith("jaxnerf-"):
+if _by_module or os.path.basename(_program).startswith("jaxnerf-"):
     import signal
 
     from jaxnerf.runtime import failed_imports

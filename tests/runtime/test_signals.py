@@ -123,6 +123,8 @@ def test_messages_that_a_full_disk_cannot_hold_are_discarded():
     "command, ours",
     [
         (["python", "-m", "jaxnerf.train", "--workdir=run"], True),
+        (["python", "-mjaxnerf.train"], True),
+        (["python", "-um", "jaxnerf.train"], True),
         (["python", "/usr/bin/jaxnerf-eval", "--workdir=run"], True),
         (["python", "-m", "pytest", "jaxnerf.train"], False),
         (["python", "study.py", "jaxnerf-train"], False),
@@ -132,9 +134,10 @@ def test_messages_that_a_full_disk_cannot_hold_are_discarded():
 def test_importing_the_package_changes_a_handler_in_its_own_programs_only(monkeypatch, command, ours):
     signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(sys, "orig_argv", command)
-    monkeypatch.setattr(sys, "argv", command[1:] or [""])
+    by_module = len(command) > 1 and command[1].startswith("-")
+    monkeypatch.setattr(sys, "argv", ["-m"] if by_module else command[1:])
     monkeypatch.setattr(sys, "path", ["/a/strangers/folder", *sys.path])
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
     importlib.reload(quiet_start)
-    assert ("/a/strangers/folder" not in sys.path) == (ours and "-m" in command)
+    assert ("/a/strangers/folder" not in sys.path) == (ours and by_module)
     assert (signal.getsignal(signal.SIGINT) is signal.SIG_DFL) == ours
