@@ -153,11 +153,11 @@ def detect_formats(folder: str | os.PathLike) -> list[str]:
     if not found:
         check_complete(folder)
         places = [place for place in (folder, folder / "images") if place.is_dir()]
-        photos = [place for place in places for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-        if photos:
+        folders = [place for place in places for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+        if folders:
             raise ValueError(
                 f"{folder}: holds images without cameras, expected the camera of each; find them with "
-                f"jaxnerf-cameras --images={photos[0]} --out=DATASET, and give that folder"
+                f"jaxnerf-cameras --images={folders[0]} --out=DATASET, and give that folder"
             )
         raise ValueError(
             f"{folder}: holds no dataset, expected transforms_train.json (Blender), transforms.json, a COLMAP "
