@@ -10,24 +10,9 @@ from absl import flags
 from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
 
-
-def _option_names():
-    from jaxnerf.training.config import option_names
-
-    return option_names()
-
-
-def _load_saved(path):
-    from jaxnerf.training.workdir import load_config_dict
-
-    return load_config_dict(path)
-
-
-_CONFIG = cli.define_config(
+_CONFIG = run_flags.define_config(
     "A config that replaces the workdir's: a name, or the path of a file. When it is not given, flags such as "
     "--config.eval.chunk=4096 change the workdir's.",
-    load_saved=_load_saved,
-    option_names=_option_names,
 )
 _RUN = run_flags.define("scored", "uncertainty/NNN.tiff and compares it with the true errors")
 _SPLIT = flags.DEFINE_string("split", None, "The split of the dataset. It overrides config.eval.split.")

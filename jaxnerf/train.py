@@ -10,13 +10,8 @@ import sys
 
 from absl import flags
 
+from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
-
-
-def _load_saved(path):
-    from jaxnerf.training.workdir import load_config_dict
-
-    return load_config_dict(path)
 
 
 def _describe_options():
@@ -25,17 +20,9 @@ def _describe_options():
     return options_page()
 
 
-def _option_names():
-    from jaxnerf.training.config import option_names
-
-    return option_names()
-
-
-_CONFIG = cli.define_config(
+_CONFIG = run_flags.define_config(
     "The config of the run: a name, or the path of a file. When it is not given, the workdir's.",
-    load_saved=_load_saved,
     describe_options=_describe_options,
-    option_names=_option_names,
 )
 _WORKDIR = flags.DEFINE_string(
     "workdir", None, "The run's folder. Training resumes if the folder holds a run.", required=True
@@ -85,7 +72,7 @@ _VIEWER_PORT = flags.DEFINE_integer("viewer_port", 8080, "The viewer's port; 0: 
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.evaluation.evaluate import train_many, train_observed
+    from jaxnerf.evaluation.evaluate import train_and_evaluate, train_many
     from jaxnerf.runtime import processes
 
     if _CONFIG.value is None:
@@ -106,7 +93,7 @@ def main(argv):
     ):
         with _viewer(processes.is_first()) as observe:
             if _SEEDS.value is None:
-                finished = train_observed(config, _WORKDIR.value, observe=observe)
+                finished = train_and_evaluate(config, _WORKDIR.value, observe=observe)
             else:
                 finished = train_many(*_runs_of_seeds(config, _SEEDS.value, _WORKDIR.value))
     if not finished:

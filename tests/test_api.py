@@ -66,7 +66,7 @@ SURFACE = {
     "still_life": "x viewdirs |",
     "load_scene": "workdir |",
     "restore_run": "workdir config=None | data_dir=None settings=None",
-    "train_and_evaluate": "config workdir | views=None",
+    "train_and_evaluate": "config workdir | views=None observe=None",
     "train_many": "configs workdirs |",
     "register_field": "name make | options=None",
     "register_sampler": "name make | options=None",

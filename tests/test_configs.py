@@ -11,7 +11,7 @@ from ml_collections import ConfigDict
 from jaxnerf import Camera, Views
 from jaxnerf.data import dataset, synthetic
 from jaxnerf.data.dataset import DataOptions
-from jaxnerf.options import replaced
+from jaxnerf.options import AUTO, replaced
 from jaxnerf.training.auto_config import resolve, resolve_for_device
 from jaxnerf.training.build import build
 from jaxnerf.training.config import changed, flatten, read_config, to_config_dict
@@ -154,6 +154,13 @@ def test_learning_rate_decays_exponentially():
 def test_invalid_value_is_an_error(field, value, message):
     with pytest.raises(ValueError, match=message):
         build(changed(resolved(load("smoke")), {field: value}))
+
+
+@pytest.mark.parametrize("kind, name", [("field", "field"), ("sampler", "sampler"), ("loss", "losses.voxels")])
+def test_a_part_that_is_not_registered_is_an_error_before_the_dataset_is_read(kind, name):
+    values = {name: 1.0 if kind == "loss" else "voxels", "data.format": AUTO, "data.dir": "nowhere"}
+    with pytest.raises(ValueError, match=f"there is no {kind} 'voxels'"):
+        resolve(changed(read_config(load("smoke")), values))
 
 
 def test_unresolved_config_is_an_error():

@@ -28,6 +28,7 @@ from jaxnerf.evaluation.supersampling import rays_per_side_of_views, render_pixe
 from jaxnerf.runtime import atomic_files, devices, memory, processes, shards, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.training import metric_log
+from jaxnerf.training.auto_config import with_registered_parts
 from jaxnerf.training.build import load_split
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, read_config
@@ -37,13 +38,20 @@ from jaxnerf.training.state import TrainState
 _REMEDY = "give --overwrite without --shard, or remove it"
 
 
-def train_and_evaluate(config: Config, workdir: str | os.PathLike, *, views: Views | None = None) -> bool:
+def train_and_evaluate(
+    config: Config,
+    workdir: str | os.PathLike,
+    *,
+    views: Views | None = None,
+    observe: Callable[[TrainState, Views], None] | None = None,
+) -> bool:
     """Trains as a config says, from the last checkpoint in a workdir if there is one, and scores the result.
 
     Args:
         config: as a config file returns it, such as `jaxnerf.configs.default.get_config()`.
         workdir: made if missing.
         views: of the split "train" where they have been read.
+        observe: called after each step, see `loop.train`.
 
     Returns:
         Whether training, and with `eval.at_end` the evaluation, are complete. False: stopped by Ctrl-C or
@@ -53,7 +61,9 @@ def train_and_evaluate(config: Config, workdir: str | os.PathLike, *, views: Vie
         ValueError: on bad input, when another process trains in the workdir, or when too many steps in a row
             were not finite.
     """
-    return train_observed(config, workdir, views=views)
+    previews = Previews(workdir)
+    at_end = functools.partial(_finish, config, workdir, previews=previews)
+    return train(config, workdir, views=views, preview=previews.write, at_end=at_end, observe=observe)
 
 
 def train_many(configs: Sequence[Config], workdirs: Sequence[str | os.PathLike]) -> bool:
@@ -77,7 +87,7 @@ def train_many(configs: Sequence[Config], workdirs: Sequence[str | os.PathLike])
         raise ValueError(f"{len(configs)} configs and {len(workdirs)} workdirs, expected a workdir for each run")
     if len({pathlib.Path(folder).resolve() for folder in workdirs}) < len(workdirs):
         raise ValueError(f"workdirs {', '.join(map(str, workdirs))}: two are the same, expected one for each run")
-    configs, data, views = [read_config(config) for config in configs], None, None
+    configs, data, views = [with_registered_parts(read_config(config)) for config in configs], None, None
     with devices.shared_steps():
         for config, workdir in zip(configs, workdirs, strict=True):
             if config.data != data:
@@ -85,19 +95,6 @@ def train_many(configs: Sequence[Config], workdirs: Sequence[str | os.PathLike])
             if not train(config, workdir, views=views, at_end=functools.partial(_finish, config, workdir)):
                 return False
     return True
-
-
-def train_observed(
-    config: Config,
-    workdir: str | os.PathLike,
-    *,
-    views: Views | None = None,
-    observe: Callable[[TrainState, Views], None] | None = None,
-) -> bool:
-    """Does what `train_and_evaluate` does, and calls a function after each step; see `loop.train`."""
-    previews = Previews(workdir)
-    at_end = functools.partial(_finish, config, workdir, previews=previews)
-    return train(config, workdir, views=views, preview=previews.write, at_end=at_end, observe=observe)
 
 
 def _finish(config, workdir, views, previews=None):
@@ -268,30 +265,31 @@ def _score_views(run, render, views, sides, folder, shard, predictor):
     sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
     readable = output_images.readable(files, sizes, is_valid=aggregate.is_finished)
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
-    progress, first = stages.Progress(len(frames), show=processes.is_first()), True
-    for done, index in enumerate(todo, len(frames) - len(todo) + 1):
-        name, (height, width) = views.names[index], (int(value) for value in views.size[index])
-        pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
-        started = time.perf_counter()
-        image, depth = jax.block_until_ready(render(index, pixels, side=int(sides[index])))
-        seconds = time.perf_counter() - started
-        truth = views.image(index)
-        row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
-        if (sides > run.experiment.config.train.rays_per_side).any():
-            plain = image_metrics(render(index, pixels, side=1)[0].rgb, truth, pixel_mask(views, index))
-            row |= {"rays_per_pixel": int(sides[index]) ** 2}
-            row |= {f"{name}_one_ray": plain[name] for name in ("psnr", "ssim")}
-        if predictor is not None:
-            masks = pixel_mask(views, index), object_mask(views, index)
-            rays = run.experiment.view_rays(views, index, pixels)
-            error, figures = predictor.scored(rays, image.rgb, truth, *masks)
-            output_images.write_error(folder, f"{index:03d}", error)
-            row |= figures
-        output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
-        aggregate.mark_finished(folder, index, row, truth, image, count=count, first=first)
-        progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
-        first = False
-    progress.close()
+    first = True
+    with stages.Progress("scoring images", len(frames), processes.is_first()) as progress:
+        for done, index in enumerate(todo, len(frames) - len(todo) + 1):
+            progress.done = done - 1
+            name, (height, width) = views.names[index], (int(value) for value in views.size[index])
+            pixels = pixel_grid(height, width, offset=run.experiment.config.data.pixel_offset)
+            started = time.perf_counter()
+            image, depth = jax.block_until_ready(render(index, pixels, side=int(sides[index])))
+            seconds = time.perf_counter() - started
+            truth = views.image(index)
+            row = {"name": name, **image_metrics(image.rgb, truth, pixel_mask(views, index)), "seconds": seconds}
+            if (sides > run.experiment.config.train.rays_per_side).any():
+                plain = image_metrics(render(index, pixels, side=1)[0].rgb, truth, pixel_mask(views, index))
+                row |= {"rays_per_pixel": int(sides[index]) ** 2}
+                row |= {f"{name}_one_ray": plain[name] for name in ("psnr", "ssim")}
+            if predictor is not None:
+                masks = pixel_mask(views, index), object_mask(views, index)
+                rays = run.experiment.view_rays(views, index, pixels)
+                error, figures = predictor.scored(rays, image.rgb, truth, *masks)
+                output_images.write_error(folder, f"{index:03d}", error)
+                row |= figures
+            output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
+            aggregate.mark_finished(folder, index, row, truth, image, count=count, first=first)
+            progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
+            first = False
 
 
 def watch(
@@ -329,24 +327,16 @@ def watch(
             except ValueError:
                 if new[0] in run.steps():  # otherwise training has deleted it as too old, which is no error
                     raise
-        elif _has_ended(run.experiment.config.train, steps, workdir):
+        elif metric_log.has_ended(run.experiment.config.train, steps, workdir):
             return
         else:
             said = _wait(f"{workdir}: no new checkpoint", said, poll_seconds)
-
-
-def _has_ended(options, steps, workdir):
-    """Returns whether the last of these checkpoints is the training's last, by its steps or by its clock."""
-    if not steps:
-        return False
-    rows = metric_log.read_rows(workdir)
-    late = rows and rows[-1]["step"] == steps[-1] and 0 < options.max_seconds <= rows[-1]["seconds"]
-    return steps[-1] >= options.max_steps or bool(late)
 
 
 def _wait(text, said, seconds):
     """Sleeps, after printing the text unless it was printed last; returns the text."""
     if text != said:
         print(f"{text}; checking again every {seconds:g} s", file=sys.stderr, flush=True)
-    time.sleep(seconds)
+    with stages.stage(""):
+        time.sleep(seconds)
     return text

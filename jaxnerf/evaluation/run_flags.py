@@ -56,6 +56,22 @@ class RunFlags(NamedTuple):
         return requested(self.uncertainty.value, self.workdir.value, **options)
 
 
+def define_config(help: str, **options: Any) -> flags.FlagHolder:
+    """Defines --config of a run, which takes the config.json of one, too; options: of `cli.define_config`."""
+
+    def load_saved(path):
+        from jaxnerf.training.workdir import load_config_dict
+
+        return load_config_dict(path)
+
+    def option_names():
+        from jaxnerf.training.config import option_names
+
+        return option_names()
+
+    return cli.define_config(help, load_saved=load_saved, option_names=option_names, **options)
+
+
 def define(done: str, written: str, *, required: bool = False) -> RunFlags:
     """Defines the flags.
 

@@ -90,6 +90,7 @@ def run(
         _leave(1, error)
     except KeyboardInterrupt as interrupt:
         code = 128 + (interrupt.args or (signal.SIGINT,))[0]
+        stages.show(False)
         if callable(stopped):
             stopped = stopped() if flags.FLAGS.is_parsed() else "before anything was read"
         print(f"stopped {stopped}", file=sys.stderr)
@@ -98,6 +99,7 @@ def run(
         # A regular exit would destroy what threads of XLA still use, which can end in a segmentation fault.
         os._exit(code)
     finally:  # all is done: a signal while Python shuts down prints nothing
+        stages.show(False)
         signals.handle(lambda number, _: os._exit(128 + number))
 
 

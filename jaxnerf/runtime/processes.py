@@ -187,7 +187,8 @@ def print_once(*lines: str) -> None:
     """Prints lines to stderr, in the first process only."""
     chosen = [line for line in lines if not isinstance(line, Detail) or prints_details()]
     if chosen and is_first():
-        print(*chosen, sep="\n", file=sys.stderr)
+        with stages.room():
+            print(*chosen, sep="\n", file=sys.stderr)
 
 
 def any_of(flag: bool, step: int = 0) -> bool:

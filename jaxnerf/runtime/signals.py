@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Any, TextIO
 
+from jaxnerf.runtime import stages
 from jaxnerf.runtime.printed_text import printable
 
 _GONE = (errno.EPIPE, errno.EIO, errno.EBADF)  # what writing to a closed pipe, terminal or file raises
@@ -84,7 +85,8 @@ class _Output:
 
     def write(self, text: str) -> int:
         """Writes a text."""
-        return self.write_as_is(printable(text, "\n\t"))
+        with stages.room(text):
+            return self.write_as_is(printable(text, "\n\t"))
 
     def writelines(self, lines: Iterable[str]) -> None:
         """Writes several texts."""

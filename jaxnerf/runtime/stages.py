@@ -1,124 +1,164 @@
 """Says on stderr what a program is doing, and how far it is.
 
-On a terminal a line takes the place of the one before; a log file gets all of them.
+Each second a thread looks at the stages that are running. On a terminal it rewrites one line. A log file gets a line
+for each stage that lasts, and another for each further minute.
 """
 
 import contextlib
+import math
+import shutil
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from typing import TextIO
+from collections.abc import Iterator, Sequence
+from typing import Any
 
-_FIRST, _EVERY = 2.0, 4.0  # seconds after which a stage says something, and between further lines
+from jaxnerf.runtime.printed_text import printable
+
+_EVERY = 1.0  # seconds between lines of a terminal
+_FIRST, _AGAIN = 4.0, 60.0  # seconds after which a log file gets a stage's line, and the next one
+_now = time.monotonic
 _shown = False  # whether a program has asked for it: who imports the functions gets no output
 _running: list["Stage"] = []
+_said: dict[str, float] = {}  # when a log file got the line of a stage
+_lock = threading.RLock()  # held while something is written
+_replaceable = _unfinished = False  # whether the terminal's last line shows a stage, or is other text without its end
 
 
 class Stage:
-    """A stage of a program's work; see `stage`."""
+    """A stage of a program's work, for a `with` statement. Of stages within stages the line shows all."""
+
+    shown, unsaid = True, False  # whether it is shown; whether it has a result that no line has kept
 
     def __init__(self, text: str, note: str = ""):
-        self.text, self._note, self._started = text, note, time.perf_counter()
-        self._done, self._total = 0, 0
+        """Takes what is done, or "" while the program waits and nothing is shown, and a note about it."""
+        self.name, self.text, self._note, self.started = text, text, note, _now()
+        self.done, self._total = 0, 0
+
+    def __enter__(self) -> Any:
+        self.started = _now()
+        _running.append(self)
+        return self
+
+    def __exit__(self, *_) -> None:
+        _running.remove(self)
+        _between.started = _now()
 
     def update(self, done: int, total: int) -> None:
         """Records how much of the stage is done, for the next line."""
-        self._done, self._total = done, total
+        self.done, self._total = done, total
 
-    def line(self) -> str:
-        """Returns what the stage is doing, since when, and how far it is."""
-        seconds = f"for {time.perf_counter() - self._started:.0f} s"
-        done = f", {self._done:,} of {self._total:,} done" if self._total else ""
-        return f"working       {self.text} {seconds}{done}{self._note}"
+    def part(self, seconds: str = "") -> str:
+        """Returns what the stage does and how far it is."""
+        done = f", {self.done:,} of {self._total:,} done" if self._total else ""
+        return f"{self.text}{seconds}{done}{self._note}"
+
+    def head(self) -> str:
+        """Returns how the line begins if no other stage contains this one."""
+        return "working       " + self.part(f" for {_now() - self.started:.0f} s")
+
+
+class Progress(Stage):
+    """A stage of steps that have results: a bar on a terminal, where the last result stays."""
+
+    def __init__(self, text: str, steps: int | None, shown: bool = True):
+        """Takes what is said until there is a result, the number of steps if it is known, and whether to show it."""
+        super().__init__(text)
+        self._steps, self.shown, self._fraction = steps, shown, 0.0
+
+    def __exit__(self, *error) -> None:
+        super().__exit__(*error)
+        if self.unsaid:
+            _write([self], stays=True)
+
+    def show(self, done: int, text: str, fraction: float | None = None) -> None:
+        """Shows the result of a step as text; fraction: how much of the work is done, if not that of the steps."""
+        self.done, self.text, self.unsaid = done, text, self.shown
+        self._fraction = min(done / self._steps if fraction is None else fraction, 1.0)
+        if self.shown and (sys.stderr.isatty() or _is_due([self])):
+            _write([self])
+
+    def head(self) -> str:
+        text = f"{self.done}/{self._steps}  {self.text}" if self._steps else f"{self.done}  {self.text}"
+        bar = f"[{'#' * int(24 * self._fraction):<24}] {100 * self._fraction:3.0f} %  "
+        return bar + text if sys.stderr.isatty() and len(bar + text) < shutil.get_terminal_size().columns else text
+
+
+_between = Stage("preparing")  # what a program does outside of its stages
+stage = Stage
 
 
 def show(shown: bool = True) -> None:
     """Sets whether the stages of this process are shown."""
     global _shown
+    if shown and not _shown:
+        threading.Thread(target=_watch, name="stages", daemon=True).start()
     _shown = shown
+    with room():  # without the last line
+        pass
 
 
 def innermost() -> str | None:
-    """Returns what the innermost stage of a program is doing; None between stages, and where nothing is shown."""
+    """Returns what the innermost stage of a program is doing; None between stages."""
     running = _running[-1:]
     return running[0].text if running else None
 
 
 @contextlib.contextmanager
-def stage(text: str, note: str = "") -> Iterator[Stage]:
-    """Shows a stage of work on stderr after two seconds, and again every four seconds until it ends.
+def room(text: str = "\n") -> Iterator[None]:
+    """Clears the line of the terminal that shows a stage, for a text that is written before the next such line."""
+    global _replaceable, _unfinished
+    with _lock:
+        if _replaceable:
+            _replaceable = False
+            getattr(sys.stderr, "write_as_is", sys.stderr.write)("\r\033[K")
+            sys.stderr.flush()
+        _unfinished = not text.endswith("\n") if text else _unfinished
+        yield
 
-    On a terminal the line disappears in the end. Of stages within stages the innermost is shown. Nothing is shown
-    unless the program has called `show`.
 
-    Args:
-        text: what is done, such as "reading images".
-        note: what follows the line, such as how long it took the last time.
-    """
-    current, ended = Stage(text, note), threading.Event()
-    if not _shown:
-        yield current
+def tick() -> None:
+    """Writes the line about the stages that are running, if it is due."""
+    running = _running[:] or [_between]
+    waits, running = not running[-1].text, [each for each in running if each.text]
+    if waits or not running[0].shown:
         return
-
-    def report():
-        wait, wrote = _FIRST, False
-        while not ended.wait(wait):
-            wait = _EVERY
-            if _shown and _running and _running[-1] is current:
-                wrote = sys.stderr.isatty()
-                _write(sys.stderr, current.line())
-        if wrote:
-            _write(sys.stderr, "")
-
-    _running.append(current)
-    thread = threading.Thread(target=report, name="stage", daemon=True)
-    thread.start()
-    try:
-        yield current
-    finally:
-        _running.remove(current)
-        ended.set()
-        thread.join()
-
-
-class Progress:
-    """Work of a known number of steps: a bar on a terminal, plain lines in a log file."""
-
-    def __init__(self, total: int | None, stream: TextIO | None = None, show: bool = True):
-        self._total, self._stream, self._shown = total, stream or sys.stderr, show
-        self._terminal = show and self._stream.isatty()
-
-    def show(self, done: int, text: str, fraction: float | None = None) -> None:
-        """Shows how many of the total steps are done, followed by a text.
-
-        Args:
-            done: steps.
-            text: what follows.
-            fraction: which part of the work is done, if not that of the steps.
-        """
-        if not self._shown:
+    if not sys.stderr.isatty():
+        least = _AGAIN if running[0] is _between else _FIRST
+        running = [each for each in running if _now() - each.started >= least]
+        if running and isinstance(running[0], Progress):  # its results are enough
+            running = running[:1]
+        if not running or not _is_due(running):
             return
-        fraction = min(done / self._total if fraction is None else fraction, 1.0)
-        steps = f"{done}/{self._total}" if self._total else f"{done}"
-        bar = f"[{'#' * int(24 * fraction):<24}] {100 * fraction:3.0f} %"
-        _write(self._stream, f"{bar if self._terminal else steps}  {text}")
-
-    def note(self, *lines: str) -> None:
-        """Prints lines of their own, above the bar."""
-        for line in lines if self._shown else ():
-            _write(self._stream, line, stays=True)
-
-    def close(self) -> None:
-        """Ends the line of the bar."""
-        if self._terminal:
-            self._stream.write("\n")
+    _write(running)
 
 
-def _write(stream, line, *, stays=False):
-    """Writes a line in place of the one before on a terminal; stays: whether the next one leaves it there."""
-    terminal = stream.isatty()
-    if terminal:
-        getattr(stream, "write_as_is", stream.write)("\r\033[K")
-    stream.write(line + ("" if terminal and not stays else "\n"))
-    stream.flush()
+def _watch():
+    while _shown:
+        time.sleep(_EVERY)
+        if _shown:
+            tick()
+
+
+def _is_due(running: Sequence[Stage]) -> bool:
+    """Returns whether a log file gets a line about stages within each other; it then counts as written."""
+    name = ": ".join(each.name for each in running)
+    if _now() - _said.get(name, -math.inf) < _AGAIN:
+        return False
+    _said[name] = _now()
+    return True
+
+
+def _write(running, *, stays=False):
+    """Writes the line about stages within each other. On a terminal the next one replaces it, unless it stays."""
+    global _replaceable, _unfinished
+    replaceable = sys.stderr.isatty() and not stays
+    line = ": ".join([running[0].head(), *(each.part() for each in running[1:])])
+    line = printable(line)[: shutil.get_terminal_size().columns - 1] if replaceable else line + "\n"
+    with _lock:
+        if not (_unfinished and replaceable):
+            with room():
+                sys.stderr.write(line)
+                sys.stderr.flush()
+                _replaceable, _unfinished = replaceable, False
+                running[0].unsaid &= replaceable

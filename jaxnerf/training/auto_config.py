@@ -56,7 +56,7 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     Raises:
         ValueError: names the option or file, what was found and what is expected.
     """
-    config = read_config(config)
+    config = with_registered_parts(read_config(config))
     device = Device(platform or jax.default_backend(), jax.process_count())
     data, lines, capture = dataset.resolve(config.data)
     if views is None:
@@ -99,6 +99,14 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     if views.time is not None and "time" not in build_model(resolve_for_device(config, training=False)[0]).needs:
         lines.append(f"time          {TIME_UNUSED}")
     return Resolved(config, views, lines + more + near)
+
+
+def with_registered_parts(config: RunConfig) -> RunConfig:
+    """Returns the config; raises a ValueError if its field, its sampler or a loss with a weight is not registered."""
+    losses = [(LOSSES, name) for name, weight in config.losses.items() if weight != 0]
+    for registry, name in ((FIELDS, config.field), (SAMPLERS, config.sampler), *losses):
+        registry.get(name)
+    return config
 
 
 def resolve_for_device(

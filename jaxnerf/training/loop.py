@@ -49,8 +49,7 @@ def train(
         Whether training, and at_end, have completed. False: stopped by a signal and saved.
 
     Raises:
-        ValueError: on bad input, when another process trains in the workdir, or when too many steps in a row
-            were not finite.
+        ValueError: as `train_and_evaluate`.
     """
     started = time.perf_counter()
     with stages.stage("reading the dataset"):
@@ -77,7 +76,12 @@ def train(
                 f"settings      {hidden} more values are inferred; --verbosity=1 prints them with their reasons"
             )
         processes.print_once(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
-        finished = run_training(experiment, views, folder, preview=preview, observe=observe)
+        steps = Checkpoints(folder).steps()
+        finished = processes.any_of(metric_log.has_ended(options, steps, folder))
+        if finished:
+            processes.print_once(f"steps         {metric_log.of_all(steps[-1], options)} done, so training is complete")
+        else:
+            finished = run_training(experiment, views, folder, preview=preview, observe=observe)
         memory.release()
         return finished and (at_end is None or at_end(views))
 
@@ -100,19 +104,20 @@ def run_training(
     done = int(state.step)
     log = metric_log.MetricLog(folder, first_step=done, write=processes.is_first())
     processes.print_once(*unreadable, *metric_log.header(experiment, views, state, compiled))
-    progress = stages.Progress(metric_log.all_steps(options), show=processes.is_first())
+    progress = stages.Progress("training", metric_log.all_steps(options), processes.is_first())
     previews = PreviewTimes(options.preview_every if preview else 0.0, log.seconds)
     clock = Clock(log.seconds, done * options.batch_size - int(state.counters.get("rays_dropped", 0)))
     pace = Pace(options, clock, compiled.data)
     recent = []  # metrics since the last row of the log
     last = processes.any_of(done >= options.max_steps or 0 < options.max_seconds <= log.seconds)
-    with signals.Interrupt() as interrupt:
+    with signals.Interrupt() as interrupt, progress:
         while not last:
             count = compiled.count_after(done)
             with clock.paused():
                 take_steps = compiled.of(count)
             state, metrics = take_steps(state, pace.data_of(done + 1))
             done += count
+            progress.done = done
             state, metrics = reinitialize_dead(done, state, metrics)
             if observe is not None:
                 observe(state, views)
@@ -137,8 +142,8 @@ def run_training(
             if not last and processes.any_of(previews.is_due(clock.seconds()), done):
                 jax.block_until_ready(state)  # its step counts
                 with clock.paused(), previews.timed(clock.seconds()):
-                    progress.note(preview(state, views))
-    for part in (progress, checkpoints, log):
+                    processes.print_once(preview(state, views))
+    for part in (checkpoints, log):
         part.close()
     interrupted = processes.any_of(interrupt.caught)
     if interrupted:

@@ -222,6 +222,13 @@ def row(
     }
 
 
+def has_ended(options: Any, steps: list[int], workdir: str | os.PathLike) -> bool:
+    """Returns whether the last of a run's checkpoints is that of its end, by its steps or by its clock."""
+    rows = read_rows(workdir) if steps else []
+    late = rows and rows[-1]["step"] == steps[-1] and 0 < options.max_seconds <= rows[-1]["seconds"]
+    return bool(steps) and (steps[-1] >= options.max_steps or bool(late))
+
+
 def all_steps(options: Any) -> int | None:
     """Returns the number of steps of a run, or None if only train.max_seconds limits it; options: section `train`."""
     return None if options.max_seconds and options.max_steps >= UNLIMITED_STEPS else options.max_steps

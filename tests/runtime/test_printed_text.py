@@ -42,7 +42,8 @@ def test_every_way_out_of_a_program_is_cleaned(tmp_path):
         "import logging, sys, warnings\nfrom jaxnerf.runtime import cli, stages\n\n\ndef main(argv):\n"
         f"    text = {HOSTILE!r}\n    print(text)\n    print(text, file=sys.stderr)\n"
         "    logging.getLogger('jaxnerf').warning(text)\n    warnings.warn(text)\n"
-        "    stages.Progress(1).note(text)\n    raise ValueError(text)\n\n\ncli.run(main)\n"
+        "    with stages.Progress(text, 1) as progress:\n        progress.show(1, text)\n"
+        "    raise ValueError(text)\n\n\ncli.run(main)\n"
     )
     code, out, err = run_forked(program, folder=tmp_path)
     assert code == 1 and out == f"{printable(HOSTILE)}\n"

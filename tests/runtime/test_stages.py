@@ -1,66 +1,101 @@
 """What a program says while a stage of its work takes long."""
 
-import re
-import time
+import io
+import sys
 
 import pytest
 
 import captures
 from jaxnerf.evaluation.evaluate import train_and_evaluate
-from jaxnerf.runtime import processes, stages
+from jaxnerf.runtime import processes, signals, stages
 from runs import PACKED, smoke_config
 
 pytest_plugins = ["run_fixtures"]
 
 
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
 @pytest.fixture
-def shown(monkeypatch):
-    monkeypatch.setattr(stages, "_FIRST", 0.02)
-    monkeypatch.setattr(stages, "_EVERY", 0.02)
-    stages.show()
-    yield
-    stages.show(False)
+def clock(monkeypatch):
+    """Sets the seconds that have passed, and lets the thread's part be called by hand."""
+    now = [0.0]
+    for name, value in {"_shown": True, "_now": lambda: now[0], "_running": [], "_said": {}}.items():
+        monkeypatch.setattr(stages, name, value)
+    monkeypatch.setattr(stages._between, "started", 0.0)
+
+    def pass_seconds(seconds):
+        for _ in range(seconds):
+            now[0] += 1
+            stages.tick()
+
+    return pass_seconds
 
 
-def wait_for(capsys, pattern):
-    """Waits until the errors hold a pattern, and returns them."""
-    found, deadline = "", time.monotonic() + 60
-    while not re.search(pattern, found):
-        assert time.monotonic() < deadline, found
-        time.sleep(0.01)
-        found += capsys.readouterr().err
-    return found
-
-
-def test_a_stage_says_what_it_does_and_how_far_it_is(shown, capsys):
-    with stages.stage("reading images", "; 9 s the last time") as stage:
-        wait_for(capsys, r"working       reading images for 0 s; 9 s the last time\n")
+def test_a_log_file_gets_a_line_for_each_stage_that_lasts_and_one_for_each_further_minute(clock, capsys):
+    with stages.stage("reading the dataset"), stages.stage("reading images", "; 9 s the last time") as stage:
+        clock(3)
+        assert capsys.readouterr().err == ""
+        clock(1)
         stage.update(1200, 3000)
-        wait_for(capsys, r"reading images for 0 s, 1,200 of 3,000 done; 9 s the last time\n")
-        with stages.stage("compiling"):
-            wait_for(capsys, "compiling for")
-            capsys.readouterr()
-            time.sleep(0.1)
-            assert "reading" not in capsys.readouterr().err
-        wait_for(capsys, "reading images for")
-    capsys.readouterr()
-    time.sleep(0.1)
+        clock(120)
+    with stages.stage("compiling"):
+        clock(3)
+    shown = "working       reading the dataset for %d s: reading images%s; 9 s the last time\n"
+    done = ", 1,200 of 3,000 done"
+    assert capsys.readouterr().err == shown % (4, "") + shown % (64, done) + shown % (124, done)
+    clock(59)
+    with stages.stage(""):  # it waits
+        clock(300)
     assert capsys.readouterr().err == ""
+    clock(60)
+    assert capsys.readouterr().err == "working       preparing for 60 s\n"
 
 
-def test_a_terminal_shows_one_line_that_disappears(shown, capsys, monkeypatch):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    with pytest.raises(KeyError), stages.stage("reading images"):
-        found = wait_for(capsys, "reading images for 0 s")
-        raise KeyError
-    assert "\n" not in found
-    assert capsys.readouterr().err.endswith("\r\033[K")
+def test_a_log_file_gets_the_first_result_one_a_minute_and_the_last(clock, capsys):
+    with stages.Progress("scoring", 200) as progress, stages.stage("rendering an image"):
+        clock(4)
+        for done in range(1, 131):
+            clock(1)
+            progress.show(done, f"view {done}")
+    found = capsys.readouterr().err.splitlines()
+    assert found == ["0/200  scoring", "59/200  view 59", "119/200  view 119", "130/200  view 130"]
+
+
+def test_a_terminal_has_one_line_that_is_rewritten_each_second(clock, monkeypatch):
+    monkeypatch.setattr("sys.stderr", signals._Output(stream := Terminal()))
+    monkeypatch.setenv("COLUMNS", "60")
+    with stages.Progress("training", 200) as progress:
+        progress.done = 9
+        clock(1)
+        progress.show(100, "20 dB\x07")
+        with stages.stage("saving the checkpoint"):
+            clock(2)
+            print("a line of its own", file=sys.stderr)
+        with pytest.raises(KeyError), stages.stage("reading " + 60 * "x"):
+            raise KeyError
+    bars = [f"[{marks:<24}] {percent:3d} %  " for marks, percent in (("", 0), (12 * "#", 50))]
+    saving = f"{bars[1]}100/200  20 dB\\x07: saving the checkpoint"[:59]
+    lines = [f"{bars[0]}9/200  training", f"{bars[1]}100/200  20 dB\\x07", saving, saving, "a line of its own\n"]
+    assert stream.getvalue().split("\r\033[K") == [*lines[:-1], f"{lines[-1]}{bars[1]}100/200  20 dB\\x07\n"]
+
+
+def test_a_line_of_a_stage_does_not_end_up_in_text_that_is_being_written(clock, monkeypatch):
+    monkeypatch.setattr("sys.stderr", signals._Output(stream := Terminal()))
+    sys.stderr.write("half")
+    clock(1)
+    sys.stderr.write(" a line\n")
+    clock(1)
+    stages.show(False)
+    assert stream.getvalue() == "half a line\nworking       preparing for 2 s\r\033[K"
 
 
 def test_who_imports_the_functions_gets_no_output(monkeypatch, capsys):
-    monkeypatch.setattr(stages, "_FIRST", 0.0)
+    monkeypatch.setattr(stages.threading, "Thread", None)  # nothing would start one
     with stages.stage("reading images"):
-        time.sleep(0.05)
+        assert not stages._shown
     assert capsys.readouterr().err == ""
 
 

@@ -1,6 +1,5 @@
 """Rows of metrics, and the lines that a run prints."""
 
-import io
 import types
 
 import numpy as np
@@ -65,23 +64,12 @@ def test_line_reports_what_went_wrong():
     )
 
 
-def test_a_note_is_a_line_above_the_bar():
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    for stream, expected in ((Terminal(), "\r\033[Ka\n\r\033[Kb\n"), (io.StringIO(), "a\nb\n")):
-        stages.Progress(10, stream).note("a", "b")
-        assert stream.getvalue() == expected
-        stages.Progress(10, stream, show=False).note("c")
-        assert stream.getvalue() == expected
-
-
 @pytest.mark.parametrize("max_steps, shown, done", [(100, "20/100  text\n", 0.5), (UNLIMITED_STEPS, "20  text\n", 0.5)])
-def test_progress_of_a_run_of_limited_time(max_steps, shown, done):
+def test_progress_of_a_run_of_limited_time(max_steps, shown, done, capsys):
     """Its part is that of the time, and the number of steps is shown only if it may end the run."""
-    train, stream = types.SimpleNamespace(batch_size=64, max_steps=max_steps, max_seconds=10.0), io.StringIO()
-    stages.Progress(metric_log.all_steps(train), stream).show(20, "text", 0.5)
-    assert stream.getvalue() == shown
+    train = types.SimpleNamespace(batch_size=64, max_steps=max_steps, max_seconds=10.0)
+    with stages.Progress("training", metric_log.all_steps(train)) as progress:
+        progress.show(20, "text", 0.5)
+    assert capsys.readouterr().err == shown
     assert metric_log.fraction_done(row([{}]), train) == done
     assert metric_log.of_all(20, train) == ("20 of 100" if max_steps == 100 else "20")

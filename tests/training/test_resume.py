@@ -14,7 +14,7 @@ from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.options import AUTO, Changes, values_of
-from jaxnerf.training import earlier_options, metric_log, workdir
+from jaxnerf.training import earlier_options, loop, metric_log, workdir
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import read_config, to_config_dict
 from jaxnerf.training.earlier_options import Gone, Renamed
@@ -71,11 +71,12 @@ def test_last_checkpoints_are_kept(trained):
     assert logged_steps(trained) == [5, 10, 15, 20]
 
 
-def test_finished_run_does_not_change(trained, tmp_path, capsys):
+def test_finished_run_does_not_change_and_is_not_compiled(trained, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(loop, "compile_training", None)
     folder = shutil.copytree(trained, tmp_path / "run")
     before = variables(folder, 20)
     assert train_and_evaluate(smoke_config(), folder)
-    assert "20 of 20 done" in capsys.readouterr().err
+    assert "20 of 20 done, so training is complete\n" in capsys.readouterr().err
     assert Checkpoints(folder).steps() == [10, 15, 20]
     assert logged_steps(folder) == [5, 10, 15, 20]
     assert_equal(variables(folder, 20), before)

@@ -172,16 +172,17 @@ def _write_frames(target, shown, output):
     frames = shards.indices_of(range(len(files)), output.shard)
     readable = output_images.readable([files[index] for index in frames], [(path.height, path.width)] * len(frames))
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
-    progress, compiled = Progress(len(frames)), None
-    for done, (index, planes) in enumerate(_planes(shown, todo, rgba=output.rgba), len(frames) - len(todo) + 1):
-        for file, plane in zip(files[index], planes, strict=True):
-            output_images.write_image(file, plane)
-        compiled, left = compiled or (time.monotonic(), done), ""
-        if done > compiled[1]:  # the first frame takes longer
-            seconds = (time.monotonic() - compiled[0]) / (done - compiled[1])
-            left = f", {minutes(seconds * (len(frames) - done))} left"
-        progress.show(done, f"frames of {target}{left}")
-    progress.close()
+    compiled = None
+    with Progress(f"frames of {target}", len(frames)) as progress:
+        progress.done = len(frames) - len(todo)
+        for done, (index, planes) in enumerate(_planes(shown, todo, rgba=output.rgba), len(frames) - len(todo) + 1):
+            for file, plane in zip(files[index], planes, strict=True):
+                output_images.write_image(file, plane)
+            compiled, left = compiled or (time.monotonic(), done), ""
+            if done > compiled[1]:  # the first frame takes longer
+                seconds = (time.monotonic() - compiled[0]) / (done - compiled[1])
+                left = f", {minutes(seconds * (len(frames) - done))} left"
+            progress.show(done, f"frames of {target}{left}")
     missing = sum(not all(file.is_file() for file in group) for group in files)
     if not missing:
         _write_depth_images([group[0] for group in files])

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from jaxnerf.core.cameras import project
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import Capture
+from jaxnerf.runtime import stages
 from jaxnerf.tools.capture_check.findings import Finding, axes_change, axes_name, focal_change, percent
 from jaxnerf.tools.capture_check.images import ImageSummary
 from jaxnerf.tools.capture_check.tracks import (
@@ -139,13 +140,15 @@ def judge_views(capture: Capture, evidence: Evidence) -> list[Finding]:
     An image is flagged only if another pose explains several times as many guided matches, see `view_evidence`.
     """
     views = range(len(capture.frames))
-    fit, matches = np.array([_fits(evidence, view, view) for view in views]).T
+    with stages.stage("comparing the poses with the images"):
+        fit, matches = np.array([_fits(evidence, view, view) for view in views]).T
     fraction = fit / np.maximum(matches, 1)
     usual = np.median(fraction)
     if usual < _RARE:
         return _judge_all(capture, evidence)
     odd = [view for view in views if fraction[view] < _UNUSUAL * usual and len(evidence.keypoints[view].points)]
-    found = {view: find_alternative(evidence, view, without=odd) for view in odd}
+    with stages.stage("searching other poses for images that do not fit"):
+        found = {view: find_alternative(evidence, view, without=odd) for view in odd}
     flagged = {view: other for view, other in found.items() if other and _is_certain(capture, evidence, view, other)}
     findings, left = [], set(flagged)
     for first, second in itertools.combinations(flagged, 2):

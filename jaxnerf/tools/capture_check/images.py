@@ -16,6 +16,7 @@ from jaxnerf.data.images.downscaled_copies import with_size
 from jaxnerf.data.images.image_files import open_image, read_image
 from jaxnerf.data.images.load_images import check_size, read_frame_mask
 from jaxnerf.data.readers.base import Capture, Frame
+from jaxnerf.runtime import stages
 from jaxnerf.tools.capture_check.findings import Finding, named
 
 _LONGEST = 512  # px of the reduced images, to whose pixels all pixel errors refer
@@ -65,8 +66,11 @@ def read(capture: Capture) -> tuple[list[ImageSummary | None], list[Finding]]:
         except ValueError as error:
             return None, refused(str(error), (item[0],))
 
-    with ThreadPoolExecutor(2) as pool:  # decoding and OpenCV release Python's lock
-        both = list(pool.map(one, enumerate(capture.frames)))
+    both: list = []
+    with ThreadPoolExecutor(2) as pool, stages.stage("reading images") as stage:  # OpenCV releases Python's lock
+        for found in pool.map(one, enumerate(capture.frames)):
+            both.append(found)
+            stage.update(len(both), len(capture.frames))
     return [image for image, _ in both], [finding for _, finding in both if finding]
 
 

@@ -10,7 +10,7 @@ import sys
 
 from absl import flags
 
-from jaxnerf.runtime import cli
+from jaxnerf.runtime import cli, stages
 
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. With --workdir, it overrides config.data.dir.")
 _WORKDIR = flags.DEFINE_string("workdir", None, "The folder of a trained run whose coverage is reported.")
@@ -67,7 +67,8 @@ def _check_dataset():
     check_range(0 if _NEAR.value is None else _NEAR.value, 3e38 if _FAR.value is None else _FAR.value)
     folder = dataset_folder(_DATA_DIR.value)
     camera_plot, plot = _plot_of(folder)
-    report = inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value, up=_UP.value)
+    with stages.stage("checking the dataset"):
+        report = inspect(folder, format=_FORMAT.value, near=_NEAR.value, far=_FAR.value, up=_UP.value)
     print(report.text())
     if camera_plot:
         camera_plot.save(camera_plot.plot_cameras(report), plot, folder)

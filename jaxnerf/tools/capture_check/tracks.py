@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxnerf.core.cameras import undistort
 from jaxnerf.data.readers.base import Capture
+from jaxnerf.runtime import stages
 from jaxnerf.tools.capture_check.images import ImageSummary
 
 INLIER = 2.0  # px of the reduced images: the largest error of a track that fits the cameras
@@ -135,10 +136,12 @@ def follow(
         first: these views; None: all.
     """
     parts = []
-    for view, others in zip(range(len(near)) if first is None else first, near, strict=True):
-        matches = [match(keypoints[view], keypoints[other]) for other in others]
-        indices = np.stack([np.arange(len(keypoints[view].points)), *matches], axis=1)
-        parts.append(_tracks(keypoints, (view, *others), indices[(indices >= 0).sum(axis=1) > 1]))
+    with stages.stage("matching images") as stage:
+        for view, others in zip(range(len(near)) if first is None else first, near, strict=True):
+            stage.update(len(parts), len(near))
+            matches = [match(keypoints[view], keypoints[other]) for other in others]
+            indices = np.stack([np.arange(len(keypoints[view].points)), *matches], axis=1)
+            parts.append(_tracks(keypoints, (view, *others), indices[(indices >= 0).sum(axis=1) > 1]))
     return joined(parts)
 
 

@@ -22,7 +22,7 @@ from jaxnerf.data.geometry.world import points_in_run, poses_in_file
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.output_images import to_8_bits
 from jaxnerf.evaluation.paths.camera_path import path_pixels, posed_views, resize, through_first_lens
-from jaxnerf.runtime.stages import Progress
+from jaxnerf.runtime import stages
 from jaxnerf.tools.exporters.base import ExportSource
 
 _CHUNK = 8192  # points at which the field is evaluated at once
@@ -106,32 +106,34 @@ def render_depth_images(
     run, views = source.run, source.views
     path = _poses_of(source, size, all_around)
     render = functools.partial(run.render_image, median_depth=True) if colors else _depth_renderer(run)
-    posed, images, progress = posed_views(views, path), [], Progress(len(path.poses))
+    posed, images = posed_views(views, path), []
     names = views.names or tuple(f"{index:04d}" for index in range(len(views.size)))
     names = [names[index] for index in _chosen(len(views.size), source.settings.num_views)]
     names += [None] * (len(path.poses) - len(names))
     poses = poses_in_file(path.poses, views.to_file)
     surface = _surface_function(source, posed)
-    for index, name in enumerate(names):
-        pixels = path_pixels(posed, path, index, offset=0.5)
-        rays = run.experiment.view_rays(posed, index, pixels)
-        seen = render(source.variables, rays)
-        distance, extinction, x = (np.asarray(each) for each in surface(index, pixels, seen.median_depth))
-        camera = Camera(
-            to_world=np.float32(poses[index]),
-            focal=np.float32(path.focal[index]),
-            center=np.float32(path.center[index]),
-            height=path.height,
-            width=path.width,
-        )
-        image = DepthImage(name, camera, distance, to_8_bits(seen.rgb) if colors else None, extinction, x)
-        depth = distance / np.linalg.norm(image._local(), axis=-1)
-        opacity = np.asarray(seen.opacity)
-        there = (opacity > _MIN_OPACITY) & (np.asarray(seen.median_depth) < np.asarray(rays.far)) & np.isfinite(depth)
-        depth = np.where(there, depth, np.where(opacity < _MAX_EMPTY_OPACITY, np.inf, 0)).astype(np.float32)
-        images.append(image._replace(depth=depth))
-        progress.show(index + 1, "depth images")
-    progress.close()
+    with stages.stage("rendering depth images") as stage:
+        for index, name in enumerate(names):
+            pixels = path_pixels(posed, path, index, offset=0.5)
+            rays = run.experiment.view_rays(posed, index, pixels)
+            seen = render(source.variables, rays)
+            distance, extinction, x = (np.asarray(each) for each in surface(index, pixels, seen.median_depth))
+            camera = Camera(
+                to_world=np.float32(poses[index]),
+                focal=np.float32(path.focal[index]),
+                center=np.float32(path.center[index]),
+                height=path.height,
+                width=path.width,
+            )
+            image = DepthImage(name, camera, distance, to_8_bits(seen.rgb) if colors else None, extinction, x)
+            depth = distance / np.linalg.norm(image._local(), axis=-1)
+            opacity = np.asarray(seen.opacity)
+            there = (
+                (opacity > _MIN_OPACITY) & (np.asarray(seen.median_depth) < np.asarray(rays.far)) & np.isfinite(depth)
+            )
+            depth = np.where(there, depth, np.where(opacity < _MAX_EMPTY_OPACITY, np.inf, 0)).astype(np.float32)
+            images.append(image._replace(depth=depth))
+            stage.update(index + 1, len(names))
     if not any(
         np.isfinite(image.depth).any() and (image.depth[np.isfinite(image.depth)] > 0).any() for image in images
     ):

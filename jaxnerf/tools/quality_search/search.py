@@ -12,6 +12,7 @@ from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.evaluate import result_folder
 from jaxnerf.evaluation.restore import newest_step
 from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.runtime import stages
 
 # What the error is measured against.
 _EXACT = {"sample_multiplier": 4.0, "early_stop_eps": 0.0, "bake_occupancy": False}
@@ -45,7 +46,8 @@ def choose(
     """Returns the settings of `cheapest_settings` for evaluation, and prints all candidates."""
     # The search takes a while, so errors that would end the later evaluation are raised first.
     result_folder(restore(), workdir, split=split, step=step, overwrite=overwrite)
-    best, candidates = cheapest_settings(workdir, restore, error_budget, split=split, step=step)
+    with stages.stage("searching settings within the error budget"):
+        best, candidates = cheapest_settings(workdir, restore, error_budget, split=split, step=step)
     for candidate in candidates:
         tried = ", ".join(f"{name} {value}" for name, value in candidate.settings.items())
         line = f"RMS error {candidate.error:.5f} in {candidate.seconds:.3f} s: {tried}"

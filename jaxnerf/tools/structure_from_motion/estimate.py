@@ -14,6 +14,7 @@ from jaxnerf.registry import READERS
 from jaxnerf.runtime.atomic_files import check_tree, partial_file, read_bytes, remove, sweep, write_text
 from jaxnerf.runtime.fingerprint import file_sha256
 from jaxnerf.runtime.printed_text import printable
+from jaxnerf.runtime.stages import Stage
 from jaxnerf.tools.structure_from_motion import colmap_process
 from jaxnerf.tools.structure_from_motion import images as images_module
 from jaxnerf.tools.structure_from_motion.colmap_process import Model
@@ -30,7 +31,6 @@ CAMERA_MODELS = (  # of which the reader's lenses have all parameters
     "OPENCV_FISHEYE",
 )
 MATCHING = ("auto", "exhaustive", "sequential")
-_SECONDS = 10.0  # between two lines of progress
 
 
 class Settings(NamedTuple):
@@ -170,53 +170,59 @@ class _Stages:
 
     def prepare_images(self, paths, in_place):
         """Copies and checks the images, and creates the database; returns their names, and notes."""
-        progress = _Progress(self.say, "images", "images", len(paths))
-        notes = [f"images are in {self.images}" + ("" if in_place else ", copied")]
-        if in_place:
+        with _Progress(self.say, "images", "images", len(paths)) as progress:
+            notes = [f"images are in {self.images}" + ("" if in_place else ", copied")]
+            if in_place:
+                if not self.database.exists():
+                    images_module.check_images(paths, progress)
+                turned = sum(map(images_module.is_rotated_jpeg, paths))
+                note = (
+                    f"{turned} images are rotated by their EXIF orientation, which is not followed where they are used"
+                )
+                notes += [f"{note}; with another --out, upright copies are made"] if turned else []
+            else:
+                self.images.mkdir(exist_ok=True)
+                turned = images_module.copy_images(paths, self.images, overwrite=self.overwrite, progress=progress)
+                notes += [f"{turned} copies were turned upright, as the EXIF orientation says"] if turned else []
+            copies = [self.images / images_module.copy_name(path) for path in paths]
+            names = [path.name for path in copies]
             if not self.database.exists():
-                images_module.check_images(paths, progress)
-            turned = sum(map(images_module.is_rotated_jpeg, paths))
-            note = f"{turned} images are rotated by their EXIF orientation, which is not followed where they are used"
-            notes += [f"{note}; with another --out, upright copies are made"] if turned else []
-        else:
-            self.images.mkdir(exist_ok=True)
-            turned = images_module.copy_images(paths, self.images, overwrite=self.overwrite, progress=progress)
-            notes += [f"{turned} copies were turned upright, as the EXIF orientation says"] if turned else []
-        copies = [self.images / images_module.copy_name(path) for path in paths]
-        names = [path.name for path in copies]
-        if not self.database.exists():
-            self._import(copies)
-        self.seconds["images"] = progress.end(len(paths))
+                self._import(copies)
+            self.seconds["images"] = progress.end(len(paths))
         return names, notes
 
     def extract(self, names):
         """Extracts the features of all images."""
-        progress = _Progress(self.say, "features", "images", len(names))
+        with _Progress(self.say, "features", "images", len(names)) as progress:
 
-        def count(running=False):
-            return colmap_process.count_rows(self.database, "descriptors", running=running)
+            def count(running=False):
+                return colmap_process.count_rows(self.database, "descriptors", running=running)
 
-        if count() < len(names):
-            arguments = (self.database, self.images, names, self.settings["max_size"], self.num_threads)
-            self._call(colmap_process.extract_features, *arguments, progress=lambda _: progress(count(running=True)))
-        if count() < len(names):
-            raise ValueError(f"{self.log}: COLMAP found features in {count()} of {len(names)} images; see its messages")
-        self.seconds["features"] = progress.end(len(names))
+            if count() < len(names):
+                arguments = (self.database, self.images, names, self.settings["max_size"], self.num_threads)
+                self._call(
+                    colmap_process.extract_features, *arguments, progress=lambda _: progress(count(running=True))
+                )
+            if count() < len(names):
+                raise ValueError(
+                    f"{self.log}: COLMAP found features in {count()} of {len(names)} images; see its messages"
+                )
+            self.seconds["features"] = progress.end(len(names))
 
     def match(self, names):
         """Matches the features of pairs of images."""
         pairs = images_module.image_pairs(names, self.settings["matching"])
-        progress = _Progress(self.say, f"{self.settings['matching']} matching", "pairs", len(pairs))
+        with _Progress(self.say, f"{self.settings['matching']} matching", "pairs", len(pairs)) as progress:
 
-        def count(running=False):
-            return colmap_process.count_rows(self.database, "two_view_geometries", running=running)
+            def count(running=False):
+                return colmap_process.count_rows(self.database, "two_view_geometries", running=running)
 
-        if count() < len(pairs):
-            listed = self.work / "pairs.txt"
-            write_text(listed, "".join(f"{first} {second}\n" for first, second in pairs))
-            arguments = (self.database, listed, self.num_threads)
-            self._call(colmap_process.match_features, *arguments, progress=lambda _: progress(count(running=True)))
-        self.seconds["matching"] = progress.end(count())
+            if count() < len(pairs):
+                listed = self.work / "pairs.txt"
+                write_text(listed, "".join(f"{first} {second}\n" for first, second in pairs))
+                arguments = (self.database, listed, self.num_threads)
+                self._call(colmap_process.match_features, *arguments, progress=lambda _: progress(count(running=True)))
+            self.seconds["matching"] = progress.end(count())
 
     def map_images(self, names):
         """Returns the models that COLMAP estimates, that with most images first, and notes.
@@ -251,17 +257,17 @@ class _Stages:
         models = self.work / folder
         remove(models)
         models.mkdir()
-        progress = _Progress(self.say, "mapping", "images", len(names))
-        arguments = (database, self.images, names, models, self.num_threads)
-        found = self._call(colmap_process.map_images, *arguments, progress=progress)
-        if not found and database == self.database:
-            verified = colmap_process.count_rows(self.database, "two_view_geometries", "rows > 0")
-            raise ValueError(
-                f"{self.images}: COLMAP registered none of {len(names)} images; {verified} pairs of them have "
-                "matches, expected sharp images of one static, textured scene, each overlapping several others "
-                "by more than half; take more of them"
-            )
-        seconds = progress.end(len(found[0].images) if found else 0)
+        with _Progress(self.say, "mapping", "images", len(names)) as progress:
+            arguments = (database, self.images, names, models, self.num_threads)
+            found = self._call(colmap_process.map_images, *arguments, progress=progress)
+            if not found and database == self.database:
+                verified = colmap_process.count_rows(self.database, "two_view_geometries", "rows > 0")
+                raise ValueError(
+                    f"{self.images}: COLMAP registered none of {len(names)} images; {verified} pairs of them have "
+                    "matches, expected sharp images of one static, textured scene, each overlapping several others "
+                    "by more than half; take more of them"
+                )
+            seconds = progress.end(len(found[0].images) if found else 0)
         self.seconds["mapping"] = self.seconds.get("mapping", 0) + seconds
         return found
 
@@ -296,25 +302,22 @@ class _Stages:
         return colmap_process.call(stage, *arguments, log=self.log, progress=progress)
 
 
-class _Progress:
-    """Says how far a stage is, at most every few seconds and at its end."""
+class _Progress(Stage):
+    """A stage that counts images or pairs, and says its final count in a line that stays."""
 
-    def __init__(self, say, stage, what, total):
-        self.say, self.stage, self.what, self.total = say, stage, what, total
-        self.start = self.last = time.monotonic()
+    def __init__(self, say, step, what, total):
+        super().__init__(f"structure from motion, {step}")
+        self.say, self.step, self.what, self.total = say, step, what, total
 
     def __call__(self, count):
-        if count is not None and time.monotonic() - self.last >= _SECONDS:
-            self.last = time.monotonic()
-            self._say(count)
+        if count is not None:
+            self.update(count, self.total)
 
     def end(self, count):
         """Says the final count; returns the stage's seconds."""
-        self._say(count)
-        return time.monotonic() - self.start
-
-    def _say(self, count):
-        self.say(f"{self.stage}: {count} of {self.total} {self.what}, {time.monotonic() - self.start:.0f} s")
+        seconds = time.monotonic() - self.started
+        self.say(f"{self.step}: {count} of {self.total} {self.what}, {seconds:.0f} s")
+        return seconds
 
 
 def _check_choice(name, value, choices):

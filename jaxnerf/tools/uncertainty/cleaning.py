@@ -17,7 +17,7 @@ from jaxnerf.core.views import check_pixels
 from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.options import is_auto
-from jaxnerf.runtime import atomic_files
+from jaxnerf.runtime import atomic_files, stages
 from jaxnerf.tools.uncertainty.base import UncertaintySource
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 
@@ -96,8 +96,9 @@ def _lowest_limit(source, uncertainty):
         return float(((rgb - batch.rgb) ** 2).mean())
 
     most = max(error(grid), _LEAST_ERROR) * 10 ** (_MOST_LOSS / 10)
-    held = itertools.takewhile(lambda limit: error(_without(grid, uncertainty > limit)) <= most, _LIMITS)
-    return min(held, default=1.0)
+    with stages.stage("comparing limits of the uncertainty"):
+        held = itertools.takewhile(lambda limit: error(_without(grid, uncertainty > limit)) <= most, _LIMITS)
+        return min(held, default=1.0)
 
 
 def _without(grid, removed):

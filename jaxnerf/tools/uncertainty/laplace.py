@@ -30,7 +30,7 @@ from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.fields.base import Field
 from jaxnerf.models.base import with_field_input
-from jaxnerf.runtime import atomic_files
+from jaxnerf.runtime import atomic_files, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource, fingerprint_of, folder_of
 
@@ -175,9 +175,11 @@ def fit_deformation(source: UncertaintySource) -> Deformation:
         return transpose(signs)[0] ** 2, ((rgb - batch.rgb) ** 2).mean()
 
     squares, error = jnp.zeros_like(still), 0.0
-    for index in range(NUM_BATCHES):
-        more, mean = product(index, params, grid, views)
-        squares, error = squares + more, error + mean / NUM_BATCHES
+    with stages.stage("estimating the uncertainty") as stage:
+        for index in range(NUM_BATCHES):
+            stage.update(index, NUM_BATCHES)
+            more, mean = product(index, params, grid, views)
+            squares, error = squares + more, error + mean / NUM_BATCHES
     noise = jnp.maximum(error, _LEAST_NOISE)
     rays = np.prod(np.asarray(views.size, np.int64), axis=1).sum()
     information = squares * (rays / (NUM_BATCHES * BATCH_SIZE)) / noise

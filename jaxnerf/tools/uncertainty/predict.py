@@ -14,7 +14,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views
 from jaxnerf.options import is_auto
-from jaxnerf.runtime import atomic_files
+from jaxnerf.runtime import atomic_files, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty import calibration as calibrations
 from jaxnerf.tools.uncertainty.base import Score, UncertaintySource
@@ -40,7 +40,11 @@ class Predictor(NamedTuple):
 
     def error(self, rays: Rays) -> np.ndarray:
         """Returns the predicted RMS error [...] of the colours of Rays [...]."""
-        return self._error(np.asarray(self.score(rays)))
+        return self._error(self._score(rays))
+
+    def _score(self, rays):
+        with stages.stage("predicting the errors"):
+            return np.asarray(self.score(rays))
 
     def _error(self, score):
         return np.float32(score) if self.calibration is None else self.calibration.predicted(score)
@@ -65,7 +69,7 @@ class Predictor(NamedTuple):
             The predicted errors [H, W]; and the figures of `score_order`, with a calibration "coverage", the
             fraction of pixels whose errors are within their intervals, and "interval", the mean half width.
         """
-        score, error = np.asarray(self.score(rays)), pixel_error(rgb, truth)
+        score, error = self._score(rays), pixel_error(rgb, truth)
         kept = np.ones(error.shape, bool) if mask is None else np.asarray(mask, bool)
         row = score_order(error, score, kept, on_object)
         if self.calibration is not None:
@@ -173,12 +177,14 @@ def _calibrate(run, variables, score, coverage):
     experiment = run.experiment
     views: Views = refined_views(run, experiment.load_split("held_out"), "held_out", variables[0])
     scores, errors, render = [], [], functools.partial(run.render_image, variables)
-    for index in range(len(views.names)):
-        height, width = (int(side) for side in views.size[index])
-        pixels = pixel_grid(height, width, offset=experiment.config.data.pixel_offset)
-        rays = experiment.view_rays(views, index, pixels)
-        kept = pixel_mask(views, index)
-        kept = np.ones((height, width), bool) if kept is None else np.asarray(kept, bool)
-        scores.append(np.asarray(score(rays))[kept])
-        errors.append(pixel_error(render(rays).rgb, views.image(index))[kept])
+    with stages.stage("calibrating the uncertainty on held-out images") as stage:
+        for index in range(len(views.names)):
+            stage.update(index, len(views.names))
+            height, width = (int(side) for side in views.size[index])
+            pixels = pixel_grid(height, width, offset=experiment.config.data.pixel_offset)
+            rays = experiment.view_rays(views, index, pixels)
+            kept = pixel_mask(views, index)
+            kept = np.ones((height, width), bool) if kept is None else np.asarray(kept, bool)
+            scores.append(np.asarray(score(rays))[kept])
+            errors.append(pixel_error(render(rays).rgb, views.image(index))[kept])
     return calibrations.calibrate(scores, errors, views.names, coverage)

@@ -15,6 +15,7 @@ from typing import Any
 
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import TrainedRun
+from jaxnerf.runtime import stages
 from jaxnerf.tools.viewer.client_rendering import ClientRendering
 from jaxnerf.tools.viewer.frame_renderer import FrameRenderer
 from jaxnerf.tools.viewer.page import Page
@@ -115,7 +116,8 @@ class Viewer:
         self.score, self.state = score, state
         if first and (self._pages or self._server is None):  # pages that render by themselves need no frames
             self._each(lambda page: page.report("compiling the renderer"))
-            self.renderer.compile(state)
+            with stages.stage("compiling the renderer"):
+                self.renderer.compile(state)
         self.loop.set_scene(state)
         self._each(lambda page: page.scene_changed())
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ball_runs
-from jaxnerf.evaluation.evaluate import train_observed
+from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
 from jaxnerf.runtime.atomic_files import write_text
 from jaxnerf.tools.viewer import live
@@ -44,7 +44,7 @@ def test_a_training_is_shown_and_not_changed(trained, tmp_path):
     config = smoke_config()
     config.occupancy.resolution, config.occupancy.step_size = 16, 0.1  # of the grid that the viewer extracts
     try:
-        assert train_observed(config, tmp_path / "run", observe=observe)
+        assert train_and_evaluate(config, tmp_path / "run", observe=observe)
     finally:
         viewer.close()
     assert len(shown) == 1 and shown[0]
