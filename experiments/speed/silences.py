@@ -69,7 +69,7 @@ def main(argv: list[str]) -> None:
                     shutil.rmtree(run, ignore_errors=True)
                 command = [sys.executable, "-m", *PROGRAMS[program].format(run=run, **names).split()]
                 found.append(watch(command, on_terminal=place == "terminal"))
-                print(f"{program} {data} {place}: {found[-1][:2]}", file=sys.stderr, flush=True)
+                print(f"{program} {data} {place}: {longest(found[-1][0], cpu=True)}", file=sys.stderr, flush=True)
             (outputs, cpu), *files = found
             gap, seconds, before, after = longest(outputs, cpu=True)
             row = (program, f"`{data}`", f"{cpu:.0f}", f"{gap:.1f} ({seconds:.1f})", f"`{before}`", f"`{after}`")

@@ -29,7 +29,7 @@ def main() -> None:
 
     def sample():
         now = {"seconds": time.perf_counter() - started, "cpu": time.process_time(), "mb": resident_mb()}
-        samples.append({"stage": stages.innermost(), **now})
+        samples.append({"stage": ([None] + [each.text for each in stages.running])[-1], **now})
 
     def watch():
         while not ended.wait(_EVERY):

@@ -20,6 +20,7 @@ from jaxnerf.fields import portable_math, still_life
 from jaxnerf.fields.portable_math import exp
 from jaxnerf.fields.still_life import BODIES, FINISHES, WIDTH
 from jaxnerf.registry import Reader
+from jaxnerf.runtime import stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
@@ -233,8 +234,10 @@ def render_rays(
         part = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[chosen], rays)
         rgb[chosen], opacity[chosen] = _render(part, finish, num_segments // _INTERVAL)
 
-    with ThreadPoolExecutor(num_workers()) as pool:
-        list(pool.map(render, range(0, hits.size, chunk)))
+    starts = range(0, hits.size, chunk)
+    with ThreadPoolExecutor(num_workers()) as pool, stages.stage("rendering the embedded scene") as stage:
+        for done, _ in enumerate(pool.map(render, starts), 1):
+            stage.update(done, len(starts))
     return rgb, opacity
 
 

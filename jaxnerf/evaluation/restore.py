@@ -15,6 +15,7 @@ from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.options import AUTO, Changes, changing, is_auto, replaced
 from jaxnerf.registry import needs_folder
+from jaxnerf.runtime import stages
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, identity, read_config
@@ -87,7 +88,10 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         return model.view(*variables, rays, **options)
 
     def variables_of(params, grid):
-        return params, bake(params) if bake else grid
+        if bake:
+            with stages.stage("extracting an occupancy grid"):
+                grid = bake(params)
+        return params, grid
 
     def variables(step):
         return variables_of(*checkpoints.load_rendered(step, shapes(), averaged=config.train.averaging_power > 0))

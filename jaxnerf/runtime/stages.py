@@ -19,7 +19,7 @@ _EVERY = 1.0  # seconds between lines of a terminal
 _FIRST, _AGAIN = 4.0, 60.0  # seconds after which a log file gets a stage's line, and the next one
 _now = time.monotonic
 _shown = False  # whether a program has asked for it: who imports the functions gets no output
-_running: list["Stage"] = []
+running: list["Stage"] = []  # each within the one before
 _said: dict[str, float] = {}  # when a log file got the line of a stage
 _lock = threading.RLock()  # held while something is written
 _replaceable = _unfinished = False  # whether the terminal's last line shows a stage, or is other text without its end
@@ -37,11 +37,11 @@ class Stage:
 
     def __enter__(self) -> Any:
         self.started = _now()
-        _running.append(self)
+        running.append(self)
         return self
 
     def __exit__(self, *_) -> None:
-        _running.remove(self)
+        running.remove(self)
         _between.started = _now()
 
     def update(self, done: int, total: int) -> None:
@@ -91,17 +91,11 @@ stage = Stage
 def show(shown: bool = True) -> None:
     """Sets whether the stages of this process are shown."""
     global _shown
-    if shown and not _shown:
+    begins, _shown = shown and not _shown, shown
+    if begins:
         threading.Thread(target=_watch, name="stages", daemon=True).start()
-    _shown = shown
     with room():  # without the last line
         pass
-
-
-def innermost() -> str | None:
-    """Returns what the innermost stage of a program is doing; None between stages."""
-    running = _running[-1:]
-    return running[0].text if running else None
 
 
 @contextlib.contextmanager
@@ -119,18 +113,18 @@ def room(text: str = "\n") -> Iterator[None]:
 
 def tick() -> None:
     """Writes the line about the stages that are running, if it is due."""
-    running = _running[:] or [_between]
-    waits, running = not running[-1].text, [each for each in running if each.text]
-    if waits or not running[0].shown:
+    stages = running[:] or [_between]
+    waits, stages = not stages[-1].text, [each for each in stages if each.text]
+    if waits or not stages[0].shown:
         return
     if not sys.stderr.isatty():
-        least = _AGAIN if running[0] is _between else _FIRST
-        running = [each for each in running if _now() - each.started >= least]
-        if running and isinstance(running[0], Progress):  # its results are enough
-            running = running[:1]
-        if not running or not _is_due(running):
+        least = _AGAIN if stages[0] is _between else _FIRST
+        stages = [each for each in stages if _now() - each.started >= least]
+        if stages and isinstance(stages[0], Progress):  # its results are enough
+            stages = stages[:1]
+        if not stages or not _is_due(stages):
             return
-    _write(running)
+    _write(stages)
 
 
 def _watch():
@@ -140,20 +134,20 @@ def _watch():
             tick()
 
 
-def _is_due(running: Sequence[Stage]) -> bool:
+def _is_due(stages: Sequence[Stage]) -> bool:
     """Returns whether a log file gets a line about stages within each other; it then counts as written."""
-    name = ": ".join(each.name for each in running)
+    name = ": ".join(each.name for each in stages)
     if _now() - _said.get(name, -math.inf) < _AGAIN:
         return False
     _said[name] = _now()
     return True
 
 
-def _write(running, *, stays=False):
+def _write(stages, *, stays=False):
     """Writes the line about stages within each other. On a terminal the next one replaces it, unless it stays."""
     global _replaceable, _unfinished
     replaceable = sys.stderr.isatty() and not stays
-    line = ": ".join([running[0].head(), *(each.part() for each in running[1:])])
+    line = ": ".join([stages[0].head(), *(each.part() for each in stages[1:])])
     line = printable(line)[: shutil.get_terminal_size().columns - 1] if replaceable else line + "\n"
     with _lock:
         if not (_unfinished and replaceable):
@@ -161,4 +155,4 @@ def _write(running, *, stays=False):
                 sys.stderr.write(line)
                 sys.stderr.flush()
                 _replaceable, _unfinished = replaceable, False
-                running[0].unsaid &= replaceable
+                stages[0].unsaid &= replaceable

@@ -2,6 +2,7 @@
 
 import io
 import sys
+import threading
 
 import pytest
 
@@ -22,7 +23,7 @@ class Terminal(io.StringIO):
 def clock(monkeypatch):
     """Sets the seconds that have passed, and lets the thread's part be called by hand."""
     now = [0.0]
-    for name, value in {"_shown": True, "_now": lambda: now[0], "_running": [], "_said": {}}.items():
+    for name, value in {"_shown": True, "_now": lambda: now[0], "running": [], "_said": {}}.items():
         monkeypatch.setattr(stages, name, value)
     monkeypatch.setattr(stages._between, "started", 0.0)
 
@@ -92,6 +93,18 @@ def test_a_line_of_a_stage_does_not_end_up_in_text_that_is_being_written(clock, 
     assert stream.getvalue() == "half a line\nworking       preparing for 2 s\r\033[K"
 
 
+def test_a_program_starts_a_thread_that_writes_until_it_ends(monkeypatch):
+    monkeypatch.setattr(stages, "_shown", False)
+    monkeypatch.setattr(stages, "_EVERY", 0.0)
+    monkeypatch.setattr(stages, "tick", (ticked := threading.Event()).set)
+    stages.show()
+    (thread,) = (each for each in threading.enumerate() if each.name == "stages")
+    assert ticked.wait(60)
+    stages.show(False)
+    thread.join(60)
+    assert not thread.is_alive()
+
+
 def test_who_imports_the_functions_gets_no_output(monkeypatch, capsys):
     monkeypatch.setattr(stages.threading, "Thread", None)  # nothing would start one
     with stages.stage("reading images"):
@@ -100,9 +113,15 @@ def test_who_imports_the_functions_gets_no_output(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_each_long_stage_of_a_run_says_what_it_does(shown, monkeypatch, unoptimized, tmp_path, capsys):
-    """Here each stage is long; whoever waits for a large capture sees these lines."""
-    monkeypatch.setattr(stages, "_FIRST", 0.0)
+def test_each_long_stage_of_a_run_says_what_it_does(monkeypatch, unoptimized, tmp_path, capsys):
+    """Whoever waits for a large capture sees the lines of these stages."""
+
+    class Running(list):
+        def append(self, stage):
+            super().append(stage)
+            heads.append(stage.head())
+
+    monkeypatch.setattr(stages, "running", Running())
     captures.write_colmap(tmp_path / "data", captures.noise(captures.orbit(9)))
     config = smoke_config(max_steps=4, log_every=4, save_every=4)
     config.update_from_flattened_dict({**PACKED, "occupancy.min_views": 1, "scene.contracted": True})
@@ -112,12 +131,14 @@ def test_each_long_stage_of_a_run_says_what_it_does(shown, monkeypatch, unoptimi
     config.eval.at_end = True
     for start in ("first", "second"):
         monkeypatch.setattr(processes, "prints_details", lambda start=start: start == "second")
+        heads = []
         assert train_and_evaluate(config, tmp_path / start)
+        said = "\n".join(heads)
         err = capsys.readouterr().err
         stated = ["reading the dataset", "reading images", "compiling the training step", "rendering an image"]
         cells = ["finding the cells that the cameras see", "finding the cells in front of surfaces"]
         for text in stated + cells * (start == "first"):  # they are cached
-            assert f"working       {text}" in err
-        assert ("the last time" in err) == (start == "second")
+            assert f"working       {text}" in said
+        assert ("the last time" in said) == (start == "second")
         assert "\nviews " in err and ("values are inferred; --verbosity=1" in err) == (start == "first")
         assert all((f"\n{name} " in err) == (start == "second") for name in ("parameters", "microbatch"))
