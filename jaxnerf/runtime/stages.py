@@ -1,6 +1,6 @@
 """Says on stderr what a program is doing, and how far it is.
 
-Each second a thread looks at the stages that are running. On a terminal it rewrites one line. A log file gets a line
+Twice a second a thread looks at the stages that are running. On a terminal it rewrites one line. A log file gets a line
 for each stage that lasts, and another for each further minute.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 
 from jaxnerf.runtime.printed_text import printable
 
-_EVERY = 1.0  # seconds between lines of a terminal
+_EVERY = 0.5  # seconds between lines of a terminal
 _FIRST, _AGAIN = 4.0, 60.0  # seconds after which a log file gets a stage's line, and the next one
 _now = time.monotonic
 _shown = False  # whether a program has asked for it: who imports the functions gets no output
