@@ -265,7 +265,6 @@ def _score_views(run, render, views, sides, folder, shard, predictor):
     sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
     readable = output_images.readable(files, sizes, is_valid=aggregate.is_finished)
     todo = [index for index, finished in zip(frames, readable, strict=True) if not finished]
-    first = True
     with stages.Progress("scoring images", len(frames), processes.is_first()) as progress:
         for done, index in enumerate(todo, len(frames) - len(todo) + 1):
             progress.done = done - 1
@@ -287,9 +286,8 @@ def _score_views(run, render, views, sides, folder, shard, predictor):
                 output_images.write_error(folder, f"{index:03d}", error)
                 row |= figures
             output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
-            aggregate.mark_finished(folder, index, row, truth, image, count=count, first=first)
+            aggregate.mark_finished(folder, index, row, truth, image, count=count, first=index == todo[0])
             progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
-            first = False
 
 
 def watch(
@@ -337,6 +335,5 @@ def _wait(text, said, seconds):
     """Sleeps, after printing the text unless it was printed last; returns the text."""
     if text != said:
         print(f"{text}; checking again every {seconds:g} s", file=sys.stderr, flush=True)
-    with stages.stage(""):
-        time.sleep(seconds)
+    time.sleep(seconds)
     return text

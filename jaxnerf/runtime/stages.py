@@ -17,7 +17,8 @@ from jaxnerf.runtime.printed_text import printable
 
 _EVERY = 0.5  # seconds between lines of a terminal
 _FIRST, _AGAIN = 4.0, 60.0  # seconds after which a log file gets a stage's line, and the next one
-_now = time.monotonic
+_LEAST = 0.05  # CPU time over time, below which a program that is in no stage waits for something
+_now, _cpu, _spent = time.monotonic, time.process_time, 0.0
 _shown = False  # whether a program has asked for it: who imports the functions gets no output
 running: list["Stage"] = []  # each within the one before
 _said: dict[str, float] = {}  # when a log file got the line of a stage
@@ -31,7 +32,7 @@ class Stage:
     shown, unsaid = True, False  # whether it is shown; whether it has a result that no line has kept
 
     def __init__(self, text: str, note: str = ""):
-        """Takes what is done, or "" while the program waits and nothing is shown, and a note about it."""
+        """Takes what is done, such as "reading images", and a note about it, such as how long it took before."""
         self.name, self.text, self._note, self.started = text, text, note, _now()
         self.done, self._total = 0, 0
 
@@ -113,9 +114,12 @@ def room(text: str = "\n") -> Iterator[None]:
 
 def tick() -> None:
     """Writes the line about the stages that are running, if it is due."""
-    stages = running[:] or [_between]
-    waits, stages = not stages[-1].text, [each for each in stages if each.text]
-    if waits or not stages[0].shown:
+    global _spent
+    stages, before, _spent = running[:] or [_between], _spent, _cpu()
+    if stages[0] is _between and _spent - before < _LEAST * _EVERY:  # the program waits
+        _between.started = _now()
+        return
+    if not stages[0].shown:
         return
     if not sys.stderr.isatty():
         least = _AGAIN if stages[0] is _between else _FIRST

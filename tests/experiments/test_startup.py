@@ -1,4 +1,4 @@
-"""The study of startup times: parsing of the output of training, and a training that takes no step."""
+"""The studies of startup times and silences: parsing of the output of programs, and a training that takes no step."""
 
 import sys
 
@@ -41,3 +41,11 @@ def test_a_training_without_a_first_step_is_named(training, tmp_path, text, code
     training(text, code)
     with pytest.raises(ValueError, match="smoke: training did not reach its first step"):
         startup.start("smoke", tmp_path, 0)
+
+
+def test_the_longest_silence_is_between_two_outputs():
+    silences = study("speed/silences")
+    assert silences.printed("\r\x1b[Kworking 1 s\r\x1b[Kdone\r\n") == ["working 1 s", "done"]
+    outputs = [(0.0, 0.0, "(start)"), (1.0, 9.0, "a|b"), (5.0, 10.0, "c"), (5.5, 11.0, "(end)")]
+    assert silences.longest(outputs, cpu=True) == (4.0, 1.0, "a/b", "c")
+    assert silences.longest(outputs, cpu=False) == (1.0, 9.0, "(start)", "a/b")

@@ -21,15 +21,18 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Sets the seconds that have passed, and lets the thread's part be called by hand."""
+    """Lets seconds pass and CPU time be spent by hand, and does then what the thread does."""
     now = [0.0]
-    for name, value in {"_shown": True, "_now": lambda: now[0], "running": [], "_said": {}}.items():
+    spent = [0.0]
+    values = {"_shown": True, "_now": lambda: now[0], "_cpu": lambda: spent[0], "running": [], "_said": {}, "_spent": 0}
+    for name, value in values.items():
         monkeypatch.setattr(stages, name, value)
     monkeypatch.setattr(stages._between, "started", 0.0)
 
-    def pass_seconds(seconds):
+    def pass_seconds(seconds, cpu=1):
         for _ in range(seconds):
             now[0] += 1
+            spent[0] += cpu
             stages.tick()
 
     return pass_seconds
@@ -48,8 +51,7 @@ def test_a_log_file_gets_a_line_for_each_stage_that_lasts_and_one_for_each_furth
     done = ", 1,200 of 3,000 done"
     assert capsys.readouterr().err == shown % (4, "") + shown % (64, done) + shown % (124, done)
     clock(59)
-    with stages.stage(""):  # it waits
-        clock(300)
+    clock(300, cpu=0)  # it waits
     assert capsys.readouterr().err == ""
     clock(60)
     assert capsys.readouterr().err == "working       preparing for 60 s\n"

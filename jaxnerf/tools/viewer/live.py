@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_with_grid
-from jaxnerf.runtime import atomic_files, stages
+from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.uncertainty.cleaning import cleaned
 from jaxnerf.tools.uncertainty.laplace import stored_uncertainty
 from jaxnerf.tools.viewer.server import HOST, PORT, Viewer, check_port, import_viser
@@ -78,16 +78,10 @@ def view_run(
         viewer.close()
 
 
-def _waited(ended):
-    """Returns whether an event has happened, after at most the time between two searches."""
-    with stages.stage(""):
-        return ended.wait(_POLL_SECONDS)
-
-
 def _follow(run, viewer, show_newest, ended):
     """Shows each new checkpoint until an event; what cannot be shown is reported in a line, and the last one stays."""
     failed, reported = None, ""
-    while not _waited(ended):
+    while not ended.wait(_POLL_SECONDS):
         if show_newest is None or not viewer.num_browsers:
             continue
         steps = []
