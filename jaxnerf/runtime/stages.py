@@ -94,6 +94,7 @@ def show(shown: bool = True) -> None:
     global _shown
     begins, _shown = shown and not _shown, shown
     if begins:
+        _between.started = _now()
         threading.Thread(target=_watch, name="stages", daemon=True).start()
     with room():  # without the last line
         pass
