@@ -1,4 +1,4 @@
-"""Measures `make demo` in fresh clones with empty caches: wall and CPU seconds, the first picture, and PSNR.
+"""Measures `make demo` in fresh clones with empty caches: wall and CPU seconds, the first image, and PSNR.
 
     taskset -c 0 python experiments/speed/demo.py [--commits=2990dae,HEAD] [--python=/usr/bin/python3.13] \
         [--rounds=1] [--page=FILE.md]
@@ -23,7 +23,7 @@ import common
 
 from jaxnerf.runtime import cli
 
-HEADS = ("commit", "wall, s", "CPU, s", "first picture after, s", "PSNR, dB", "matrix product, GFLOP/s")
+HEADS = ("commit", "wall, s", "CPU, s", "first image after, s", "PSNR, dB", "matrix product, GFLOP/s")
 _COMMITS = flags.DEFINE_list("commits", ["2990dae", "HEAD"], "Commits to compare.")
 _PYTHON = flags.DEFINE_string("python", "python3", "The interpreter that makes the virtual environment.")
 _ROUNDS = flags.DEFINE_integer("rounds", 1, "Number of demos of each commit; medians are shown.", lower_bound=1)
@@ -39,13 +39,13 @@ def main(argv: list[str]) -> None:
             print(commit, *(f"{value:.1f}" for value in figures[-1]), file=sys.stderr, flush=True)
     rows = []
     for commit, runs in found.items():
-        wall, cpu, picture, psnr, gflops = (statistics.median(values) for values in zip(*runs, strict=True))
-        rows.append((_name(commit), f"{wall:.0f}", f"{cpu:.0f}", f"{picture:.0f}", f"{psnr:.2f}", f"{gflops:.0f}"))
+        wall, cpu, preview, psnr, gflops = (statistics.median(values) for values in zip(*runs, strict=True))
+        rows.append((_name(commit), f"{wall:.0f}", f"{cpu:.0f}", f"{preview:.0f}", f"{psnr:.2f}", f"{gflops:.0f}"))
     common.publish([*common.markdown(HEADS, rows), "", *common.provenance()], "demo")
 
 
 def demo(commit: str) -> tuple[float, ...]:
-    """Returns wall and CPU seconds, seconds until the first picture, PSNR and GFLOP/s of one `make demo`.
+    """Returns wall and CPU seconds, seconds until the first image, PSNR and GFLOP/s of one `make demo`.
 
     Raises:
         ValueError: if it fails; quotes its last lines.
@@ -68,10 +68,10 @@ def demo(commit: str) -> tuple[float, ...]:
                 raise ValueError(f"make demo of {commit} failed: {output.read().strip()[-2000:]}")
         gflops.append(common.matrix_gflops())
         run = clone / "runs/demo"
-        picture = min((path.stat().st_mtime for path in run.glob("previews/*.png")), default=float("nan"))
+        preview = min((path.stat().st_mtime for path in run.glob("previews/*.png")), default=float("nan"))
         (results,) = run.glob("eval/*/results.json")
         psnr = json.loads(results.read_text())["psnr"]
-        return wall, usage.ru_utime + usage.ru_stime, picture - started, psnr, statistics.fmean(gflops)
+        return wall, usage.ru_utime + usage.ru_stime, preview - started, psnr, statistics.fmean(gflops)
 
 
 def _name(commit):
