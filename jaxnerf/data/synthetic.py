@@ -1,7 +1,5 @@
-"""The embedded dataset: views of `fields.still_life`, so that nothing is downloaded.
-
-The images of the demo ship with the package, as `experiments/embedded/write_images.py` has rendered them by
-`render_views`. Those of other sizes and finishes are rendered on first use.
+"""The embedded dataset: views of `fields.still_life`, so that nothing is downloaded. Those of the demo ship with the
+package, rendered by experiments/embedded/write_images.py; others are rendered on first use.
 """
 
 import inspect
@@ -80,12 +78,11 @@ def load_synthetic(
     if (size, finish) == (SHIPPED_SIZE, SHIPPED_FINISH) and split != "val":
         pixels = _shipped(split)
     else:
-        form = (count * size * size, 4), np.uint16
         pixels = load_or_make(
             cache,
             f"still_life_{finish}_{split}_{size}_{_fingerprint()}",
-            lambda: {"pixels": _rendered(stack, finish)},
-            is_valid=lambda arrays: [(each.shape, each.dtype) for each in arrays.values()] == [form],
+            lambda: {"pixels": render_views(stack, finish)},
+            is_valid=lambda found: [(a.shape, a.dtype) for a in found.values()] == [((count * size**2, 4), np.uint16)],
         )["pixels"]
     return Views(
         pixels=pixels,
@@ -103,17 +100,8 @@ def _shipped(split):
     """Returns the pixels of a split in SHIPPED: bytes [2, V, 4, H, W], high and low, of differences of neighbours."""
     with np.load(SHIPPED) as file:
         high, low = file[split].astype(np.uint16)
-    values = (high << 8 | low) - np.uint16(128)
-    for axis in (2, 3):
-        np.add.accumulate(values, axis=axis, dtype=np.uint16, out=values)  # modulo 65536
+    values = ((high << 8 | low) - np.uint16(128)).cumsum(2, np.uint16).cumsum(3, np.uint16)  # modulo 65536
     return np.moveaxis(values, 1, -1).reshape(-1, 4)
-
-
-def _rendered(stack, finish):
-    count, seconds = len(stack.to_world), len(stack.to_world) * stack.height * stack.width / _RAYS_PER_SECOND
-    if seconds > _MANY_SECONDS:
-        _logger.warning("%d images of the embedded scene are rendered, once; about %.0f s on a core", count, seconds)
-    return render_views(stack, finish)
 
 
 def render_views(
@@ -129,6 +117,8 @@ def render_views(
         chunk: number of rays at once; it has no effect on the pixels.
     """
     rays = scene_rays(stack)
+    if (seconds := len(rays.near) / _RAYS_PER_SECOND) > _MANY_SECONDS:
+        _logger.warning("images of the embedded scene are rendered, which takes about %.0f s on a core", seconds)
     length = rays.far - rays.near  # negative: the ray misses the cylinder
     rgba = np.zeros((length.size, 4))
     longest = max(length.max(), 0.0)
