@@ -32,7 +32,7 @@ _ROUNDS = flags.DEFINE_integer("rounds", 1, "Number of demos of each commit; med
 def main(argv: list[str]) -> None:
     """Runs the demos and prints the table."""
     del argv
-    found = {commit: [] for commit in _COMMITS.value}
+    found = {_name(commit): [] for commit in _COMMITS.value}  # HEAD may move meanwhile
     for _ in range(_ROUNDS.value):
         for commit, figures in found.items():
             figures.append(demo(commit))
@@ -40,7 +40,7 @@ def main(argv: list[str]) -> None:
     rows = []
     for commit, runs in found.items():
         wall, cpu, preview, psnr, gflops = (statistics.median(values) for values in zip(*runs, strict=True))
-        rows.append((_name(commit), f"{wall:.0f}", f"{cpu:.0f}", f"{preview:.0f}", f"{psnr:.2f}", f"{gflops:.0f}"))
+        rows.append((commit, f"{wall:.0f}", f"{cpu:.0f}", f"{preview:.0f}", f"{psnr:.2f}", f"{gflops:.0f}"))
     common.publish([*common.markdown(HEADS, rows), "", *common.provenance()], "demo")
 
 
@@ -53,7 +53,7 @@ def demo(commit: str) -> tuple[float, ...]:
     with tempfile.TemporaryDirectory() as folder:
         clone = pathlib.Path(folder, "jaxnerf")
         subprocess.run(["git", "clone", "--quiet", str(common.ROOT), str(clone)], check=True)
-        subprocess.run(["git", "-C", str(clone), "checkout", "--quiet", _name(commit)], check=True)
+        subprocess.run(["git", "-C", str(clone), "checkout", "--quiet", commit], check=True)
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("JAX", "PYTHON", "XDG_"))}
         environment = {**kept, "HOME": folder, "PIP_NO_CACHE_DIR": "1"}
         gflops = [common.matrix_gflops()]
