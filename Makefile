@@ -4,21 +4,23 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
 # Compiled programs are kept in build/, so that tests compile each only once, but the smallest, which are stored no faster
-# than compiled; if JAX warns of one that it cannot read, after a test was killed, call make clean. A worker that crashes is not replaced: pytest-xdist can wait
-# for the new one for ever.
+# than compiled; if JAX warns of one that it cannot read, after a test was killed, call make clean. A worker that crashes
+# is not replaced: pytest-xdist can wait for the new one for ever.
 PYTEST := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/build/compiled JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.05 $(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder --max-worker-restart=0
 
 .PHONY: demo view test test-slow test-extra docs lint clean
 
 $(BIN)/.installed: setup.cfg pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --editable .
+	$(BIN)/pip install --quiet $(PIP_OPTIONS) --editable .
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
 	$(BIN)/pip install --quiet --editable '.[dev,check,docs,export,tensorboard,viewer]'
 	touch $@
 
+# pip spends half of its time on compiling all modules. Python compiles those that it imports, when it first does.
+demo: PIP_OPTIONS := --no-compile
 demo: $(BIN)/.installed
 	$(BIN)/jaxnerf-train --config=quickstart --config.eval.at_end --workdir=$(DEMO)
 	$(BIN)/jaxnerf-render --workdir=$(DEMO) --frames=24 --overwrite
