@@ -17,7 +17,6 @@ from jaxnerf.runtime.printed_text import printable
 
 _EVERY = 0.5  # seconds between lines of a terminal
 _FIRST, _AGAIN = 4.0, 60.0  # seconds after which a log file gets a stage's line, and the next one
-_LEAST = 0.05  # CPU time over time, below which a program that is in no stage waits for something
 _now, _cpu, _spent = time.monotonic, time.process_time, 0.0
 _shown = False  # whether a program has asked for it: who imports the functions gets no output
 running: list["Stage"] = []  # each within the one before
@@ -117,16 +116,14 @@ def tick() -> None:
     """Writes the line about the stages that are running, if it is due."""
     global _spent
     stages, before, _spent = running[:] or [_between], _spent, _cpu()
-    if stages[0] is _between and _spent - before < _LEAST * _EVERY:  # the program waits
+    if stages[0] is _between and _spent - before < 0.05 * _EVERY:  # the program waits for something
         _between.started = _now()
         return
     if not stages[0].shown:
         return
     if not sys.stderr.isatty():
-        least = _AGAIN if stages[0] is _between else _FIRST
-        stages = [each for each in stages if _now() - each.started >= least]
-        if stages and isinstance(stages[0], Progress):  # its results are enough
-            stages = stages[:1]
+        stages = stages[:1] if isinstance(stages[0], Progress) else stages  # its results are enough
+        stages = [each for each in stages if _now() - each.started >= (_AGAIN if each is _between else _FIRST)]
         if not stages or not _is_due(stages):
             return
     _write(stages)

@@ -77,8 +77,7 @@ def train(
             )
         processes.print_once(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
         steps = Checkpoints(folder).steps()
-        finished = processes.any_of(metric_log.has_ended(options, steps, folder))
-        if finished:
+        if finished := processes.any_of(metric_log.has_ended(options, steps, folder)):
             processes.print_once(f"steps         {metric_log.of_all(steps[-1], options)} done, so training is complete")
         else:
             finished = run_training(experiment, views, folder, preview=preview, observe=observe)
