@@ -134,8 +134,6 @@ def headline(scores: Scores) -> list[str]:
     """Returns the lines of the table of the README: PSNR by seconds, and what others reach on the same images."""
     rows = []
     for name, runs in scores.items():
-        if not jobs.JOBS[name].headline:
-            continue
         ours = ", ".join(f"{score['psnr']:.1f} dB ({score['seconds']:.0f} s)" for score in runs)
         grouped = collections.defaultdict(list)
         for entry in others_of(jobs.JOBS[name], runs, all_views=False):

@@ -103,8 +103,9 @@ def test_a_missing_dataset_is_reported_with_the_command_that_makes_it(monkeypatc
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAXNERF_SCENES", str(tmp_path))
     (tmp_path / "lego").mkdir()
-    notes = run.missing(["lego_100", "can_reposed"])
-    assert list(notes) == ["can_reposed"] and "`jaxnerf-cameras --images=can/images" in notes["can_reposed"]
+    notes = run.missing(["lego_100", "can_undistorted"])
+    assert list(notes) == ["can_undistorted"]
+    assert "`jaxnerf-cameras --images=can/images" in notes["can_undistorted"]
 
 
 def test_a_signal_lets_the_run_save_before_the_program_ends(tmp_path):

@@ -30,7 +30,7 @@ def test_a_curve_has_medians_where_all_seeds_were_scored():
 
 @pytest.mark.parametrize("step, ended", [(5, False), (7, True)])
 def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, tmp_path, step, ended):
-    config = training.configuration("grid 200")
+    config = training.configuration("fox")
     assert config.train.max_steps == "auto"
 
     def train(config, where):
