@@ -162,9 +162,8 @@ def others_of(job: jobs.Job, runs: Sequence[Mapping[str, Any]], *, all_views: bo
     kinds, sizes = job.beside if all_views else job.beside[:1], {images_of(score) for score in runs}
     kinds = [kind for kind in kinds if any(size in kind for size in sizes)]
     entries = [entry for entry in (*published.BENCHMARK, *published.TRAINING) if entry["what"] in kinds]
-    parts = {
-        (entry["what"].removesuffix(", 25 test views"), entry["name"]) for entry in entries if "25" in entry["what"]
-    }
+    part = ", 25 test views"
+    parts = {(entry["what"].removesuffix(part), entry["name"]) for entry in entries if entry["what"].endswith(part)}
     return [entry for entry in entries if (entry["what"], entry["name"]) not in parts]
 
 

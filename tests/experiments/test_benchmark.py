@@ -182,6 +182,11 @@ def test_the_headline_has_figures_of_the_same_views_only():
     assert "TensoRF" not in row and "one CPU core" in tables.headline(scores_of_lego())[0]
 
 
+def test_figures_of_another_program_that_does_not_use_alpha_are_beside_the_run_that_does_not():
+    scores = {"lego_100_no_alpha": [fake_score("lego_100_no_alpha", 60.0, 32.0, size=[100, 100])]}
+    assert sum("| TensoRF |" in line for line in tables.beside(scores)) == 4
+
+
 def test_options_of_a_try_are_in_the_table():
     score = fake_score("lego_100", 5.0, 30.0)
     score["overrides"]["data.factor"] = 16
