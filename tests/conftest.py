@@ -24,11 +24,13 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+import mlir_context  # noqa: E402
 import type_checks  # noqa: E402
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 type_checks.install("jaxnerf", "test_scenes")
+mlir_context.share_context()
 # The programs of all tests stay in memory; to search them for garbage at the usual rate is a tenth of the time.
 gc.set_threshold(200_000, 20, 100)
 
@@ -56,6 +58,11 @@ def pytest_runtest_setup(item):
 def scenes_dir():
     """The folder of the real scenes; for tests marked `scenes`, which end before this when it is missing."""
     return pathlib.Path(os.environ["JAXNERF_SCENES"])
+
+
+def pytest_sessionfinish():
+    """Spares what is still alive the last collections of garbage, which take seconds."""
+    gc.freeze()
 
 
 _finished_files = 0

@@ -14,6 +14,7 @@ import sys
 import jax
 
 import jaxnerf.evaluation.evaluate  # noqa: F401
+import mlir_context
 
 _SECONDS = 120  # after which a program is killed
 
@@ -51,6 +52,7 @@ def _serve():
 
 if __name__ == "__main__":
     gc.collect()
+    mlir_context.share_context()
     gc.freeze()  # or the first collection of each program would copy all of it
     program = _serve()
     if program and program.endswith(".py"):
