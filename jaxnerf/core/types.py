@@ -270,6 +270,30 @@ class Batch:
     depth_weight: Float[Array, " B"] | None = None
 
 
+def is_known(condition: object) -> bool:
+    """Returns whether a condition is known to hold at trace time."""
+    return not isinstance(condition, jax.core.Tracer) and bool(condition)
+
+
+def check_order(function: str, **bounds: Num[Array, "..."]) -> None:
+    """Raises a ValueError if the first of two arrays of bounds, by name, is known to be above the second somewhere."""
+    (low, lows), (high, highs) = bounds.items()
+    if is_known((wrong := lows > highs).any()):
+        values = [each.reshape(-1)[jnp.argmax(wrong)] for each in (lows, highs)]
+        raise ValueError(f"{function}: {low} is {values[0]:g} and {high} {values[1]:g}, expected {low} <= {high}")
+
+
+def broadcast(function: str, shape: tuple[int, ...], **arrays: Num[ArrayLike, "..."]) -> list[Num[Array, "..."]]:
+    """Broadcasts arrays, by their names, to a shape; ValueError, with the name of the calling function, on others."""
+    found = []
+    for name, value in arrays.items():
+        try:
+            found.append(jnp.broadcast_to(value, shape))
+        except ValueError:
+            raise ValueError(f"{function}: {name} has shape {jnp.shape(value)}, expected {shape} or ()") from None
+    return found
+
+
 def check_shapes(function: str, **arrays: tuple[object, str]) -> None:
     """Raises a ValueError unless the shapes fit their patterns.
 

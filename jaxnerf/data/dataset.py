@@ -379,7 +379,7 @@ def dataset_folder(name: str) -> pathlib.Path:
     places = [pathlib.Path(name)] + ([pathlib.Path(scenes, name)] if scenes else [])
     found = [place for place in places if name and place.is_dir()]
     if not found:
-        searched = " or ".join(str(place.absolute()) for place in places) if name else "nothing"
+        searched = " or ".join(dict.fromkeys(str(place.absolute()) for place in places)) if name else "nothing"
         raise ValueError(f"data.dir is {name!r}: no such folder, searched {searched}; set it with --data_dir")
     return found[0]
 

@@ -256,7 +256,7 @@ def test_registrations_that_cannot_work_are_refused(monkeypatch):
 def test_a_section_that_no_part_has_is_refused(tmp_path):
     config = smoke_config(max_steps=1)
     config.trian = {"batch_size": 64}
-    with pytest.raises(ValueError, match="--config.trian is no field, expected one of .*'train'"):
+    with pytest.raises(ValueError, match="--config.trian is no field, did you mean train.*"):
         jaxnerf.train_and_evaluate(config, tmp_path / "run")
 
 
