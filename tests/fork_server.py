@@ -4,6 +4,7 @@ It starts without any JAX_ variable, so that each program takes all options of J
 never uses JAX itself: threads of a backend would not survive the fork.
 """
 
+import functools
 import gc
 import json
 import os
@@ -12,10 +13,13 @@ import signal
 import sys
 
 import jax
+from jax._src.interpreters import mlir
 
 import jaxnerf.evaluation.evaluate  # noqa: F401
 
 _SECONDS = 120  # after which a program is killed
+
+mlir.make_ir_context = functools.cache(mlir.make_ir_context)  # as in conftest.py
 
 
 def _become(request):

@@ -16,7 +16,8 @@ from runs import smoke_config
 def compiled_once(tmp_path_factory):
     """Caches compiled programs on disk, as many processes of these tests run the same step."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_shared(tmp_path_factory) / "compiled")
-    with _options(jax_compilation_cache_dir=folder, jax_persistent_cache_min_compile_time_secs=0.0):
+    with _options(jax_compilation_cache_dir=folder), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         compilation_cache.reset_cache()
         yield
     compilation_cache.reset_cache()

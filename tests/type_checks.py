@@ -20,15 +20,15 @@ def checked(function):
     """Returns the function with checks of its arguments and result.
 
     A function that itself refuses a wrong argument raises its own error, which tests expect; the TypeCheckError
-    is raised where the function accepts the argument.
+    is raised where the function accepts the argument. The checks are made at the first call.
     """
-    typed = jaxtyped(function, typechecker=_check)
+    typed = functools.cache(lambda: jaxtyped(function, typechecker=_check))
 
     @functools.wraps(function)
     def call(*args, **kwargs):
         __tracebackhide__ = True
         try:
-            return typed(*args, **kwargs)
+            return typed()(*args, **kwargs)
         except TypeCheckError:
             function(*args, **kwargs)
             raise

@@ -176,14 +176,14 @@ def test_points_on_rays_project_to_their_pixels(lens, k):
 def test_a_point_behind_the_camera_has_no_pixel():
     camera = a_camera()
     behind = camera.to_world[:, 3] + camera.to_world[:, 2]
-    pixel, depth = project(camera, behind)
+    pixel, depth = fast_project(camera, behind)
     assert np.isinf(pixel).all() and depth == pytest.approx(-1, abs=1e-5)
-    assert not jax.jacrev(lambda x: project(camera, x)[0])(behind).any()
+    assert not jax.jit(jax.jacrev(lambda x: project(camera, x)[0]))(behind).any()
 
 
 def test_the_zero_vector_has_no_direction():
-    assert not normalize(jnp.zeros((2, 3))).any()
-    assert not jax.jacrev(normalize)(jnp.zeros(3)).any()
+    assert not jax.jit(normalize)(jnp.zeros((2, 3))).any()
+    assert not jax.jit(jax.jacrev(normalize))(jnp.zeros(3)).any()
 
 
 @pytest.mark.parametrize("size", [1e-37, 1.0, 1e20, 1.1e38])

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import compiled
 from jaxnerf import Rays, create_grid, mask_scene, render_packed, render_samples, update_grid
 from jaxnerf.core.contraction import contract, expand
 from jaxnerf.core.occupancy.from_scene import crop_grid, visible_grid
@@ -23,6 +24,7 @@ INNER, SIDE = 0.5, 32  # half the uncontracted part's side, cells per side
 CELL = (4 * INNER / SIDE,) * 3
 CENTER = np.float32([0.3, -0.2, 0.1])
 BOX = CENTER - 2 * INNER, CENTER + 2 * INNER
+march = compiled(march_rays, "step_size", "cell")
 
 
 def a_grid(valid=None, **options):
@@ -48,7 +50,7 @@ def some_rays(count=64, seed=0, near=0.05, far=1e4):
 def test_rays_of_an_image_are_marched_as_in_a_row():
     rays = some_rays(count=12)
     image = jax.tree.map(lambda leaf: leaf.reshape(3, 4, *leaf.shape[1:]), rays)
-    row, rows = (march_rays(None, a_grid(), each, step_size=0.1, cell=CELL) for each in (rays, image))
+    row, rows = (march(None, a_grid(), each, step_size=0.1, cell=CELL) for each in (rays, image))
     np.testing.assert_allclose(rows.t.reshape(12, -1), row.t, rtol=1e-6)
 
 
@@ -87,7 +89,7 @@ def test_a_cell_holds_what_contract_puts_there():
     sure = (np.abs(place - np.rint(place)) > 1e-3).all(axis=-1)
     grid = a_grid(valid)
     rays = Rays(origins=x, directions=np.ones_like(x), viewdirs=np.ones_like(x), near=x[:, 0], far=x[:, 0])
-    found = np.asarray(is_occupied(grid, rays, np.zeros((4000, 1), np.float32)))[:, 0]
+    found = compiled(is_occupied)(grid, rays, np.zeros((4000, 1), np.float32))[:, 0]
     np.testing.assert_array_equal(found[sure], valid[tuple(index.T)][sure])
 
 
@@ -123,11 +125,11 @@ def test_samples_reach_from_near_to_far_and_grow_only_outside():
 
 def test_near_and_far_are_kept():
     rays = some_rays(near=0.3, far=0.9)
-    samples = march_rays(jax.random.key(0), a_grid(), rays, step_size=0.05, cell=CELL)
+    samples = march(jax.random.key(0), a_grid(), rays, step_size=0.05, cell=CELL)
     edges = samples.t - samples.delta / 2, samples.t + samples.delta / 2
-    used = np.asarray(samples.delta) > 0
-    assert np.asarray(edges[0])[used].min() > 0.3 - 1e-5 and np.asarray(edges[1])[used].max() < 0.9 + 1e-5
-    np.testing.assert_allclose(np.asarray(samples.delta).sum(axis=-1), 0.6, rtol=1e-4)
+    used = samples.delta > 0
+    assert edges[0][used].min() > 0.3 - 1e-5 and edges[1][used].max() < 0.9 + 1e-5
+    np.testing.assert_allclose(samples.delta.sum(axis=-1), 0.6, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -164,7 +166,7 @@ def test_an_update_evaluates_the_scene_where_the_cell_is():
     image = np.asarray(contract((middle - CENTER) / INNER))
     assert (np.abs(place - image) < 0.8).all()
     kept = mask_scene(scene, updated)
-    density, _ = kept(jnp.asarray(middle).reshape(1, 1, 3), jnp.ones((1, 1, 3)))
+    density, _ = jax.jit(kept)(middle.reshape(1, 1, 3), np.ones((1, 1, 3), np.float32))
     assert density.item() == 50.0
 
 

@@ -37,6 +37,9 @@ def make_rendering(weights, t, delta, rule="segments"):
     return jaxnerf.Rendering(weights=weights, samples=samples, **dict.fromkeys(names, weights[..., 0]))
 
 
+compiled_loss = compiled(jaxnerf.distortion_loss)
+
+
 def distortion(weights, t, delta, near=0.0, far=1.0, rule="segments"):
     """Returns the loss of one ray, or of rays [B]."""
     batch = make_batch(jnp.broadcast_to(near, weights.shape[:-1]), far)
@@ -115,7 +118,7 @@ def test_a_segment_is_clipped_where_disparity_begins(near, start, rule):
             slot = {"ray_index": np.zeros(1, np.int32), "used": np.ones(1, bool), "rule": rule}
             slot = jaxnerf.PackedSamples(**dict(zip(("weights", "t", "delta"), given, strict=True)), **slot)
             packed = dataclasses.replace(make_rendering(*[np.zeros((1, 1), np.float32)] * 3), samples=slot)
-            got = jaxnerf.distortion_loss([packed], make_batch(np.full(1, near), np.inf))[0]
+            got = compiled_loss([packed], make_batch(np.full(1, near), np.inf))[0]
             np.testing.assert_allclose(got, want, rtol=3e-6, atol=1e-7)
 
 

@@ -140,12 +140,14 @@ def test_scenes_of_any_number_of_channels(channels):
     early = jax.jit(lambda: jaxnerf.render_packed(scene, None, rays(), samples, **options))()
     np.testing.assert_allclose(early.rgb, whole.rgb, atol=1e-5)
     np.testing.assert_allclose(early.median_depth, whole.median_depth, rtol=1e-5)
+    shapes = (channels,), (1,), (6, 6, 1), (6, 6, channels)
     for render in (
-        jax.jit(lambda **options: render_samples(scene, rays(), samples, **options)),
-        jax.jit(lambda **options: jaxnerf.render_packed(scene, grid, rays(), samples, max_samples=36 * 24, **options)),
+        lambda behind: render_samples(scene, rays(), samples, background=behind),
+        lambda behind: jaxnerf.render_packed(scene, grid, rays(), samples, max_samples=36 * 24, background=behind),
     ):
-        for background in (jnp.ones(1), jnp.ones((6, 6, 1)), jnp.ones((6, 6, channels))):
-            np.testing.assert_array_equal(render(background=background).rgb, render(background=jnp.ones(channels)).rgb)
+        want, *found = jax.jit(lambda render=render: [render(jnp.ones(shape)).rgb for shape in shapes])()
+        for rgb in found:
+            np.testing.assert_array_equal(rgb, want)
     for wrong in (jnp.ones(channels + 1), jnp.ones((5, channels)), jnp.ones(())):
         for render in (render_samples, jaxnerf.render_packed):
             more = {"max_samples": 864} if render is jaxnerf.render_packed else {}

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxnerf.core.poses import se3_exponential
+from helpers import compiled
+from jaxnerf.core import poses
+
+se3_exponential = compiled(poses.se3_exponential)
 
 
 def generator(twist):
@@ -34,7 +37,8 @@ def test_it_is_the_matrix_exponential(angle):
 @jax.jit
 def derivatives(twist):
     """Returns the first and the second derivative."""
-    return jax.jacrev(se3_exponential)(twist), jax.jacfwd(jax.jacrev(se3_exponential))(twist)
+    first = jax.jacrev(poses.se3_exponential)
+    return first(twist), jax.jacfwd(first)(twist)
 
 
 @pytest.mark.slow

@@ -269,7 +269,9 @@ def test_what_no_scene_can_ask_for_is_named(renderer, rays, samples):
 
 def test_a_field_of_rays_has_the_shape_of_near(rays, samples):
     with pytest.raises(ValueError, match=r"render_samples: time has shape \(\), expected \[...\] beside near"):
-        jaxnerf.render_samples(needy, dataclasses.replace(rays, time=np.float32(0)), samples)
+        jax.eval_shape(
+            functools.partial(jaxnerf.render_samples, needy), dataclasses.replace(rays, time=np.float32(0)), samples
+        )
 
 
 def test_ndc_rays_keep_time_and_image_and_have_no_radius(rays):
@@ -386,10 +388,11 @@ def test_contracted_lengths_have_the_scale_of_the_contraction():
     x = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32) * np.geomspace(0.3, 300, 200)[:, None]
     x = np.float32(x)
     determinant = np.abs(np.linalg.det(np.float64(jax.jit(jax.vmap(jax.jacfwd(contract)))(x))))
-    np.testing.assert_allclose(length_scale(x), np.cbrt(determinant), rtol=2e-3)
-    assert (np.asarray(length_scale(x))[np.abs(x).max(axis=-1) <= 1] == 1).all()
+    scale = compiled(length_scale)
+    np.testing.assert_allclose(scale(x), np.cbrt(determinant), rtol=2e-3)
+    assert (scale(x)[np.abs(x).max(axis=-1) <= 1] == 1).all()
     far = np.float32([[np.inf, 0, 0], [1e30, -1e30, 0], [1e12, 0, 0]])
-    assert np.isfinite(length_scale(far)).all() and all_finite(jax.jit(jax.vmap(jax.grad(length_scale)))(far[1:]))
+    assert np.isfinite(scale(far)).all() and all_finite(jax.jit(jax.vmap(jax.grad(length_scale)))(far[1:]))
 
 
 def test_a_contracted_field_receives_contracted_lengths():
@@ -478,8 +481,9 @@ def test_needs_do_not_move_the_points_in_the_cells():
 
     cells, key = jnp.arange(64), jax.random.key(7)
     grid = jaxnerf.create_grid(-np.ones(3), np.ones(3), np.ones((4, 4, 4), bool), initial_density=0.0)
+    update = functools.partial(jaxnerf.update_grid, key, cells=cells, threshold=0.1, spacing=0.2)
     both = [
-        jaxnerf.update_grid(key, grid, each, cells, threshold=0.1, spacing=0.2).density_max
+        compiled(lambda grid, each=each: update(grid, scene=each).density_max)(grid)
         for each in (scene, lambda x, viewdirs: scene(x, viewdirs))
     ]
     np.testing.assert_array_equal(*both)
@@ -520,7 +524,7 @@ def test_padding_for_the_cache_does_not_change_the_inputs_of_a_network():
         x, radius = np.float32(rng.normal(size=(*shape, 3))), np.float32(rng.normal(size=shape))
         time, index = np.float32(rng.normal(size=(shape[0], 1))), np.arange(shape[0], dtype=np.int32)[:, None]
         inputs = {"radius": radius, "time": time, "image_index": index, "progress": jnp.float32(0.5)}
-        density, rgb = apply_network(Network(), {"scale": jnp.ones(())}, x, x[:, :1], **inputs)
+        density, rgb = compiled(functools.partial(apply_network, Network()))({"scale": 1.0}, x, x[:, :1], **inputs)
         np.testing.assert_allclose(density, 0.5 * x[..., 0])
         want = [radius, np.broadcast_to(time, shape), np.broadcast_to(index, shape)]
         np.testing.assert_allclose(rgb, np.stack(want, axis=-1))

@@ -97,7 +97,8 @@ def test_derivative_of_the_weights_of_a_ray_with_thousands_of_samples():
     """In double precision: dw_i = T_i exp(-tau_i) dtau_i - w_i sum of dtau_k in front of i."""
     rng, size = np.random.default_rng(2), 5000
     depth, tangent = np.float32(rng.exponential(2 / size, size)), np.float32(rng.normal(size=size))
-    _, change = jax.jvp(lambda depth: jaxnerf.weights_from_density(depth, jnp.ones(size)), (depth,), (tangent,))
+    weights_of = lambda depth: jaxnerf.weights_from_density(depth, jnp.ones(size))  # noqa: E731
+    _, change = jax.jit(lambda *of: jax.jvp(weights_of, *of))((depth,), (tangent,))
     exact, moved = depth.astype(np.float64), tangent.astype(np.float64)
     in_front = np.cumsum(exact) - exact
     weights = np.exp(-in_front) * -np.expm1(-exact)

@@ -20,10 +20,9 @@ from jaxnerf.evaluation.paths import camera_path as camera_paths
 from jaxnerf.evaluation.paths.camera_path import read_path_file
 
 UP = np.float32([0, 0, 1])
-look_at, interpolate = (
-    compiled(poses_module.look_at),
-    compiled(poses_module.interpolate, "num_frames", "closed"),
-)
+look_at = compiled(poses_module.look_at)
+interpolate = compiled(poses_module.interpolate, "num_frames", "closed")
+turntable = compiled(poses_module.turntable, "num_frames", "elevation")
 
 
 def turn(axis, degrees):
@@ -82,7 +81,7 @@ def assert_looks_at(poses, target):
 
 def test_a_turntable_is_a_circle_at_its_elevation():
     center = np.array([1.0, -2.0, 0.5])
-    poses = np.asarray(poses_module.turntable(16, center=center, radius=3.0, elevation=0.4))
+    poses = turntable(16, center=center, radius=3.0, elevation=0.4)
     assert_rigid(poses)
     assert_looks_at(poses, center)
     np.testing.assert_allclose(np.linalg.norm(poses[:, :, 3] - center, axis=-1), 3, rtol=1e-6)
@@ -94,10 +93,7 @@ def test_a_turntable_is_a_circle_at_its_elevation():
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (1.0, 0.1, 0.0), (-1.0, 2.0, 0.5)])
 def test_a_turntable_needs_only_the_direction_of_up(up):
-    poses, longer = (
-        np.asarray(poses_module.turntable(8, center=UP, radius=3.0, elevation=0.4, up=scale * np.array(up)))
-        for scale in (1, 20)
-    )
+    poses, longer = (turntable(8, center=UP, radius=3.0, elevation=0.4, up=scale * np.array(up)) for scale in (1, 20))
     assert_rigid(poses)
     np.testing.assert_allclose(poses, longer, atol=2e-6)
     above = (poses[:, :, 3] - UP) @ np.array(up) / np.linalg.norm(up)
@@ -106,7 +102,7 @@ def test_a_turntable_needs_only_the_direction_of_up(up):
 
 def test_an_ellipse_has_its_half_axes():
     middle, axes = np.array([0.0, 1.0, 2.0]), np.array([[3.0, 0, 0], [0, 0.5, 0]])
-    poses = np.asarray(poses_module.ellipse(16, middle=middle, axes=axes, target=np.zeros(3), up=UP))
+    poses = compiled(poses_module.ellipse, "num_frames")(16, middle=middle, axes=axes, target=np.zeros(3), up=UP)
     assert_rigid(poses)
     assert_looks_at(poses, np.zeros(3))
     x, y, z = (poses[:, :, 3] - middle).T
@@ -118,7 +114,7 @@ def test_an_ellipse_has_its_half_axes():
 def test_a_spiral_is_the_llff_codes():
     """Against render_path_spiral, written out again, from a pose that is no identity."""
     middle, radii = pose(turn([1, 2, 3], 40), [1.0, 2.0, 3.0]), np.array([0.5, 0.3, 0.1])
-    poses = np.asarray(poses_module.spiral(120, pose=middle, radii=radii, focus=4.0))
+    poses = compiled(poses_module.spiral, "num_frames")(120, pose=middle, radii=radii, focus=4.0)
     assert_rigid(poses)
     assert_looks_at(poses, middle @ [0, 0, -4, 1])
     angle = np.linspace(0, 4 * np.pi, 121)[:-1]
@@ -184,7 +180,8 @@ def test_a_single_pose_and_a_single_frame():
 
 def test_the_mean_of_a_pose_and_its_mirror_image_lies_between():
     left, right = (pose(turn([0, 1, 0], angle), [angle, 0, 5]) for angle in (-20, 20))
-    np.testing.assert_allclose(poses_module.mean_pose(np.stack([left, right])), pose(np.eye(3), [0, 0, 5]), atol=1e-6)
+    mean = compiled(poses_module.mean_pose)(np.stack([left, right]))
+    np.testing.assert_allclose(mean, pose(np.eye(3), [0, 0, 5]), atol=1e-6)
 
 
 def test_an_ellipse_passes_through_cameras_on_one():
@@ -205,7 +202,7 @@ def test_a_turntable_frames_the_scene_as_the_cameras_nearby_do():
     """Cameras on one side look at a point above the others', as at the top of an object that is not level."""
     poses = np.array(ring(12))
     for index in np.flatnonzero(poses[:, 0, 3] > 0):
-        poses[index] = np.asarray(poses_module.look_at(np.float32(poses[index, :, 3]), np.float32([0, 0, 0.8]), UP))
+        poses[index] = look_at(np.float32(poses[index, :, 3]), np.float32([0, 0, 0.8]), UP)
     found = np.asarray(path_poses.make_poses("turntable", poses, 24), np.float64)
     axes, eyes = found[:, :, 2], found[:, :, 3]
     aims = eyes - (eyes * axes).sum(axis=1, keepdims=True) * axes

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import rays_past_origin
+from helpers import compiled, rays_past_origin
 from jaxnerf import render_packed
 from jaxnerf.core.occupancy.from_scene import drop_thin_density, visible_grid
 from jaxnerf.core.occupancy.ray_marching import march_rays
@@ -58,7 +58,7 @@ def test_a_visible_wire_thinner_than_a_cell_is_kept(grid):
 
 def test_images_are_those_of_the_scene_without_fog(schedule, grid):
     rays = rays_past_origin(1, 256)
-    samples = march_rays(None, grid, rays, step_size=STEP, cell=schedule.cell)
+    samples = compiled(march_rays, "step_size", "cell")(None, grid, rays, step_size=STEP, cell=schedule.cell)
     everywhere = schedule.create(jnp.ones((SIDE,) * 3, bool))
     clear = drop_thin_density(scene, everywhere, schedule.threshold)
     show = jax.jit(lambda grid: render_packed(clear, grid, rays, samples, max_samples=2**15).rgb)

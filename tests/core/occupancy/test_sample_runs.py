@@ -23,6 +23,8 @@ SHAPE, STEP, RAYS = (21, 18, 15), 0.045, 96
 CELL = (1 / 21, 1 / 21, 1 / 21)
 UPPER = np.array(SHAPE) / 21
 march = compiled(march_near_matter, "step_size", "cell", "max_runs")
+march_all = compiled(march_rays, "step_size", "cell")
+in_matter = compiled(lambda grid, rays, samples: is_occupied(grid, rays, samples.t) & (samples.delta > 0))
 choose = compiled(importance_samples, "max_samples", "uniform_fraction")
 
 
@@ -57,17 +59,17 @@ def found(grid, rays, max_runs=2000):
 
 def test_runs_hold_all_samples_in_occupied_cells(grid, rays):
     runs, complete = found(grid, rays)
-    every = march_rays(None, grid, rays, step_size=STEP, cell=CELL)
-    occupied = np.asarray(is_occupied(grid, rays, every.t) & (every.delta > 0))
+    every = march_all(None, grid, rays, step_size=STEP, cell=CELL)
+    occupied = in_matter(grid, rays, every)
     assert complete and 20 < occupied.sum() and int(runs.count.sum()) * WIDTH < every.t.size / 2
     for ray in range(RAYS):
         mine = np.arange(runs.first[ray], runs.first[ray] + runs.count[ray])
         np.testing.assert_array_equal(runs.ray_index[mine], ray)
         t, delta = (np.asarray(leaf)[mine].ravel() for leaf in (runs.samples.t, runs.samples.delta))
         assert (np.diff(t) >= 0).all()
-        place = np.searchsorted(t, np.asarray(every.t)[ray][occupied[ray]] - 1e-4)
-        np.testing.assert_allclose(t[place], np.asarray(every.t)[ray][occupied[ray]], atol=1e-5)
-        np.testing.assert_allclose(delta[place], np.asarray(every.delta)[ray][occupied[ray]], atol=1e-5)
+        place = np.searchsorted(t, every.t[ray][occupied[ray]] - 1e-4)
+        np.testing.assert_allclose(t[place], every.t[ray][occupied[ray]], atol=1e-5)
+        np.testing.assert_allclose(delta[place], every.delta[ray][occupied[ray]], atol=1e-5)
     np.testing.assert_array_equal(np.asarray(runs.samples.delta)[int(runs.count.sum()) :], 0)
 
 
@@ -87,13 +89,10 @@ def test_rays_along_the_axes_lose_no_cell_that_is_far_from_others(cell, step):
     near, far = np.float32(random.uniform(0, 5, 600)), np.full(600, 20, np.float32)
     rays = jaxnerf.Rays(origins=at, directions=directions, viewdirs=directions, near=near, far=far)
     steps = {"step_size": step * min(cell), "cell": cell}
-    every = march_rays(None, grid, rays, **steps)
+    every = march_all(None, grid, rays, **steps)
     runs, complete = march(grid, rays, max_runs=9000, **steps)
     along = jax.tree.map(lambda leaf: leaf[runs.ray_index], rays)
-    expected, kept = (
-        np.asarray(is_occupied(grid, each, samples.t) & (samples.delta > 0)).sum()
-        for each, samples in ((rays, every), (along, runs.samples))
-    )
+    expected, kept = (in_matter(grid, each, found).sum() for each, found in ((rays, every), (along, runs.samples)))
     assert complete and kept == expected > 50
     assert runs.count.sum() < 600 * every.t.shape[-1] / WIDTH
 
@@ -108,7 +107,7 @@ def test_the_same_samples_are_chosen_from_runs(grid, rays, limit, slots):
     runs, _ = found(grid, rays)
     options = {"max_samples": slots, "uniform_fraction": 0.4}
     key, limit = jax.random.key(3), np.float32(limit)
-    every = march_rays(None, grid, rays, step_size=STEP, cell=CELL)
+    every = march_all(None, grid, rays, step_size=STEP, cell=CELL)
     old, was_hidden = choose(key, grid, rays, every, max_optical_depth=limit, **options)
     new, is_hidden = choose(key, grid, rays, runs, max_optical_depth=limit, **options)
     assert np.asarray(old.used).sum() >= 20 and (np.isinf(limit) or np.asarray(was_hidden).any())
@@ -153,7 +152,7 @@ def test_cells_within_the_radius_are_near(grid, radius):
         near=np.zeros(300, np.float32),
         far=np.ones(300, np.float32),
     )
-    near = np.asarray(near_occupied(grid, there, jnp.zeros((300, 1)), radius))[:, 0]
+    near = compiled(near_occupied, "radius")(grid, there, jnp.zeros((300, 1)), radius=radius)[:, 0]
     cells = np.argwhere(np.asarray(grid.occupied))
     distance = np.abs(at[:, None] - cells).max(axis=-1).min(axis=-1)
     assert near[distance <= radius].all() and not near[distance >= 2 * radius].any()

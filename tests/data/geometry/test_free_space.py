@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from captures import black_views, orbit
+from helpers import compiled
 from jaxnerf import SparsePoints
 from jaxnerf.core.cameras import project, rays_from_pixels
 from jaxnerf.data.geometry import free_space
@@ -23,7 +24,7 @@ def views():
     positions = RNG.uniform(-0.8, 0.8, (60, 3))
     positions += np.outer((HEIGHT - positions @ NORMAL) / (NORMAL @ NORMAL), NORMAL)
     camera = jax.tree.map(lambda leaf: leaf[0], cameras)
-    pixel = np.float32(project(camera, np.float32(positions))[0])
+    pixel = compiled(project)(camera, np.float32(positions))[0]
     index = np.arange(len(positions), dtype=np.int32)
     sparse = SparsePoints(positions=np.float32(positions), view=0 * index, point=index, pixel=pixel)
     return black_views(cameras, sparse=sparse)
@@ -36,7 +37,7 @@ def test_depths_are_exact_on_a_plane(views):
     rows, columns = np.nonzero(confidence)
     assert len(rows) > 20 and (confidence <= 1).all() and not inverse[confidence == 0].any()
     pixels = np.float32(np.stack([columns, rows], axis=-1) + 0.5) * DEPTH_STRIDE
-    rays = rays_from_pixels(views.camera(0), pixels, near=1.0, far=9.0)
+    rays = compiled(rays_from_pixels)(views.camera(0), pixels, near=1.0, far=9.0)
     places = rays.origins + rays.directions / inverse[rows, columns, None]
     np.testing.assert_allclose(places @ NORMAL, HEIGHT, atol=2e-3)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from helpers import compiled
 from jaxnerf.core.cameras import project
 from jaxnerf.core.types import Camera, SparsePoints
 from jaxnerf.core.views import Views
@@ -125,7 +126,7 @@ def test_cells_are_seen_through_the_lens():
     through, _ = seen_cells(dataclasses.replace(plain, cameras=barrel), schedule, min_views=1)
     assert through.any() and not (through & ~seen).any() and through.sum() < 0.8 * seen.sum()
     x = centers(schedule)
-    pixels, depth = (np.asarray(value) for value in project(jax.tree.map(lambda leaf: leaf[0], barrel), x))
+    pixels, depth = compiled(project)(jax.tree.map(lambda leaf: leaf[0], barrel), x)
     inside = (pixels > 3).all(axis=-1) & (pixels < SIZE - 3).all(axis=-1) & (depth > 0.3) & (depth < 3.8)
     assert through[inside].all()
     outside = (pixels < -12).any(axis=-1) | (pixels > SIZE + 12).any(axis=-1)

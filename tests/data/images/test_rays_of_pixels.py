@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import captures
-from jaxnerf import Camera
+from helpers import compiled
+from jaxnerf import Camera, pixel_grid, rays_from_pixels
 from jaxnerf.data.dataset import load_dataset
 from jaxnerf.data.images.pixel_rays import fractions_of_pixels, pixels_with_rays, rays_line, sees_sideways
 from jaxnerf.data.readers.base import read_capture
@@ -51,8 +52,9 @@ def test_pixels_without_rays_are_masked_in_views(tmp_path, lens, k, factor):
     folded = dataclasses.replace(stack, distortion=np.tile(np.float32(k), (4, 1)))
     captures.write_transforms(tmp_path, captures.noise(folded))
     views = load_dataset(tmp_path, split="train", factor=factor)
-    for index in range(len(views.size)):
-        rays = views.rays(index)
+    of_pixels = compiled(rays_from_pixels)
+    for index, (height, width) in enumerate(views.size.tolist()):
+        rays = of_pixels(views.camera(index), pixel_grid(height, width), near=views.near[index], far=views.far[index])
         mask = views.mask[views.offset[index] :][: rays.far.size].reshape(rays.far.shape)
         np.testing.assert_array_equal(mask, rays.far > rays.near)
     assert 0.1 < views.mask.mean() < 0.9

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import compiled
 from jaxnerf.core.cameras import project
 from jaxnerf.data.readers import base as readers
 from jaxnerf.data.readers import colmap
@@ -168,7 +169,7 @@ def test_every_lens_agrees_with_colmap(tmp_path, pycolmap, number, name, rest, l
         np.testing.assert_array_equal(camera.distortion, distortion)
     local = np.random.default_rng(1).uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (50, 3))
     world = local * [1, -1, -1] @ camera.to_world[:, :3].T + camera.to_world[:, 3]
-    pixels, depth = project(camera, world)
+    pixels, depth = compiled(project)(camera, world)
     np.testing.assert_allclose(pixels, known.img_from_cam(local), atol=1e-4)  # of float32
     np.testing.assert_allclose(depth, 1, atol=1e-5)
 
