@@ -161,11 +161,9 @@ class Renderings(tuple[Rendering, ...]):
     """
 
     def __new__(cls, by_network: Mapping[str, Rendering], compared: Sequence[str]) -> "Renderings":
-        """Makes the tuple from the renderings by network, and the names of those that are compared.
-
-        Raises:
-            ValueError: if one of these networks has no rendering.
-        """
+        """Makes the tuple from the renderings by network, and the names of those that are compared."""
+        if not isinstance(by_network, Mapping):
+            raise ValueError(f"the sampler returned {type(by_network).__name__}, expected a Rendering of each network")
         renderings = super().__new__(cls, (_rendering_of(by_network, name) for name in compared))
         renderings._by_network, renderings._compared = dict(by_network), tuple(compared)
         return renderings

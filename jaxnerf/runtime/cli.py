@@ -189,11 +189,7 @@ def define_option(name: str, declared: Option, kind: Any, help: str) -> flags.Fl
 
 
 def use_data(config, data_dir: str | None, format: str | None = None):
-    """Puts --data_dir and --format into a config and returns it.
-
-    Raises:
-        ValueError: if there is no such format.
-    """
+    """Puts --data_dir and --format into a config and returns it; ValueError if there is no such format."""
     if format and format != "auto":
         READERS.get(format)
     if data_dir:
