@@ -4,8 +4,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := runs/demo
 # Compiled programs are kept in build/, so that tests compile each only once, but the smallest, which are stored no faster
-# than compiled; if JAX warns of one that it cannot read, after a test was killed, call make clean. A worker that crashes is not replaced: pytest-xdist can wait
-# for the new one for ever.
+# than compiled; if JAX warns of one that it cannot read, after a test was killed, call make clean. A worker that crashes
+# is not replaced: pytest-xdist can wait for the new one for ever.
 PYTEST := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/build/compiled JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.05 $(BIN)/python -m pytest -q --numprocesses=auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder --max-worker-restart=0
 
 .PHONY: demo view test test-slow test-extra docs lint clean

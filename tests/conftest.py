@@ -1,6 +1,5 @@
 """Four CPU devices, checks of type annotations, and the real scenes, for every test."""
 
-import functools
 import gc
 import importlib.metadata
 import os
@@ -24,15 +23,14 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
-from jax._src.interpreters import mlir  # noqa: E402
 
+import mlir_context  # noqa: E402
 import type_checks  # noqa: E402
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 type_checks.install("jaxnerf", "test_scenes")
-# JAX makes a context of MLIR for each program that it compiles, which is a quarter of the time of a small one.
-mlir.make_ir_context = functools.cache(mlir.make_ir_context)
+mlir_context.share_context()
 # The programs of all tests stay in memory; to search them for garbage at the usual rate is a tenth of the time.
 gc.set_threshold(200_000, 20, 100)
 

@@ -4,7 +4,6 @@ It starts without any JAX_ variable, so that each program takes all options of J
 never uses JAX itself: threads of a backend would not survive the fork.
 """
 
-import functools
 import gc
 import json
 import os
@@ -13,13 +12,11 @@ import signal
 import sys
 
 import jax
-from jax._src.interpreters import mlir
 
 import jaxnerf.evaluation.evaluate  # noqa: F401
+import mlir_context
 
 _SECONDS = 120  # after which a program is killed
-
-mlir.make_ir_context = functools.cache(mlir.make_ir_context)  # as in conftest.py
 
 
 def _become(request):
@@ -55,6 +52,7 @@ def _serve():
 
 if __name__ == "__main__":
     gc.collect()
+    mlir_context.share_context()
     gc.freeze()  # or the first collection of each program would copy all of it
     program = _serve()
     if program and program.endswith(".py"):

@@ -3,6 +3,7 @@
 import contextlib
 import fcntl
 import os
+import shutil
 
 import jax
 import pytest
@@ -38,12 +39,13 @@ def unoptimized(compiled_once):
 @pytest.fixture(scope="session")
 def trained(compiled_once, tmp_path_factory):
     """The workdir of configs/smoke.py: 20 steps, checkpoints of 5, 10, 15 and 20 of which 3 are kept."""
-    folder = tmp_path_factory.mktemp("trained") / "run"
-    with (_shared(tmp_path_factory) / "trained.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # what one worker compiles, the others find in the cache
-        with _options(jax_disable_most_optimizations=True):
-            assert train_and_evaluate(smoke_config(), folder)
-    return folder
+    once = _shared(tmp_path_factory) / "trained"
+    with once.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one worker trains, the others copy
+        if not once.exists():
+            with _options(jax_disable_most_optimizations=True):
+                assert train_and_evaluate(smoke_config(), once)
+    return shutil.copytree(once, tmp_path_factory.mktemp("trained") / "run")
 
 
 def _shared(tmp_path_factory):
