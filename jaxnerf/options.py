@@ -345,8 +345,8 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
 
 def unknown_field(prefix: str, name: str, known: Iterable[str]) -> str:
     """Returns the message about a field of a config that does not exist, with the name of one that it resembles."""
-    near = difflib.get_close_matches(name, sorted(known), n=1)
-    return f"--{prefix}{name} is no field, {f'did you mean {near[0]}? ' * len(near)}expected one of {sorted(known)}"
+    meant = "".join(f"did you mean {each}? " for each in difflib.get_close_matches(name, sorted(known), n=1))
+    return f"--{prefix}{name} is no field, {meant}expected one of {sorted(known)}"
 
 
 def read_value(declared: Option, kind: Any, value: Any, flag: str) -> Any:
