@@ -183,7 +183,7 @@ WRONG = {
     "expected (3, 4), of one camera; drop the last row": lambda: jaxnerf.rays_from_pixels(
         dataclasses.replace(CAMERA, to_world=jnp.eye(4)), jnp.ones((1, 2)), near=1.0, far=2.0
     ),
-    "near has shape (3,), expected (1,) or ()": lambda: jaxnerf.rays_from_pixels(
+    "near has shape (3,), which does not fit (1,)": lambda: jaxnerf.rays_from_pixels(
         CAMERA, jnp.ones((1, 2)), near=jnp.ones(3), far=2.0
     ),
     "near is 3 and far 2, expected near <= far": lambda: jaxnerf.rays_from_pixels(

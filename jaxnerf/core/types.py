@@ -288,7 +288,7 @@ def broadcast(function: str, shape: tuple[int, ...], **arrays: Num[ArrayLike, ".
         try:
             found.append(jnp.broadcast_to(value, shape))
         except ValueError:
-            raise ValueError(f"{function}: {name} has shape {jnp.shape(value)}, expected {shape} or ()") from None
+            raise ValueError(f"{function}: {name} has shape {jnp.shape(value)}, which does not fit {shape}") from None
     return found
 
 
