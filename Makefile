@@ -12,13 +12,15 @@ PYTEST := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/build/compiled JAX_PERSISTENT_CACH
 
 $(BIN)/.installed: setup.cfg pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --editable .
+	$(BIN)/pip install --quiet $(PIP_OPTIONS) --editable .
 	touch $@
 
 $(BIN)/.dev: $(BIN)/.installed
 	$(BIN)/pip install --quiet --editable '.[dev,check,docs,export,tensorboard,viewer]'
 	touch $@
 
+# pip spends half of its time on compiling all modules. Python compiles those that it imports, when it first does.
+demo: PIP_OPTIONS := --no-compile
 demo: $(BIN)/.installed
 	$(BIN)/jaxnerf-train --config=quickstart --config.eval.at_end --workdir=$(DEMO)
 	$(BIN)/jaxnerf-render --workdir=$(DEMO) --frames=24 --overwrite

@@ -55,7 +55,7 @@ def installed(wheel, tmp_path_factory):
 def test_the_wheel_holds_one_package_with_configs_and_types(wheel):
     files = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in files if ".dist-info/" not in name} == {"jaxnerf"}
-    assert "jaxnerf/py.typed" in files
+    assert {"jaxnerf/py.typed", "jaxnerf/data/still_life.npz"} <= set(files)
     for path in (ROOT / "jaxnerf").rglob("*.py"):
         assert path.relative_to(ROOT).as_posix() in files
     for path in (ROOT / "jaxnerf" / "tools" / "exporters" / "web_page").iterdir():

@@ -78,7 +78,7 @@ def show(folder: pathlib.Path, out: pathlib.Path) -> list[str]:
         f"{results['training_seconds']:.0f} s of training, PSNR {results['psnr']:.2f} dB and "
         f"SSIM {results['ssim']:.3f} on {results['views']} views, {results['seconds_per_frame']:.2f} s a frame.",
         "",
-        f"![{name}: image, rendering, depth]({name}.jpg)",
+        f"[![{name}: image, rendering, depth]({name}.jpg)]({name}.jpg)",
         "",
         f"![{name}: {renders.parent.name}]({name}.webp)",
         "",

@@ -41,7 +41,7 @@ class DataOptions(Options):
 
     format: str = option(
         "synthetic",
-        "`synthetic` (the embedded scene, rendered once and cached), `blender`, `transforms`, `colmap`, `llff`, or "
+        "`synthetic` (the embedded scene), `blender`, `transforms`, `colmap`, `llff`, or "
         "the name of a registered reader; auto: what the folder holds",
         auto=True,
         protocol=True,

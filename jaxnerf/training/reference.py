@@ -5,19 +5,21 @@ import inspect
 from jaxnerf.options import AUTO, Changes, Option, kind_name
 from jaxnerf.training.config import RunConfig, declared
 
-_DEPENDS = {
-    Changes.MODEL: "training and images depend on it",
-    Changes.TRAINING: "training depends on it",
-    Changes.IMAGES: "images depend on it",
-    Changes.SPEED: "only the speed depends on it",
-    Changes.SPEED | Changes.IMAGES: "speed and, by rounding, images depend on it",
-    Changes.NOTHING: "a run may be resumed with another value",
+_BADGES = {  # what depends on an option: a word beside each, explained once
+    Changes.MODEL: ("model", "the parameters that training finds, and the images; resumed with the same value"),
+    Changes.TRAINING: ("training", "the parameters that training finds; resumed with the same value"),
+    Changes.IMAGES: ("images", "only the images that given parameters render"),
+    Changes.SPEED: ("speed", "only the speed"),
+    Changes.SPEED | Changes.IMAGES: ("speed, images", "the speed and, by rounding, the images"),
+    Changes.NOTHING: ("free", "nothing that is done: a run may be resumed with another value"),
 }
 
 
 def options_page() -> str:
     """Returns Markdown that lists the options of all parts, registered ones too, with a heading for each."""
-    config, lines, shown = RunConfig(), [], ""
+    config, shown = RunConfig(), ""
+    lines = ["The last word of an option's first line says what depends on it:", ""]
+    lines += [*(f"- *{badge}*: {meaning}" for badge, meaning in _BADGES.values()), ""]
     for name, option, kind, default in declared(config):
         section, dot, _ = name.partition(".")
         if dot and section != shown:
@@ -42,7 +44,7 @@ def _facts(option: Option, kind, default):
     parts = [values, f"default `{default!r}`" if isinstance(default, str) else f"default `{default}`"]
     parts += [option.unit] if option.unit else []
     parts += [option.range.text] if option.range else []
-    return "; ".join([*parts, _DEPENDS[option.changes]]) + "."
+    return "; ".join([*parts, f"*{_BADGES[option.changes][0]}*"])
 
 
 def _sentence(text):

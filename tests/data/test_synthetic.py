@@ -61,6 +61,18 @@ def test_the_pixels_are_the_same_on_every_machine():
     assert digest.hexdigest() == synthetic.CHECKSUM
 
 
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_the_images_that_ship_with_the_package_are_those_that_are_rendered(split, monkeypatch):
+    """If this fails after a change of the scene, run experiments/embedded/write_images.py."""
+    views = synthetic.load_synthetic(split=split, size=synthetic.SHIPPED_SIZE)
+    rays = synthetic.scene_rays(views.cameras)
+    longest = (rays.far - rays.near).argmax()  # it determines the number of segments
+    chosen = np.append(np.arange(0, len(views.pixels), 1999), longest)
+    some = jax.tree.map(lambda leaf: leaf[chosen], rays)
+    monkeypatch.setattr(synthetic, "scene_rays", lambda stack: some)
+    np.testing.assert_array_equal(synthetic.render_views(views.cameras), views.pixels[chosen])
+
+
 @pytest.mark.parametrize("finish", ["usual", "shiny"])
 def test_the_pixels_are_those_of_the_scene(finish):
     """As the renderer of this package renders the scene that code outside sees."""
