@@ -1,5 +1,6 @@
 """Short runs that are trained once, compiled steps, timings, tables and plots: what the studies share."""
 
+import contextlib
 import copy
 import importlib
 import json
@@ -11,7 +12,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -218,6 +219,20 @@ def commit() -> str:
     command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     return found.stdout.strip() or "unknown"
+
+
+@contextlib.contextmanager
+def few_cores(count: int | None) -> Iterator[None]:
+    """Lets the processes that are started inside use the first so many of this process's cores; all where None."""
+    if count is None or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(cores)[:count])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
 def matrix_gflops(repeats: int = 12) -> float:

@@ -1,16 +1,18 @@
 """Neural radiance fields as pure functions: rays, samples, weights and images of any scene.
 
 A scene is any function (x [..., S, 3], viewdirs [..., 1 or S, 3]) -> (density [..., S], rgb [..., S, 3]).
-Importing this package needs jax and jaxtyping only. The functions that read datasets or runs are imported when they
-are first used.
+Its functions raise a ValueError on arguments of other kinds or shapes than they document, also where they are traced.
+Importing it needs jax and jaxtyping only; the functions that read datasets or runs are imported when first used.
 """
 
 import jaxnerf.runtime.quiet_start as _quiet_start  # noqa: F401
 
 # isort: split
 import importlib as _importlib
+import inspect as _inspect
 import typing as _typing
 
+from jaxnerf.core.arguments import checked as _checked
 from jaxnerf.core.cameras import ndc_rays, ndc_to_t, pixel_grid, pixel_radius, project, rays_from_pixels, undistort
 from jaxnerf.core.encoding import (
     frustum_variance,
@@ -92,7 +94,8 @@ if not _typing.TYPE_CHECKING:  # a type checker would accept every name
     def __getattr__(name):
         if name not in _ON_DEMAND:
             raise AttributeError(f"module 'jaxnerf' has no attribute {name!r}")
-        return getattr(_importlib.import_module(_ON_DEMAND[name]), name)
+        found = getattr(_importlib.import_module(_ON_DEMAND[name]), name)
+        return globals().setdefault(name, found if isinstance(found, type) else _checked(found))
 
 
 def __dir__():
@@ -126,3 +129,7 @@ __all__ = [
     "register_field", "register_sampler", "register_loss", "register_reader", "register_exporter",
     "register_estimator",
 ]  # fmt: skip
+
+for _name, _value in list(globals().items()):
+    if _name in __all__ and _inspect.isfunction(_value):
+        globals()[_name] = _checked(_value)

@@ -6,11 +6,12 @@ derived from these declarations.
 """
 
 import dataclasses
+import difflib
 import enum
 import functools
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Self, TypeAlias, TypeVar, dataclass_transform
 
 AUTO = "auto"  # the only marker of a value that is inferred
@@ -299,13 +300,9 @@ def replaced(options: _Part, **values: Any) -> _Part:
     return dataclasses.replace(options, **values)  # type: ignore[type-var]
 
 
+@functools.cache
 def declarations(kind: type[Options]) -> dict[str, tuple[Option, Any]]:
     """Returns what the options of a class declare, and their types, by name; inherited ones first."""
-    return _declarations(kind)
-
-
-@functools.cache
-def _declarations(kind):
     types_of, found = typing.get_type_hints(kind), {}
     for field in dataclasses.fields(kind):
         if "option" in field.metadata:
@@ -342,8 +339,14 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
     if missing:
         raise ValueError(f"--{prefix}{missing[0]} is missing; restore the config, or set it")
     if unknown:
-        raise ValueError(f"--{prefix}{unknown[0]} is no field, expected one of {sorted(known)}")
+        raise ValueError(unknown_field(prefix, unknown[0], known))
     return kind(**{name: read_value(*known[name], values[name], f"{prefix}{name}") for name in known})
+
+
+def unknown_field(prefix: str, name: str, known: Iterable[str]) -> str:
+    """Returns the message about a field of a config that does not exist, with the name of one that it resembles."""
+    meant = "".join(f"did you mean {each}? " for each in difflib.get_close_matches(name, sorted(known), n=1))
+    return f"--{prefix}{name} is no field, {meant}expected one of {sorted(known)}"
 
 
 def read_value(declared: Option, kind: Any, value: Any, flag: str) -> Any:

@@ -30,7 +30,7 @@ import type_checks  # noqa: E402
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 type_checks.install("jaxnerf", "test_scenes")
-mlir_context.share_context()
+mlir_context.use_one_context()
 # The programs of all tests stay in memory; to search them for garbage at the usual rate is a tenth of the time.
 gc.set_threshold(200_000, 20, 100)
 

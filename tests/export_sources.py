@@ -40,7 +40,7 @@ def orbit(count=14):
     height, angle = 1 - 2 * steps / count, np.pi * (1 + np.sqrt(5)) * steps
     around = np.sqrt(1 - height**2)
     eyes = 3 * np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1)
-    poses = jax.vmap(lambda eye: look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])))(jnp.float32(eyes))
+    poses = jax.jit(jax.vmap(lambda eye: look_at(eye, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))))(jnp.float32(eyes))
     return Views(
         pixels=np.zeros((count * SIZE**2, 3), np.uint8),
         offset=np.arange(count, dtype=np.int32) * SIZE**2,

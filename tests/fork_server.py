@@ -52,7 +52,7 @@ def _serve():
 
 if __name__ == "__main__":
     gc.collect()
-    mlir_context.share_context()
+    mlir_context.use_one_context()
     gc.freeze()  # or the first collection of each program would copy all of it
     program = _serve()
     if program and program.endswith(".py"):

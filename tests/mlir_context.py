@@ -6,16 +6,16 @@ from jax._src.interpreters import mlir
 from jax._src.lib.mlir import ir
 
 
-def share_context():
+def use_one_context():
     """Lets JAX use one context, but a new one for what it compiles in the middle of compiling something else."""
     make = mlir.make_ir_context
-    shared = functools.cache(make)
+    one = functools.cache(make)
 
     def context():
         try:
             ir.Context.current  # noqa: B018
         except ValueError:  # there is none
-            return shared()
+            return one()
         return make()
 
     mlir.make_ir_context = context

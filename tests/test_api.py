@@ -1,11 +1,15 @@
 """The public API is a contract: names, parameters, docstrings, and what an import loads."""
 
+import dataclasses
 import inspect
 import pathlib
+import pickle
 import re
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import jaxnerf
@@ -145,6 +149,71 @@ PLAIN = {
 def test_docstring_names_its_source(name):
     text = " ".join((inspect.getdoc(getattr(jaxnerf, name)) or "").split())
     assert re.search(SOURCE, text), "expected an equation, a section, a paper or the released code"
+
+
+def fog(x, viewdirs):
+    return jnp.ones(x.shape[:-1]), jnp.ones(x.shape)
+
+
+RAYS = jaxnerf.Rays(
+    **{name: [[0.0, 0.0, 1.0]] for name in ("origins", "directions", "viewdirs")}, near=[1.0], far=[2.0]
+)
+POSE = jnp.eye(4)[:3]
+CAMERA = jaxnerf.Camera(to_world=POSE, focal=jnp.ones(2), center=jnp.ones(2))
+WRONG = {
+    "scene is of type Rays, expected a function; the order is key, scene, rays": lambda: jaxnerf.render_rays(
+        None, RAYS, fog, num_samples=2
+    ),
+    "key is a function, expected a key such as jax.random.key(0) or None": lambda: jaxnerf.render_rays(
+        fog, RAYS, None, num_samples=2
+    ),
+    "rays.near is None, expected an array": lambda: jaxnerf.render_rays(
+        None, fog, dataclasses.replace(RAYS, near=None), num_samples=2
+    ),
+    "num_samples is 2.0, expected a whole number": lambda: jaxnerf.render_rays(None, fog, RAYS, num_samples=2.0),
+    "num_samples is a traced array ()": lambda: jax.jit(
+        lambda count: jaxnerf.render_rays(None, fog, RAYS, num_samples=count)
+    )(2),
+    "grid is of type Rays, expected OccupancyGrid or None": lambda: jaxnerf.render_packed(
+        fog, RAYS, RAYS, RAYS, max_samples=2
+    ),
+    "camera is an array (3, 4)": lambda: jaxnerf.rays_from_pixels(POSE, jnp.ones((1, 2)), near=1.0, far=2.0),
+    "a is 'image.png', expected an array": lambda: jaxnerf.psnr("image.png", jnp.ones((2, 2, 3))),
+    "outputs is of type Rays, expected a list": lambda: jaxnerf.distortion_loss(RAYS, RAYS),
+    "expected (3, 4), of one camera; drop the last row": lambda: jaxnerf.rays_from_pixels(
+        dataclasses.replace(CAMERA, to_world=jnp.eye(4)), jnp.ones((1, 2)), near=1.0, far=2.0
+    ),
+    "near has shape (3,), which does not fit (1,)": lambda: jaxnerf.rays_from_pixels(
+        CAMERA, jnp.ones((1, 2)), near=jnp.ones(3), far=2.0
+    ),
+    "near is 3 and far 2, expected near <= far": lambda: jaxnerf.rays_from_pixels(
+        CAMERA, jnp.ones((1, 2)), near=3.0, far=2.0
+    ),
+    "uniform_edges: near is 3 and far 2": lambda: jaxnerf.uniform_edges(3.0, 2.0, num_segments=2),
+    "step_size is 0.0, expected more than 0": lambda: jaxnerf.stepped_edges(
+        None, 1.0, 2.0, step_size=0.0, num_segments=2
+    ),
+    "eye and target are both [1. 2. 3.]": lambda: jaxnerf.look_at((1, 2, 3), (1, 2, 3), (0, 0, 1)),
+    "radius is 0.0, expected more than 0": lambda: jaxnerf.turntable(2, center=(0, 0, 0), radius=0.0, elevation=0.0),
+    "lower is 1 and upper -1": lambda: jaxnerf.create_grid(
+        (1, 1, 1), (-1, -1, -1), jnp.ones((2, 2, 2), bool), initial_density=1.0
+    ),
+    "config is 'smoke', expected RunConfig or ConfigDict or a dict": lambda: jaxnerf.train_and_evaluate("smoke", "run"),
+    "config is 'smoke', expected one such as": lambda: jaxnerf.train_many(["smoke"], ["run"]),
+    "workdir is None, expected text or a path": lambda: jaxnerf.load_scene(None),
+    "needs is 'alpha', expected a list": lambda: jaxnerf.register_loss("wrong", fog, needs="alpha"),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_a_wrong_argument_is_named(message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        WRONG[message]()
+
+
+def test_lists_of_rays_become_arrays():
+    rendering = jaxnerf.render_rays(None, fog, RAYS, num_samples=2)
+    assert rendering.rgb.shape == (1, 3) and pickle.loads(pickle.dumps(jaxnerf.render_rays)) is jaxnerf.render_rays
 
 
 def test_import_is_light():

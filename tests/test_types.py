@@ -16,6 +16,7 @@ from jaxtyping import ArrayLike, Float, TypeCheckError
 
 import jaxnerf
 import jaxnerf.core
+from jaxnerf.core import cameras
 from jaxnerf.core.types import check_shapes
 from type_checks import checked
 
@@ -122,4 +123,4 @@ def test_a_function_that_refuses_a_wrong_shape_raises_its_own_error():
 
 def test_functions_of_the_package_are_checked():
     with pytest.raises(TypeCheckError, match="height"):
-        jaxnerf.pixel_grid(np.float32(4), 4)
+        cameras.pixel_grid(np.float32(4), 4)

@@ -53,7 +53,6 @@ class Job(NamedTuple):
         beside: the "what" of the entries of `speed/published.py` that compare with it.
         origin: how the dataset is made where it is missing; "" if it is downloaded.
         cores: of a CPU that the process may use.
-        headline: whether it is in the table of the README.
     """
 
     dataset: str
@@ -65,7 +64,6 @@ class Job(NamedTuple):
     beside: Sequence[str] = ()
     origin: str = ""
     cores: int = 1
-    headline: bool = True
 
 
 def _blender(dataset, side, seconds, *, work, beside=(), **overrides):
@@ -82,11 +80,6 @@ def _capture(dataset, seconds, *, work, beside=(), origin=""):
     return Job(dataset, "capture", {"data.dir": dataset}, seconds, "capture", work, beside, origin)
 
 
-def _detail(job):
-    """Returns a job that is not in the table of the README."""
-    return job._replace(headline=False)
-
-
 _OF_LEGO = ("lego, 800x800, 25 test views", "lego, 800x800")
 _OF_MIC = ("mic, 800x800, 25 test views", "mic, 800x800")
 _NO_ALPHA = {"scene.use_alpha": False}
@@ -95,27 +88,22 @@ _REPOSE = "jaxnerf-cameras --images=can/images --out=can_reposed"
 _FOLDERS = "'can_undistorted', 'can_reposed/sparse/0', 'can_reposed/images'"
 _UNDISTORT = f'python -c "import pycolmap; pycolmap.undistort_images({_FOLDERS})"'
 JOBS = {
-    "lego_100": _blender("lego", 100, (15, 60), work="100 px", beside=("lego, 100x100, 25 test views",)),
+    "lego_100": _blender("lego", 100, (10, 60), work="100 px", beside=("lego, 100x100, 25 test views",)),
     "lego_100_no_alpha": _blender(
-        "lego", 100, (15, 30, 60, 120), work="100 px, alpha not used", beside=(_WITHOUT_ALPHA,), **_NO_ALPHA
+        "lego", 100, (60,), work="100 px, alpha not used", beside=(_WITHOUT_ALPHA,), **_NO_ALPHA
     ),
-    "lego_400": _blender("lego", 400, (180, 600), work="400 px"),
-    "lego_800": _blender("lego", 800, (600, 2400), work="800 px, its full size", beside=_OF_LEGO),
-    "mic_100": _detail(_blender("mic", 100, (15, 60), work="100 px")),
-    "mic_400": _detail(_blender("mic", 400, (180, 600), work="400 px")),
-    "mic_800": _blender("mic", 800, (600, 2400), work="800 px, its full size", beside=_OF_MIC),
-    "fern_8": _detail(_llff("fern", 8, (300, 600), work="forward-facing, 504 px wide")),
-    "fern_4": _llff("fern", 4, (600, 2400), work="forward-facing, 1008 px wide", beside=("fern, 1008x756",)),
-    "fern_200": _detail(_capture("fern", (120, 300), work="fern, forward-facing, 201 px wide")),
+    "lego_400": _blender("lego", 400, (180,), work="400 px"),
+    "lego_800": _blender("lego", 800, (600,), work="800 px, its full size", beside=_OF_LEGO),
+    "mic_800": _blender("mic", 800, (600,), work="800 px, its full size", beside=_OF_MIC),
+    "fern_4": _llff("fern", 4, (600,), work="forward-facing, 1008 px wide", beside=("fern, 1008x756",)),
+    "trex_8": _llff("trex", 8, (300,), work="forward-facing, 504 px wide"),
     "fox_200": _capture("fox", (120, 300), work="fox, phone images, 216 px wide"),
-    "can_200": _detail(_capture("can", (120, 300), work="can, phone images, 180 px wide", beside=("can, 180x320",))),
-    "can_reposed": _detail(_capture("can_reposed", (120, 300), work="can with new poses, 180 px wide", origin=_REPOSE)),
     "can_undistorted": _capture(
         "can_undistorted",
-        (60, 120, 300),
-        work="can with new poses, undistorted, 177 px wide",
+        (120, 300),
+        work="can, phone images, 177 px wide, cameras of `jaxnerf-cameras`",
         beside=("can with new poses, undistorted, 177x316",),
-        origin=_UNDISTORT,
+        origin=f"{_REPOSE} && {_UNDISTORT}",
     ),
 }
 

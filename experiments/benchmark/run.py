@@ -1,6 +1,6 @@
 """Trains and scores datasets by the published protocols, and writes tables with published figures beside them.
 
-    JAXNERF_SCENES=... python experiments/benchmark/run.py [--jobs=lego_100,mic_400] [--list] [--seconds=5] \
+    JAXNERF_SCENES=... python experiments/benchmark/run.py [--jobs=lego_100,fox_200] [--list] [--seconds=5] \
         [--set=data.factor=16] [--page=docs/results/benchmark.md] [--nerfbaselines=DIR]
 
 Each job of jobs.py is trained for each of its times: one run in a process of its own, on one core where there is only a
@@ -14,13 +14,12 @@ the mark "headline", as in the README. --nerfbaselines writes each run's scores 
 nerfbaselines_layout.py.
 """
 
-import contextlib
 import os
 import pathlib
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from absl import flags
@@ -169,7 +168,7 @@ def _measure(plan, configs, out, commit):
             on_cpu = _is_cpu() if on_cpu is None else on_cpu
             command = [sys.executable, str(_ONE_RUN), f"--job={name}", f"--seconds={time:g}", f"--workdir={workdir}"]
             command += [f"--set={value}" for value in _SET.value]
-            with _few_cores(jobs.JOBS[name].cores if on_cpu else None):
+            with common.few_cores(jobs.JOBS[name].cores if on_cpu else None):
                 status = run_to_end(command, {**os.environ, "JAXNERF_COMMIT": commit})
             score = common.read_json(workdir / settings.SCORE)
             if status or not score:
@@ -198,20 +197,6 @@ def _is_cpu():
     if found.returncode:
         raise ValueError(f"JAX finds no device: {found.stderr.strip().splitlines()[-1]}")
     return found.stdout.split()[-1] == "cpu"
-
-
-@contextlib.contextmanager
-def _few_cores(count: int | None) -> Iterator[None]:
-    """Lets the processes that are started inside use the first so many of this process's cores; all where None."""
-    if count is None or not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(cores)[:count])
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
 
 
 def _publish(lines_of):

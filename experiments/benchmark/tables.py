@@ -134,8 +134,6 @@ def headline(scores: Scores) -> list[str]:
     """Returns the lines of the table of the README: PSNR by seconds, and what others reach on the same images."""
     rows = []
     for name, runs in scores.items():
-        if not jobs.JOBS[name].headline:
-            continue
         ours = ", ".join(f"{score['psnr']:.1f} dB ({score['seconds']:.0f} s)" for score in runs)
         grouped = collections.defaultdict(list)
         for entry in others_of(jobs.JOBS[name], runs, all_views=False):
@@ -164,9 +162,8 @@ def others_of(job: jobs.Job, runs: Sequence[Mapping[str, Any]], *, all_views: bo
     kinds, sizes = job.beside if all_views else job.beside[:1], {images_of(score) for score in runs}
     kinds = [kind for kind in kinds if any(size in kind for size in sizes)]
     entries = [entry for entry in (*published.BENCHMARK, *published.TRAINING) if entry["what"] in kinds]
-    parts = {
-        (entry["what"].removesuffix(", 25 test views"), entry["name"]) for entry in entries if "25" in entry["what"]
-    }
+    part = ", 25 test views"
+    parts = {(entry["what"].removesuffix(part), entry["name"]) for entry in entries if entry["what"].endswith(part)}
     return [entry for entry in entries if (entry["what"], entry["name"]) not in parts]
 
 

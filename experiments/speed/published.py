@@ -42,15 +42,6 @@ RENDERING = [  # seconds of an 800x800 frame, but where another size is said
     _entry("OpenSplat", None, 0.6, "one core, AVX2", "lego, 800x800, trained at 100x100", _BY_HAND, "measured by hand"),
 ]
 
-# Peers on one core of a machine with AVX2, process CPU seconds, one run each, by hand: TensoRF (VM decomposition, grid
-# 32^3 to 100^3) in PyTorch, and OpenSplat's CPU build from 10,000 points on the visual hull of lego and from COLMAP's
-# points of can. Curve of this project beside them: {peer: {seconds: PSNR}}.
-PEERS = {
-    "grid without alpha": {"TensoRF": {15: 28.7, 30: 30.3, 60: 31.9, 120: 32.9}},
-    "grid": {"OpenSplat": {25: 26.1, 52: 28.4, 109: 30.2}},
-    "capture can": {"OpenSplat": {60: 22.6, 120: 23.7, 300: 24.5}},
-}
-
 # Whole test splits, and the 25 of the 200 test views (every 8th) that the benchmark scores.
 _LEGO_25, _MIC, _MIC_25 = "lego, 800x800, 25 test views", "mic, 800x800", "mic, 800x800, 25 test views"
 _PER_IMAGE = "nerfbaselines, results of each image"
@@ -86,18 +77,16 @@ BENCHMARK = [
     _entry("mip-NeRF 360", 31.50, None, "A100", _MIC, _PER_IMAGE),
     _entry("TensoRF", 25.08, 32 * 60, "not said", "fern, 1008x756", _TABLE),
 ]
-_BESIDE = {
-    "grid": "lego, 100x100, 25 test views",
-    "grid without alpha": "lego, 100x100, 25 test views, without alpha",
-    "capture can": "can, 180x320",
-}
+
+# Run by hand, once each: TensoRF (VM decomposition, grid 32^3 to 100^3) in PyTorch, and OpenSplat's build for CPUs from
+# 10,000 points on the visual hull of lego, or from COLMAP's points of can. Seconds are CPU seconds of the process.
+_SIDE_BY_SIDE = (
+    ("TensoRF", "lego, 100x100, 25 test views, without alpha", _AVX2, {15: 28.7, 30: 30.3, 60: 31.9, 120: 32.9}),
+    ("OpenSplat", "lego, 100x100, 25 test views", _AVX2, {25: 26.1, 52: 28.4, 109: 30.2}),
+    ("OpenSplat", "can with new poses, undistorted, 177x316", _TWO_CORES, {60: 20.1, 120: 22.0, 300: 24.6}),
+)
 BENCHMARK += [
-    _entry(name, psnr, seconds, _AVX2, what, _BY_HAND, "side by side")
-    for curve, what in _BESIDE.items()
-    for name, points in PEERS[curve].items()
-    for seconds, psnr in points.items()
-]
-BENCHMARK += [
-    _entry("OpenSplat", psnr, seconds, _TWO_CORES, "can with new poses, undistorted, 177x316", _BY_HAND, "side by side")
-    for seconds, psnr in {60: 20.1, 120: 22.0, 300: 24.6}.items()
+    _entry(name, psnr, seconds, hardware, what, _BY_HAND, "side by side")
+    for name, what, hardware, scores in _SIDE_BY_SIDE
+    for seconds, psnr in scores.items()
 ]

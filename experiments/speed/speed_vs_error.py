@@ -1,7 +1,7 @@
 """Measures error against seconds of training, and where the time of a training step goes.
 
     JAXNERF_SCENES=... python experiments/speed/speed_vs_error.py --out=DIR \
-        [--parts=training,parts] [--curves=grid,dense] [--page=FILE.md]
+        [--parts=training,parts] [--curves=dense,paper] [--page=FILE.md]
 
 Writes DIR/<part>.json and prints the tables. What DIR holds already is kept: the same command resumes after an
 interruption. With --page the tables replace what lies between <!-- speed --> and <!-- end of speed --> in that file.
@@ -22,9 +22,7 @@ PARTS = ("training", "parts")
 _OUT = flags.DEFINE_string("out", None, "Folder of the measurements.", required=True)
 _PARTS = flags.DEFINE_list("parts", list(PARTS), f"Parts to measure, of {PARTS}; 'report' alone measures nothing.")
 _CURVES = flags.DEFINE_list("curves", None, "Names of training curves; all when not given.")
-_SEEDS = flags.DEFINE_list(
-    "seeds", ["0", "1", "2"], f"Seeds of the curves {training.SEEDED}; the others take the first."
-)
+_SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds of each curve.")
 _SECONDS = flags.DEFINE_list("seconds", [], "Seconds of training, in place of the curves' own.")
 
 
@@ -103,21 +101,10 @@ def _training(kept):
 def published_tables() -> list[str]:
     """Returns the lines of what others report."""
     heads = ("system", "on", "PSNR", "s", "hardware", "kind", "source")
-    peers = [
-        (curve, peer, ", ".join(f"{psnr} dB ({seconds} s)" for seconds, psnr in scores.items()))
-        for curve, measured in published.PEERS.items()
-        for peer, scores in measured.items()
-    ]
     return [
         *_others(heads, published.TRAINING, psnr="{:.2f}", seconds="{:,.0f}"),
         "",
         *_others(("system", "frame", "s", "hardware", "kind", "source"), published.RENDERING, seconds="{:.3g}"),
-        "",
-        "Other programs, in CPU seconds of the whole process, start-up included. They were run once each, by hand, on "
-        "one core of a machine with AVX2. TensoRF (PyTorch) does not use alpha. OpenSplat (its build for CPUs) starts "
-        "from 10,000 points on the visual hull of lego, and from COLMAP's points of `can`.",
-        "",
-        *common.markdown(("as the curve", "program", "PSNR of the same test views"), peers),
     ]
 
 

@@ -2,8 +2,7 @@
 
 The profiler times each operation of the compiled step, and the compiler's metadata says which lines of which functions
 an operation comes from. An operation that fuses several lines belongs to the last of them. The profiler itself slows a
-step down, so the table also has the time of a step without it. Run it on one core: otherwise operations of several
-threads are added up.
+step down, so the table also has the time of a step without it.
 """
 
 import collections
@@ -37,7 +36,7 @@ _PARTS = (
 _OTHER = "gradient's norm, copies, counters"
 _LEAST = 0.8  # of the time of a step that its parts must make up
 
-_RUNS = {
+RUNS = {
     "lego, 100 px": ("lego_fast", {"data.factor": 8}),
     "lego, 400 px": ("lego_fast", {"data.factor": 2}),
     "fox, 200 px": ("capture", {"data.dir": "fox"}),
@@ -47,7 +46,7 @@ _RUNS = {
 
 def measure_all(kept: dict[str, Any], save: Callable[[dict], None]) -> None:
     """Measures the step of each run; what was kept is not measured again."""
-    for name, run in _RUNS.items():
+    for name, run in RUNS.items():
         if name not in kept:
             kept[name] = measure(common.configuration(*run))
             save(kept)
@@ -83,7 +82,7 @@ def measure(config, *, warm_up: int = 1500, num_steps: int = 64) -> dict[str, An
         events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
     part_of = parts_of_operations(step.run.as_text())
     parts: collections.Counter = collections.Counter()
-    for name, microseconds in own_times(events, part_of):
+    for name, microseconds in wall_times(events, part_of):
         parts[part_of[name]] += microseconds / 1e3 / num_steps
     if sum(parts.values()) < _LEAST * 1e3 * plain / num_steps:
         raise ValueError(
@@ -102,26 +101,22 @@ def measure(config, *, warm_up: int = 1500, num_steps: int = 64) -> dict[str, An
     }
 
 
-def own_times(events: Iterable[dict], names: Iterable[str]) -> list[tuple[str, float]]:
-    """Returns (name, duration without that of the operations inside) of each event with one of the names.
+def wall_times(events: Iterable[dict], names: Iterable[str]) -> list[tuple[str, float]]:
+    """Returns (name, time until the next operation starts) of each event with one of the names.
+
+    XLA starts an operation when the one before it is done, so this is the time of the step that it takes, whether one
+    thread works on it or several. Where operations run beside each other, the later one is charged.
 
     Args:
-        events: of a trace in Chrome's format: "name", "ph", "tid", "ts" and "dur".
+        events: of a trace in Chrome's format: "name", "ph", "ts" and "dur".
         names: of the operations.
     """
     names = set(names)
     timed = [event for event in events if event.get("ph") == "X" and event["name"] in names]
-    timed.sort(key=lambda event: (event["tid"], event["ts"], -event["dur"]))
-    own: list[list] = []
-    running: list[tuple] = []  # (thread, end, index into own) of the events around the current one
-    for event in timed:
-        while running and (running[-1][0] != event["tid"] or running[-1][1] <= event["ts"]):
-            running.pop()
-        if running:
-            own[running[-1][2]][1] -= event["dur"]
-        running.append((event["tid"], event["ts"] + event["dur"], len(own)))
-        own.append([event["name"], event["dur"]])
-    return [(name, duration) for name, duration in own]
+    timed.sort(key=lambda event: (event["ts"], -event["dur"]))
+    end = max((event["ts"] + event["dur"] for event in timed), default=0)
+    starts = [event["ts"] for event in timed] + [end]
+    return [(event["name"], after - event["ts"]) for event, after in zip(timed, starts[1:], strict=True)]
 
 
 def part_of_stack(frames: Sequence[tuple[str, str]]) -> str:

@@ -37,14 +37,6 @@ _NO_UPDATES = {
 _ADAM = {"train.muon": 0.0, "train.lr_init": 8e-3, "train.lr_final": 3e-4, "train.lr_decay_power": 1.0}
 _PAPER = {"data.format": "blender", "data.dir": "lego", "data.factor": 8}
 CURVES = {
-    "grid": _curve("lego_fast", (10, 15, 30, 60, 120, 300)),
-    "grid without alpha": _curve("lego_fast", (15, 30, 60, 120), **{"scene.use_alpha": False}),
-    "grid 200": _curve("lego_fast", (60, 300), **{"data.factor": 4}),
-    "grid 400": _curve("lego_fast", (180, 600), **{"data.factor": 2}),
-    "grid 800": _curve("lego_fast", (600,), **{"data.factor": 1}),
-    "capture can": _curve("capture", (120, 300, 600), **{"data.dir": "can"}),
-    "capture fern": _curve("capture", (120, 300, 600), **{"data.dir": "fern"}),
-    "capture fox": _curve("capture", (120, 300, 600), **{"data.dir": "fox"}),
     "small network": _curve("lego_mlp_fast", (30, 60, 120, 240, 480)),
     "small network by Adam": _curve("lego_mlp_fast", (30, 60, 120, 240, 480), **_ADAM),
     "small network everywhere": _curve("lego_mlp_fast", (120, 480), **_DENSE),
@@ -58,7 +50,6 @@ CURVES = {
     "paper": _curve("default", (600, 1800), **_PAPER),
     "paper skipping": _curve("default", (600, 1800), **_PAPER, **{"sampler": "occupancy"}),
 }
-SEEDED = ("grid", "grid without alpha")  # the curves that are measured with several seeds
 
 
 def measure(
@@ -78,7 +69,7 @@ def measure(
         save: called with kept after each score.
         folder: of the workdirs.
         names: of CURVES.
-        seeds: of the curves SEEDED; the others take the first.
+        seeds: of each curve.
         seconds: in place of the curves' own.
 
     Returns:
@@ -91,7 +82,7 @@ def measure(
         curve = kept.setdefault("curves", {}).setdefault(name, {**described, "runs": {}})
         if {key: curve[key] for key in described} != described:
             raise ValueError(f"{name}: was measured with {curve['overrides']}; give another --out")
-        for seed in seeds if name in SEEDED else seeds[:1]:
+        for seed in seeds:
             points = curve["runs"].setdefault(str(seed), [])
             for time_limit in sorted(seconds or plan["seconds"]):
                 if any(covers(point, time_limit) for point in points):

@@ -1,6 +1,6 @@
 """Cameras: pixels, lenses, rays and their projective (NDC) form.
 
-Camera axes are x right, y up, looking along -z. Image axes are x right, y down.
+Camera axes are x right, y up, looking along -z. Image axes are x right, y down. An unknown lens is a ValueError.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core.safe_math import at_least_float32, divide, norm, normalize
-from jaxnerf.core.types import Camera, Rays, check_shapes
+from jaxnerf.core.types import Camera, Rays, broadcast, check_order, check_shapes
 
 # Degrees from the axis of a fisheye up to which directions reach the plane at distance 1. Those beyond, also backwards,
 # end on the sphere through that plane's circle at this angle.
@@ -56,9 +56,6 @@ def undistort(
         growing, along the ray or across it: where the Jacobian's determinant is no longer positive. A fisheye's
         pixel at 90 degrees from the axis or beyond is flagged, too: its ray, see `rays_from_pixels`, does not cross
         that plane.
-
-    Raises:
-        ValueError: on other shapes or an unknown lens.
     """
     points, converged = _before_lens("undistort", camera, pixels)
     if _is_fisheye(camera):
@@ -134,7 +131,7 @@ def rays_from_pixels(
         runs along the axis.
 
     Raises:
-        ValueError: on other shapes or an unknown lens.
+        ValueError: on other shapes, an unknown lens, or near > far where known at trace time.
     """
     pixels = jnp.asarray(pixels)
     check_shapes("rays_from_pixels", pixels=(pixels, "... 2"))
@@ -147,7 +144,7 @@ def rays_from_pixels(
     # Sums of products instead of a matmul, which may round the camera to ten bits.
     directions = (to_world[:, :3].reshape(*lead, 3, 3) * local[..., None, :]).sum(axis=-1)
     shape = pixels.shape[:-1]
-    near, far = (jnp.broadcast_to(jnp.asarray(value, directions.dtype), shape) for value in (near, far))
+    near, far = _bounds(directions.dtype, shape, near, far)
     return Rays(
         origins=jnp.broadcast_to(to_world[:, 3], directions.shape).astype(directions.dtype),
         directions=directions,
@@ -165,12 +162,7 @@ def _rays_of_cameras(cameras, pixels, near, far):
         value = getattr(cameras, name)
         if value is not None:
             one = jnp.shape(value)[-2 if name == "to_world" else -1 :]
-            if jnp.shape(value) not in (one, (*count, *one)):
-                raise ValueError(
-                    f"rays_from_pixels: {name} has shape {jnp.shape(value)}, expected {one} or {(*count, *one)} beside "
-                    f"to_world {jnp.shape(cameras.to_world)}; give one for all cameras, or one for each"
-                )
-            flat[name] = jnp.broadcast_to(value, (*count, *one)).reshape(-1, *one)
+            flat[name] = broadcast("rays_from_pixels", (*count, *one), **{name: value})[0].reshape(-1, *one)
     rays = jax.vmap(lambda camera: rays_from_pixels(camera, pixels, near=0.0, far=1.0))(
         dataclasses.replace(cameras, **flat)
     )
@@ -178,13 +170,18 @@ def _rays_of_cameras(cameras, pixels, near, far):
     has_preimage, shape = rays.far > rays.near, rays.near.shape
 
     def of_rays(bound):
-        bound = jnp.asarray(bound, rays.near.dtype)
-        if bound.shape == count:
-            bound = bound.reshape(*count, *(1,) * (pixels.ndim - 1))
-        return jnp.broadcast_to(bound, shape)
+        bound = jnp.asarray(bound)
+        return bound.reshape(*count, *(1,) * (pixels.ndim - 1)) if bound.shape == count else bound
 
-    near, far = of_rays(near), of_rays(far)
+    near, far = _bounds(rays.near.dtype, shape, of_rays(near), of_rays(far))
     return dataclasses.replace(rays, near=near, far=jnp.where(has_preimage, far, near))
+
+
+def _bounds(dtype, shape, near, far):
+    """Returns near and far of rays [*shape]; ValueError on other shapes, or where near is known to be beyond far."""
+    near, far = (each.astype(dtype) for each in broadcast("rays_from_pixels", shape, near=near, far=far))
+    check_order("rays_from_pixels", near=near, far=far)
+    return near, far
 
 
 def _check_one(function, camera, *names, call="lambda camera: {}(camera, ...)", arguments="cameras"):
@@ -192,9 +189,10 @@ def _check_one(function, camera, *names, call="lambda camera: {}(camera, ...)", 
     for name in names:
         found, expected = jnp.shape(getattr(camera, name)), (3, 4) if name == "to_world" else (2,)
         if found != expected:
+            several = f"for several, each array of which has a leading axis, call jax.vmap({call.format(function)})"
+            advice = "drop the last row: to_world[:3]" if found == (4, 4) else f"{several}({arguments})"
             raise ValueError(
-                f"{function}: the camera's {name} has shape {found}, expected {expected}, of one camera; for several, "
-                f"each array of which has a leading axis, call jax.vmap({call.format(function)})({arguments})"
+                f"{function}: the camera's {name} has shape {found}, expected {expected}, of one camera; {advice}"
             )
 
 
@@ -211,9 +209,6 @@ def pixel_radius(camera: Camera, pixels: Num[ArrayLike, "*batch 2"]) -> Float[Ar
     Returns:
         [...] world units per t. For a lens it is that of the pixel's area on that plane, or on the sphere where a
         fisheye's directions end, see `rays_from_pixels`; 0 without a preimage.
-
-    Raises:
-        ValueError: on other shapes or an unknown lens.
     """
     (pixels,) = at_least_float32(pixels)
     check_shapes("pixel_radius", pixels=(pixels, "... 2"))
@@ -239,9 +234,6 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
         the t of rays_from_pixels, also where this is not along the axis, beside a fisheye. A point that the camera
         does not see, behind it or beyond a fold of the lens, see `undistort`, or so near the camera that the gradient
         of its pixel overflows, has pixels inf, with gradient 0.
-
-    Raises:
-        ValueError: on other shapes or an unknown lens.
     """
     x = jnp.asarray(x)
     check_shapes("project", x=(x, "... 3"))
@@ -350,9 +342,6 @@ def ndc_to_t(
 
     Returns:
         [...] in t of the world rays: at the near plane for 0, inf for 1, with gradient 0.
-
-    Raises:
-        ValueError: on other shapes.
     """
     check_shapes("ndc_to_t", t=(t, "..."), near=(rays.near, "..."))
     depth = rays.directions[..., 2]

@@ -18,9 +18,6 @@ def contract(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
     Returns:
         [..., 3]; x with m = max |x_i| > 1 is scaled to 2 - 1 / m and keeps its direction. Components beyond 1e30
         count as 1e30, so that infinity maps to 2.
-
-    Raises:
-        ValueError: on other shapes.
     """
     check_shapes("contract", x=(x, "... 3"))
     x = jnp.clip(x, -1e30, 1e30)
@@ -41,9 +38,6 @@ def length_scale(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
 
     Returns:
         [...] in [0, 1]; 0 at infinity.
-
-    Raises:
-        ValueError: on other shapes.
     """
     check_shapes("length_scale", x=(x, "... 3"))
     largest = _largest(jnp.clip(x, -1e30, 1e30))[..., 0]
@@ -53,11 +47,7 @@ def length_scale(x: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
 
 
 def expand(y: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """Inverts `contract`: returns x with contract(x) = y, for components |y_i| < 2.
-
-    Raises:
-        ValueError: on other shapes.
-    """
+    """Inverts `contract`: returns x with contract(x) = y, for components |y_i| < 2."""
     check_shapes("expand", y=(y, "... 3"))
     largest = _largest(y)
     outside = largest > 1

@@ -108,9 +108,6 @@ def frustum_variance(
 
     Returns:
         [..., S, 3] at least 0, in the square of that unit; exactly 0, with gradient 0, for a radius and a length of 0.
-
-    Raises:
-        ValueError: on other shapes.
     """
     check_shapes("frustum_variance", viewdirs=(viewdirs, "... R 3"), radius=(radius, "... S"), length=(length, "... S"))
     viewdirs, radius, length = at_least_float32(viewdirs, radius, length)

@@ -92,9 +92,6 @@ def psnr(
 
     Returns:
         [...] dB: inf for identical images, with gradient 0; NaN if a colour that counts is NaN.
-
-    Raises:
-        ValueError: as mse.
     """
     return decibels(_mean_squared_error("psnr", a, b, mask))
 
@@ -159,9 +156,6 @@ def align_colors(
 
     Returns:
         [H, W, C], clipped to [0, 1]. A channel that is 0 in all these pixels keeps its colours. NaN stays NaN.
-
-    Raises:
-        ValueError: on other shapes.
     """
     image, target = at_least_float32(image, target)
     check_shapes("align_colors", image=(image, "H W C"), target=(target, "H W C"))

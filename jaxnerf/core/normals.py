@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaxnerf.core.safe_math import normalize
+from jaxnerf.core.scene import evaluate_scene
 from jaxnerf.core.types import SceneFn, check_shapes
 
 # The corners of a tetrahedron at distance 1: four evaluations, where differences along the axes take six.
@@ -39,22 +40,23 @@ def density_normals(
     Returns:
         [..., S, 3] unit length, at least float32; 0, with gradient 0, where the density does not change. With a
         spacing, a density of far less than 0.001 / spacing counts as empty space, and an infinite one is finite.
-
-    Raises:
-        ValueError: on other shapes.
     """
     x = jnp.asarray(x)
     pattern = "... 1 3" if jnp.shape(viewdirs)[-2:-1] == (1,) else "... S 3"
     check_shapes("density_normals", x=(x, "... S 3"), viewdirs=(viewdirs, pattern))
+
+    def density_at(x, viewdirs, inputs):
+        return evaluate_scene("density_normals", scene, x, viewdirs, inputs)[0]
+
     if spacing is None:
-        return -normalize(jax.grad(lambda x: scene(x, viewdirs, **inputs)[0].sum())(x))
+        return -normalize(jax.grad(lambda x: density_at(x, viewdirs, inputs).sum())(x))
     length = jnp.broadcast_to(jnp.asarray(spacing, x.dtype), x.shape[:-1])
     around = jnp.stack([x + jnp.stack([length * each for each in corner], axis=-1) for corner in _CORNERS])
 
     def repeated(value):
         return value if jnp.ndim(value) == 0 else jnp.broadcast_to(value, (len(_CORNERS), *jnp.shape(value)))
 
-    density = scene(around, repeated(viewdirs), **{name: repeated(value) for name, value in inputs.items()})[0]
+    density = density_at(around, repeated(viewdirs), {name: repeated(value) for name, value in inputs.items()})
     levels = jnp.log1p(jnp.minimum(density * repeated(length) / _LEAST_DEPTH, _LARGEST_DEPTH))
     change = levels - levels[:1]  # exactly 0 where all are equal
     return -normalize(jnp.einsum("c...,ca->...a", change, jnp.asarray(_CORNERS, change.dtype)))

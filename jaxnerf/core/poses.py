@@ -11,7 +11,7 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from jaxnerf.core.safe_math import norm, normalize
-from jaxnerf.core.types import Vector, check_shapes
+from jaxnerf.core.types import Vector, check_shapes, is_known
 
 
 def turntable(
@@ -33,12 +33,11 @@ def turntable(
 
     Returns:
         Poses [N, 3, 4].
-
-    Raises:
-        ValueError: on other shapes.
     """
     center, up = jnp.asarray(center, jnp.float32), jnp.asarray(up, jnp.float32)
-    check_shapes("turntable", center=(center, "3"), up=(up, "3"))
+    check_shapes("turntable", center=(center, "3"), up=(up, "3"), radius=(radius, ""))
+    if is_known(jnp.asarray(radius) <= 0):
+        raise ValueError(f"turntable: radius is {radius}, expected more than 0")
     up = normalize(up)
     across = jnp.cross(up, jnp.array([1.0, 0.1, 0.0]))
     first = normalize(jnp.where(norm(across) > 1e-3, across, jnp.cross(up, jnp.array([0.0, 1.0, 0.0]))))
@@ -62,9 +61,6 @@ def ellipse(
 
     Returns:
         Poses [N, 3, 4].
-
-    Raises:
-        ValueError: on other shapes.
     """
     middle, axes, target, up = (jnp.asarray(value, jnp.float32) for value in (middle, axes, target, up))
     check_shapes("ellipse", middle=(middle, "3"), axes=(axes, "2 3"), target=(target, "3"), up=(up, "3"))
@@ -97,9 +93,6 @@ def spiral(
 
     Returns:
         Poses [N, 3, 4].
-
-    Raises:
-        ValueError: on other shapes.
     """
     pose, radii = jnp.asarray(pose, jnp.float32), jnp.asarray(radii, jnp.float32)
     check_shapes("spiral", pose=(pose, "3 4"), radii=(radii, "3"))
@@ -125,9 +118,6 @@ def interpolate(num_frames: int, *, poses: Num[ArrayLike, "K 3 4"], closed: bool
 
     Returns:
         Poses [N, 3, 4].
-
-    Raises:
-        ValueError: on other shapes.
     """
     poses = jnp.asarray(poses, jnp.float32)
     check_shapes("interpolate", poses=(poses, "K 3 4"))
@@ -162,18 +152,17 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Float[Array, "3 4"]:
         target: [3] the point in the center of the image, world.
         up: [3] upwards in the image, any length > 0. If it is parallel to the viewing direction, within 1e-6
             radians, the coordinate axis after that of the direction's largest component replaces it: y after x, z
-            after y, x after z. No direction leads from a point to itself: a target at the eye makes the rotation 0.
+            after y, x after z. A traced target at the eye, to which no direction leads, makes the rotation 0.
 
     Returns:
         Pose [3, 4], camera to world, orthonormal also where up is nearly parallel to the viewing direction. The
         gradient is finite; it grows as the inverse of the angle between them, to 1e6, and is 0 with respect to an up
         that is replaced.
-
-    Raises:
-        ValueError: on other shapes.
     """
     eye, target, up = (jnp.asarray(value, jnp.float32) for value in (eye, target, up))
     check_shapes("look_at", eye=(eye, "3"), target=(target, "3"), up=(up, "3"))
+    if is_known((eye == target).all()):
+        raise ValueError(f"look_at: eye and target are both {eye}, expected two points; move one of them")
     back = normalize(eye - target)
     right, largest = jnp.cross(normalize(up), back), jnp.arange(3) == jnp.abs(back).argmax()
     sine = norm(right)
@@ -207,9 +196,6 @@ def se3_exponential(twists: Float[ArrayLike, "*batch 6"]) -> Float[Array, "*batc
     Returns:
         [..., 3, 4] rotation and translation; the identity for a twist of 0. Values and all derivatives are exact
         there, as a, b and c are power series in s^2 below s = 1.
-
-    Raises:
-        ValueError: on other shapes.
     """
     twists = jnp.asarray(twists)
     check_shapes("se3_exponential", twists=(twists, "... 6"))

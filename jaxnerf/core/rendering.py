@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from jaxnerf.core import sampling, volume_rendering
 from jaxnerf.core.safe_math import norm
-from jaxnerf.core.scene import inputs_of
+from jaxnerf.core.scene import evaluate_scene, inputs_of
 from jaxnerf.core.types import Background, Keys, Rays, Rendering, Samples, SceneFn, check_shapes, without_samples
 
 
@@ -164,9 +164,6 @@ def render_hierarchical(
 
     Returns:
         (Rendering, Rendering): coarse and fine. No gradient flows from the fine one to the coarse scene.
-
-    Raises:
-        ValueError: as render_rays.
     """
     coarse_key, point_key, fine_key = sampling.split_key(key, 3)
     if rule == "points":
@@ -212,6 +209,8 @@ def render_image(render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int)
     parts = []
     for start in range(0, count, chunk):
         part = render(_take_chunk(rays, start, chunk=chunk))
+        if not isinstance(part, Rendering):
+            raise ValueError(f"render_image: render returned {type(part).__name__}, expected a Rendering of its rays")
         parts.append(without_samples(part))
     return _join_chunks(parts, shape=shape)
 
@@ -230,42 +229,6 @@ def _join_chunks(parts, *, shape):
     count = math.prod(shape)
     whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), whole)
-
-
-def evaluate_scene(
-    function: str,
-    scene: SceneFn,
-    x: Float[ArrayLike, "*batch samples 3"],
-    viewdirs: Float[ArrayLike, "*batch #samples 3"],
-    inputs: Mapping[str, Num[ArrayLike, "..."]],
-) -> tuple[Num[Array, "*batch samples"], Num[Array, "*batch samples channels"]]:
-    """Evaluates a scene, and checks what it returns.
-
-    Args:
-        function: name of the calling function, for messages.
-        scene: see render_samples.
-        x: [..., S, 3] world units.
-        viewdirs: [..., 1 or S, 3].
-        inputs: what the scene asks for, see `sample_inputs`.
-
-    Returns:
-        density [..., S] and rgb [..., S, C].
-
-    Raises:
-        ValueError: if they have other shapes. An error of the scene itself gets a note with the shapes it was given.
-    """
-    try:
-        density, rgb = scene(x, viewdirs, **inputs)
-    except Exception as error:
-        error.add_note(f"{function} called the scene with x {x.shape} and viewdirs {viewdirs.shape}, which broadcast")
-        raise
-    fits = density.shape == x.shape[:-1] == rgb.shape[:-1] and rgb.shape[-1] > 0
-    if not fits:
-        raise ValueError(
-            f"{function}: the scene returned density {density.shape} and rgb {rgb.shape} for positions "
-            f"{x.shape}, expected {x.shape[:-1]} and {x.shape}, or another number of channels than 3"
-        )
-    return density, rgb
 
 
 def sample_inputs(
@@ -348,6 +311,8 @@ def _uniform_edges(name, rays, num_samples, rule, in_disparity):
 
 def _num_segments(name, num_samples, rule):
     """Returns the number of segments for a number of samples."""
+    if num_samples < 1:
+        raise ValueError(f"{name} is {num_samples}, expected at least 1")
     if rule not in ("segments", "gauss"):
         raise ValueError(f"rule is {rule!r}, expected 'segments', 'gauss' or 'points'")
     if rule == "gauss" and num_samples % 2:

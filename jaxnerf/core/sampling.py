@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Key, Num
 
 from jaxnerf.core.safe_math import at_least_float32, clamp, divide, divide_by_largest
-from jaxnerf.core.types import Keys, Samples, check_shapes
+from jaxnerf.core.types import Keys, Samples, broadcast, check_order, check_shapes, is_known
 
 
 def uniform_edges(
@@ -27,17 +27,18 @@ def uniform_edges(
         [..., S + 1] ascending edges; the first is near and the last is far, exactly.
 
     Raises:
-        ValueError: on other shapes, S < 1, or disparity with a near <= 0 that is known at trace time.
+        ValueError: on other shapes, S < 1, or near > far or disparity with near <= 0 where known at trace time.
     """
     near, far = jnp.asarray(near), jnp.asarray(far)
     check_shapes("uniform_edges", near=(near, "..."), far=(far, "..."))
+    check_order("uniform_edges", near=near, far=far)
     if num_segments < 1:
         raise ValueError(f"uniform_edges: num_segments is {num_segments}, expected at least 1")
     dtype = jnp.result_type(jnp.float32, near.dtype, far.dtype)
     near, far = near[..., None].astype(dtype), far[..., None].astype(dtype)
     s = (jnp.arange(1, num_segments, dtype=dtype) / num_segments).reshape((1,) * (near.ndim - 1) + (-1,))
     if in_disparity:
-        if _is_known(~(near > 0).all()):
+        if is_known(~(near > 0).all()):
             raise ValueError(f"uniform_edges: near has {near.min()}, expected near > 0 for disparity 1 / t; raise near")
         inner = near / ((1 - s) + s * (near / far))
     else:
@@ -71,15 +72,18 @@ def stepped_edges(
         [..., S + 1] ascending edges; the first is near and the last is far, exactly.
 
     Raises:
-        ValueError: on other shapes or S < 1.
+        ValueError: on other shapes or S < 1, or near > far or step_size <= 0 where known at trace time.
     """
-    near, far = at_least_float32(jnp.asarray(near), jnp.asarray(far))
+    near, far = at_least_float32(near, far)
     check_shapes("stepped_edges", near=(near, "..."), far=(far, "..."))
+    check_order("stepped_edges", near=near, far=far)
     if num_segments < 1:
         raise ValueError(f"stepped_edges: num_segments is {num_segments}, expected at least 1")
     shift = 0.0 if key is None else uniform(key, (*near.shape, 1))
     count = jnp.arange(num_segments + 1, dtype=near.dtype).reshape((1,) * near.ndim + (-1,))
-    step = jnp.broadcast_to(jnp.asarray(step_size, near.dtype), near.shape)
+    (step,) = broadcast("stepped_edges", near.shape, step_size=jnp.asarray(step_size, near.dtype))
+    if is_known((step <= 0).any()):
+        raise ValueError(f"stepped_edges: step_size is {step.min()}, expected more than 0")
     return edges_after_steps(count, near[..., None], far[..., None], step[..., None], num_segments, shift)
 
 
@@ -139,9 +143,6 @@ def samples_from_points(t: Num[ArrayLike, "*batch samples"], *, last_delta: Num[
 
     Returns:
         Samples [..., S].
-
-    Raises:
-        ValueError: if t has no sample axis.
     """
     (t,) = at_least_float32(t)
     check_shapes("samples_from_points", t=(t, "... S"))
@@ -169,9 +170,6 @@ def inverse_cdf(
         [..., N] in t, within [first edge, last edge], ascending where u is. Gradients with respect
         to edges and u are those of the interpolation. In a segment that ends at inf, 1 / t is
         interpolated. If a weight is NaN, all points are.
-
-    Raises:
-        ValueError: on other shapes.
     """
     edges, weights, u = at_least_float32(edges, weights, u)
     check_shapes("inverse_cdf", edges=(edges, "... E"), weights=(weights, "... S"), u=(u, "... N"))
@@ -246,9 +244,6 @@ def merge_edges(
 
     Returns:
         [..., S + N + 1] ascending; a repeated edge makes a segment of width 0, which has no weight.
-
-    Raises:
-        ValueError: if the leading axes differ.
     """
     edges, points = at_least_float32(edges, points)
     check_shapes("merge_edges", edges=(edges, "... E"), points=(points, "... N"))
@@ -274,13 +269,10 @@ def stratified_points(
 
     Returns:
         [..., S] ascending, in t.
-
-    Raises:
-        ValueError: as uniform_edges.
     """
     if num_points < 2:
         raise ValueError(f"stratified_points: num_points is {num_points}, expected at least 2")
-    if _is_known(jnp.isinf(jnp.asarray(far)).any()):
+    if is_known(jnp.isinf(jnp.asarray(far)).any()):
         raise ValueError("stratified_points: far is inf, expected a finite far, where the last point lies")
     points = uniform_edges(near, far, num_segments=num_points - 1, in_disparity=in_disparity)
     if key is None:
@@ -400,11 +392,6 @@ def _count_below(sums, target):
 
 def _take(values, index):
     return jnp.take_along_axis(values, index, axis=-1)
-
-
-def _is_known(condition):
-    """Returns whether a condition is known to hold at trace time."""
-    return not isinstance(condition, jax.core.Tracer) and bool(condition)
 
 
 def _check_edges(function, edges):

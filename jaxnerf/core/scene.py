@@ -1,11 +1,13 @@
-"""What a scene asks for beyond positions and directions: keyword-only parameters, found by name when it is traced."""
+"""Evaluates scenes, and finds what they ask for beyond positions and directions by keyword-only parameters."""
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from jaxnerf.core.types import SceneFn
 
 # Each is given per sample; [..., 1] stands for one value per ray.
 #   radius        [..., S]       of the cone around the ray, at the sample, world units (arXiv:2103.13415)
@@ -25,11 +27,50 @@ _REMEDIES = {
 _EXAMPLES = {"radius": "0.01", "length": "0.01", "time": "0.0", "image_index": "0", "progress": "1.0"}
 
 
+def evaluate_scene(
+    function: str,
+    scene: SceneFn,
+    x: Float[ArrayLike, "*batch samples 3"],
+    viewdirs: Float[ArrayLike, "*batch #samples 3"],
+    inputs: Mapping[str, Num[ArrayLike, "..."]],
+) -> tuple[Num[Array, "*batch samples"], Num[Array, "*batch samples channels"]]:
+    """Evaluates a scene, and checks what it returns.
+
+    Args:
+        function: name of the calling function, for messages.
+        scene: see render_samples.
+        x: [..., S, 3] world units.
+        viewdirs: [..., 1 or S, 3].
+        inputs: what the scene asks for, see `sample_inputs`.
+
+    Returns:
+        density [..., S] and rgb [..., S, C].
+
+    Raises:
+        ValueError: if they have other shapes. An error of the scene itself gets a note with the shapes it was given.
+    """
+    try:
+        found = scene(x, viewdirs, **inputs)
+    except Exception as error:
+        error.add_note(f"{function} called the scene with x {x.shape} and viewdirs {viewdirs.shape}, which broadcast")
+        raise
+    pair = isinstance(found, tuple | list) and len(found) == 2
+    density, rgb = (getattr(each, "shape", type(each).__name__) for each in (found if pair else (found, found)))
+    if not (pair and density == x.shape[:-1] == rgb[:-1] and rgb[-1:] > (0,)):
+        returned = f"density {density} and rgb {rgb}" if pair else f"{density} in place of a pair"
+        raise ValueError(
+            f"{function}: the scene returned {returned} for positions {x.shape}, expected density {x.shape[:-1]} and "
+            f"rgb {x.shape}, or another number of channels than 3"
+        )
+    return found
+
+
 def needs_of(scene: Callable[..., Any]) -> tuple[str, ...]:
     """Returns the names, of NEEDS, that a scene or the `apply` of a field takes as keyword-only parameters.
 
     functools.partial, functools.wraps and JAX's transformations are followed. What functools.partial has bound by
-    name is no longer asked for. A function without a signature asks for nothing.
+    name is no longer asked for. A function without a signature asks for nothing. ValueError on another such parameter
+    that has no default.
     """
     return tuple(_parameters(scene))
 
@@ -74,9 +115,14 @@ def _parameters(scene):
         parameters = inspect.signature(scene).parameters
     except (TypeError, ValueError):  # of some builtins
         return {}
-    found = {name: parameters[name] for name in NEEDS if name in parameters and name not in bound}
-    keyword_only = inspect.Parameter.KEYWORD_ONLY
-    return {name: each.default is not each.empty for name, each in found.items() if each.kind is keyword_only}
+    free = {name: each for name, each in parameters.items() if each.kind is each.KEYWORD_ONLY and name not in bound}
+    unknown = [name for name, each in free.items() if name not in NEEDS and each.default is each.empty]
+    if unknown:
+        raise ValueError(
+            f"the scene asks for {unknown[0]} by a keyword-only parameter, expected one of {', '.join(NEEDS)}; bind it "
+            f"with functools.partial(scene, {unknown[0]}=...), or give it a default"
+        )
+    return {name: free[name].default is not inspect.Parameter.empty for name in NEEDS if name in free}
 
 
 def _is_wrapper(scene):

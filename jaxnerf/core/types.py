@@ -161,11 +161,9 @@ class Renderings(tuple[Rendering, ...]):
     """
 
     def __new__(cls, by_network: Mapping[str, Rendering], compared: Sequence[str]) -> "Renderings":
-        """Makes the tuple from the renderings by network, and the names of those that are compared.
-
-        Raises:
-            ValueError: if one of these networks has no rendering.
-        """
+        """Makes the tuple from the renderings by network, and the names of those that are compared."""
+        if not isinstance(by_network, Mapping):
+            raise ValueError(f"the sampler returned {type(by_network).__name__}, expected a Rendering of each network")
         renderings = super().__new__(cls, (_rendering_of(by_network, name) for name in compared))
         renderings._by_network, renderings._compared = dict(by_network), tuple(compared)
         return renderings
@@ -268,6 +266,30 @@ class Batch:
     alpha: Float[Array, " B"] | None = None
     depth: Float[Array, " B"] | None = None
     depth_weight: Float[Array, " B"] | None = None
+
+
+def is_known(condition: object) -> bool:
+    """Returns whether a condition is known to hold at trace time."""
+    return not isinstance(condition, jax.core.Tracer) and bool(condition)
+
+
+def check_order(function: str, **bounds: Num[Array, "..."]) -> None:
+    """Raises a ValueError if the first of two arrays of bounds, by name, is known to be above the second somewhere."""
+    (low, lows), (high, highs) = bounds.items()
+    if is_known((wrong := lows > highs).any()):
+        values = [each.reshape(-1)[jnp.argmax(wrong)] for each in (lows, highs)]
+        raise ValueError(f"{function}: {low} is {values[0]:g} and {high} {values[1]:g}, expected {low} <= {high}")
+
+
+def broadcast(function: str, shape: tuple[int, ...], **arrays: Num[ArrayLike, "..."]) -> list[Num[Array, "..."]]:
+    """Broadcasts arrays, by their names, to a shape; ValueError, with the name of the calling function, on others."""
+    found = []
+    for name, value in arrays.items():
+        try:
+            found.append(jnp.broadcast_to(value, shape))
+        except ValueError:
+            raise ValueError(f"{function}: {name} has shape {jnp.shape(value)}, which does not fit {shape}") from None
+    return found
 
 
 def check_shapes(function: str, **arrays: tuple[object, str]) -> None:

@@ -64,9 +64,6 @@ def transmittance(
 
     Returns:
         [...] in [0, 1]; accurate even where 1 - sum of weights would cancel.
-
-    Raises:
-        ValueError: if the shapes differ.
     """
     return jnp.exp(-optical_depth("transmittance", density, length).sum(axis=-1))
 
@@ -109,9 +106,6 @@ def composite(
 
     Returns:
         [..., C], at least float32.
-
-    Raises:
-        ValueError: on other shapes.
     """
     weights, values = at_least_float32(weights, values)
     check_shapes("composite", weights=(weights, "... S"), values=(values, "... S C"))
@@ -154,9 +148,6 @@ def expected_depth(
     Returns:
         [...] in t. An empty ray has depth far. 0 times an infinite t or far is 0, not NaN, and an infinite t or
         far gives its factor gradient 0.
-
-    Raises:
-        ValueError: on other shapes.
     """
     weights, t, transmittance, far = at_least_float32(weights, t, transmittance, far)
     check_shapes(
@@ -196,9 +187,6 @@ def median_depth(
         [...] in t, at most far; far where the transmittance stays above one half. A segment of infinite delta counts
         as opaque where it begins. The depth jumps where another surface reaches one half, so that its gradient
         describes only the surface that it lies on.
-
-    Raises:
-        ValueError: on other shapes.
     """
     depth = optical_depth("median_depth", density, length)
     t, delta, far = at_least_float32(t, delta, far)
@@ -256,9 +244,6 @@ def expected_disparity(
     Returns:
         [...] in 1 / t; 0 for an empty ray, also with samples at t = 0. A weight at t = 0 makes it
         inf, with gradient 0.
-
-    Raises:
-        ValueError: if the shapes differ.
     """
     weights, t = at_least_float32(weights, t)
     check_shapes("expected_disparity", weights=(weights, "... S"), t=(t, "... S"))
@@ -277,9 +262,6 @@ def packed_weights(
 
     Returns:
         [K] weights, and [K] optical depths sigma l, capped where exp(-sigma l) is 0.
-
-    Raises:
-        ValueError: if the shapes differ.
     """
     depth = optical_depth("packed_weights", density, length)
     check_shapes("packed_weights", density=(density, "K"), starts=(starts, "K"))

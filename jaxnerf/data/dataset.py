@@ -370,16 +370,12 @@ def is_there(data: DataOptions) -> bool:
 
 
 def dataset_folder(name: str) -> pathlib.Path:
-    """Returns the folder of that path, or else of that name below $JAXNERF_SCENES.
-
-    Raises:
-        ValueError: if neither exists.
-    """
+    """Returns the folder of that path, or else of that name below $JAXNERF_SCENES; ValueError if neither exists."""
     scenes = os.environ.get("JAXNERF_SCENES")
     places = [pathlib.Path(name)] + ([pathlib.Path(scenes, name)] if scenes else [])
     found = [place for place in places if name and place.is_dir()]
     if not found:
-        searched = " or ".join(str(place.absolute()) for place in places) if name else "nothing"
+        searched = " or ".join(dict.fromkeys(str(place.absolute()) for place in places)) if name else "nothing"
         raise ValueError(f"data.dir is {name!r}: no such folder, searched {searched}; set it with --data_dir")
     return found[0]
 

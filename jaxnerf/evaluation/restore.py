@@ -160,14 +160,10 @@ def refined_views(run: TrainedRun, views: Views, split: str, params: Any) -> Vie
 
 
 def newest_step(run: TrainedRun, workdir: str | os.PathLike, step: int | None = None) -> int:
-    """Returns the newest checkpoint's step, or the given one.
-
-    Raises:
-        ValueError: if there is no such checkpoint; names the workdir.
-    """
+    """Returns the newest checkpoint's step, or the given one; ValueError, with the workdir, if there is none."""
     steps = run.steps()
     if not steps:
-        raise ValueError(f"{workdir}: has no checkpoint yet; train first, or wait with --watch")
+        raise ValueError(f"{workdir}: has no checkpoint yet; train first")
     if step is not None and step not in steps:
         raise ValueError(f"{workdir}: has no checkpoint of step {step}, only {steps}; give one of these")
     return steps[-1] if step is None else step

@@ -64,9 +64,6 @@ def still_life(x: Positions, viewdirs: Directions) -> Output:
     Returns:
         density [..., S] in 1 / world unit, at most 50 in a single body; rgb [..., S, 3] in [0, 1]. In empty
         space the colour is a mean of all bodies', which no ray shows. Gradients are finite everywhere.
-
-    Raises:
-        ValueError: on other shapes.
     """
     return finished_still_life(x, viewdirs, "usual")
 

@@ -14,13 +14,8 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import IO, Any
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 _MAX_DEPTH = 100  # of JSON and of folders; functions that call themselves for each level must not fail
 _NO_LINK, _NO_WAIT = getattr(os, "O_NOFOLLOW", 0), getattr(os, "O_NONBLOCK", 0)
@@ -208,89 +203,6 @@ def write_text_once(path: str | os.PathLike, text: str) -> None:
             os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def partial_folder(target: str | os.PathLike) -> Iterator[pathlib.Path]:
-    """Yields a new, empty folder to fill, and then moves it to `target`, where it replaces what is there.
-
-    It lies beside `target`, has a random name, and is locked for as long as the process lives. Such folders that
-    killed processes have left beside `target`, and which nobody locks, are removed first.
-
-    Raises:
-        OSError: with the path.
-    """
-    target = pathlib.Path(target)
-    for left in target.parent.glob(f"*.{'[0-9a-f]' * 16}.tmp*"):
-        if left.is_dir() and not left.is_symlink() and (lock := _lock_folder(left)) is not None:
-            shutil.rmtree(left, ignore_errors=True)
-            os.close(lock)
-    lock = None
-    while lock is None:  # another process can have taken it for an abandoned one before it was locked
-        partial = target.with_name(f"{target.name}.{secrets.token_hex(8)}.tmp")
-        partial.mkdir()
-        lock = _lock_folder(partial, missing=-1)
-    try:
-        with naming(partial):
-            yield partial
-        replaced = partial.with_name(f"{partial.name}.old")
-        if target.exists():
-            target.rename(replaced)
-        partial.rename(target)
-        remove(replaced)
-    finally:
-        remove(partial)
-        if lock >= 0:
-            os.close(lock)
-
-
-def _lock_folder(folder, missing=None):
-    """Returns a descriptor that locks a folder until it is closed, or None if another process does or it is gone.
-
-    Where the system has no such locks it returns `missing`.
-    """
-    if fcntl is None:
-        return missing
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(descriptor)
-        return None if isinstance(error, BlockingIOError) else missing
-    if folder.exists():
-        return descriptor
-    os.close(descriptor)
-    return None
-
-
-@contextlib.contextmanager
-def one_at_a_time(path: str | os.PathLike, waiting: Callable[[], None]) -> Iterator[None]:
-    """Lets one process at a time do something; the others wait.
-
-    Where the system has no flock, as on some network file systems, no process waits.
-
-    Args:
-        path: of a file, made if missing, with its folder. It stays and locks nobody out, as the system releases the
-            lock however the process ends.
-        waiting: called once if this process has to wait.
-
-    Raises:
-        OSError: with the path, if nothing can be written there.
-    """
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open_regular(path, "a") as file:
-        if fcntl is not None:
-            with contextlib.suppress(OSError):
-                try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    waiting()
-                    fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def sweep(folder: pathlib.Path, pattern: str = "*.tmp") -> None:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from absl import app, flags, logging
-from ml_collections import config_flags
+from ml_collections import ConfigDict, config_flags
 
 from jaxnerf.options import MAX_INT, Option, between, is_auto, is_tuple
 from jaxnerf.registry import READERS, needs_folder
@@ -78,7 +78,7 @@ def run(
         except UnicodeEncodeError as error:
             _leave(1, f"a name is not UTF-8: {error.object[:200]!r} ({error.reason}); rename the file or the folder")
         except (ValueError, OSError) as error:
-            _leave(1, error)
+            _leave(1, _in_words_of_file(str(error)))
         except MemoryError as error:
             _leave(1, f"out of memory ({error}); free memory, or reduce what the flags ask for")
 
@@ -132,7 +132,7 @@ def define_config(
         if describe_options and value == "help:options":
             print(describe_options())
             sys.exit(0)
-        return load(_list_configs() if value == "help" else config_path(value))
+        return _load_file(load, _list_configs() if value == "help" else config_path(value))
 
     parser.parse, parser.option_names = parse, option_names
     if required:
@@ -191,11 +191,7 @@ def define_option(name: str, declared: Option, kind: Any, help: str) -> flags.Fl
 
 
 def use_data(config, data_dir: str | None, format: str | None = None):
-    """Puts --data_dir and --format into a config and returns it.
-
-    Raises:
-        ValueError: if there is no such format.
-    """
+    """Puts --data_dir and --format into a config and returns it; ValueError if there is no such format."""
     if format and format != "auto":
         READERS.get(format)
     if data_dir:
@@ -225,11 +221,45 @@ def config_path(value: str) -> str:
         if os.path.isfile(name):
             return value
         near = difflib.get_close_matches(name, config_names(), n=1)
+        near = [f"{name}.py"] if os.path.isfile(f"{name}.py") else near
         meant = f"; did you mean {near[0]}?" if near else ""
         raise ValueError(
             f"there is no file and no config {name!r}, expected a path or one of {', '.join(config_names())}{meant}"
         )
     return f"{CONFIGS / name}.py{colon}{argument}"
+
+
+def _load_file(load, path):
+    """Returns the config of a file; a fault in the file ends the program with one line that names its place."""
+    file = path.partition(":")[0]
+    std_logging.disable(std_logging.WARNING)  # that of ml_collections, where the file returns None
+    try:
+        config = load(path)
+        if isinstance(config, ConfigDict):
+            return config
+        fault = f"get_config() returns {type(config).__name__}, expected a ConfigDict"
+        fault = getattr(config, "_error", fault)  # of a file that cannot be read
+    except Exception as error:
+        if str(error).startswith("Error whilst parsing"):  # ml_collections raises it again, with its trace as text
+            error = error.__context__
+        if failed := failed_imports.reason(error):
+            _leave(1, failed)
+        trace = traceback.extract_tb(error.__traceback__)
+        places = [each.lineno for each in trace if os.path.abspath(each.filename) == os.path.abspath(file)]
+        file, fault = ", line ".join([file, *map(str, places[-1:])]), f"{type(error).__name__}: {_unquoted(error)}"
+        if not places and "no attribute 'get_config'" in fault:
+            fault = "defines no get_config(), which returns the config"
+    finally:
+        std_logging.disable(std_logging.NOTSET)
+    _leave(2, f"--config: {file}: {fault}; correct the file")
+
+
+def _in_words_of_file(message):
+    """Returns a message about an option with the config file's name, where no flag but the file has set the option."""
+    flag, file = re.match(r"--(config\.[\w.]+)", message), given_flag("config", sys.argv).partition(":")[0]
+    if not flag or not os.path.isfile(file) or any(flag[1] in argument for argument in sys.argv):
+        return message
+    return f"{file}: {message[2:]}"
 
 
 def _list_configs():
@@ -284,6 +314,8 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
             number = isinstance(flag.value, int | float) and "." not in flag.name  # options have their own ranges
             if number and not abs(flag.value) <= MAX_INT:  # nor NaN, which is in every range of absl
                 _leave(2, f"--{flag.name} is {str(flag.value):.40}, expected at most {MAX_INT:,}; correct it")
+            if flag.value == "" and flag.present and "." not in flag.name:
+                _leave(2, f"--{flag.name} is empty; give a value, or omit it")
         verbosity = flags.FLAGS["verbosity"]
         if not verbosity.present or verbosity.value in (0, 1):
             level = std_logging.INFO if verbosity.present else std_logging.WARNING
@@ -304,39 +336,42 @@ def _parse(argv: Sequence[str], module: str) -> list[str]:
         if error.flagname.startswith("config."):
             _leave(2, f"{error}; give --config=NAME, which has such fields")
         meant = _options_meant(error.flagname)
-        hint = f"--{error.flagname}: no such flag; did you mean {' or '.join(meant)}?"
-        _leave(2, hint if meant else error)
+        _leave(2, f"--{error.flagname}: no such flag; {meant}" if meant else error)
     except Exception as error:
         if failed := failed_imports.reason(error):
             _leave(1, failed)
         if isinstance(error, (flags.Error, TypeError, ValueError, OSError, ImportError, SyntaxError)):
             _leave(2, error)
-        *_, place = trace = traceback.extract_tb(error.__traceback__)
-        if "ml_collections" in pathlib.Path(place.filename).parts and isinstance(error, AttributeError | KeyError):
-            where = "--config=help:options lists all fields, those of registered parts with --plugins=MODULE, too"
-            _leave(2, f"the config has no such field: {_unquoted(error)}; {where}")
-        file = given_flag("config", argv).partition(":")[0]
-        places = [each for each in trace if file and os.path.abspath(each.filename) == os.path.abspath(file)]
-        if not places:
+        if not isinstance(error, AttributeError | KeyError):
             raise
-        place = f"{file}, line {places[-1].lineno}"
-        _leave(2, f"--config: {place}: {type(error).__name__}: {error}; correct the file")
+        given = [found for each in argv[1:] if (found := re.match(r"--?(?:no)?config\.([^=]+)", each))]
+        wrong = [found[1] for found in given if found[1] not in _option_names()]
+        if not wrong:
+            raise
+        where = "--config=help:options lists all options, those of registered parts with --plugins=MODULE, too"
+        _leave(2, f"--config.{wrong[0]}: no such option; {' '.join([_options_meant(wrong[0]), where]).strip()}")
+
+
+def _option_names():
+    """Returns the names "section.option" of all options; none of a program without --config."""
+    parser = flags.FLAGS["config"].parser if "config" in flags.FLAGS else None
+    return (getattr(parser, "option_names", None) or list)()
 
 
 def _options_meant(name):
-    """Returns the flags --config.SECTION.OPTION of the options that an unknown flag may mean, the nearest ones."""
-    parser = flags.FLAGS["config"].parser if "config" in flags.FLAGS else None
-    known = (getattr(parser, "option_names", None) or list)()
-    name = name.replace("-", "_")
-    for wanted in (name, name.removeprefix("no")):  # --nomuon sets a boolean
-        found = [option for option in known if wanted in (option, option.rpartition(".")[2])]
-        if found:
-            break
-    else:
-        words = {option if "." in name else option.rpartition(".")[2] for option in known}
-        near = difflib.get_close_matches(name, sorted(words), n=1, cutoff=0.8)
-        found = [option for option in known if near and near[0] in (option, option.rpartition(".")[2])]
-    return [f"--config.{option}" for option in found]
+    """Returns a question with the flags of the options that an unknown one may mean; "" where it resembles none."""
+    known, name = _option_names(), name.replace("-", "_")
+    section, _, last = name.rpartition(".")
+    words = {option: option.rpartition(".")[2] for option in known}
+    kinds: list[Callable[[str], object]] = [
+        lambda option: name in (option, words[option]),
+        lambda option: name.removeprefix("no") in (option, words[option]),  # --nomuon sets a boolean
+        lambda option: option.startswith(section and f"{section}.") and words[option].startswith(f"{last}_"),
+        lambda option: difflib.get_close_matches(name, [option if section else words[option]], cutoff=0.8),
+        lambda option: last == words[option],
+    ]
+    found = next(filter(None, (list(filter(kind, known)) for kind in kinds)), [])
+    return f"did you mean {' or '.join(f'--config.{option}' for option in found[:5])}?" if found else ""
 
 
 def _unquoted(error):
@@ -367,11 +402,11 @@ def _import_plugins(names: Sequence[str]) -> None:
         try:
             importlib.import_module(name)
         except Exception as error:  # a plugin is the user's code: report any failure in one line
-            raise ValueError(
-                failed_imports.reason(error)
-                or f"--plugins: cannot import {name!r} ({type(error).__name__}: {error}); "
-                "correct the module, or set PYTHONPATH to its folder"
-            ) from error
+            advice = "correct the module, or set PYTHONPATH to its folder"
+            if (path := pathlib.Path(name)).name != name or path.suffix == ".py":
+                advice = f"give the name of a module, not a file: {path.stem}, with PYTHONPATH={path.absolute().parent}"
+            fault = f"--plugins: cannot import {name!r} ({type(error).__name__}: {error}); {advice}"
+            raise ValueError(failed_imports.reason(error) or fault) from error
 
 
 def _leave(code, error):

@@ -202,17 +202,16 @@ def build_model(config: Config, wrap: Callable[[Field], Field] | None = None, *,
         field = _make_field(config, network, fixed_order)
         return wrap(field) if wrap is not None and network == FINAL_NETWORK else field
 
-    return part.make(
-        SamplerContext(
-            options=_filled(config.options_of(SAMPLERS), part.section or config.sampler),
-            make_field=make_field,
-            view=config.eval,
-            background=scene.color_behind(config.data.background),
-            box=scene.box,
-            contracted=scene.contracted is True,
-            fixed_order=fixed_order,
-        )
+    context = SamplerContext(
+        options=_filled(config.options_of(SAMPLERS), part.section or config.sampler),
+        make_field=make_field,
+        view=config.eval,
+        background=scene.color_behind(config.data.background),
+        box=scene.box,
+        contracted=scene.contracted is True,
+        fixed_order=fixed_order,
     )
+    return _checked(config.sampler, part.make(context), Model)
 
 
 def build_cameras(config: RunConfig, needs: tuple[str, ...] = ()) -> CameraParameters | None:
@@ -314,7 +313,8 @@ def _make_field(config, network, fixed_order) -> Field:
         part, options, section = part_sections()[network], getattr(config, network), network
     else:
         raise ValueError(f"make_field: no network {network!r}, expected one of {FINAL_NETWORK!r} and {[*config.parts]}")
-    field = part.make(_filled(options, section), config.scene.box)
+    name = config.field if network == FINAL_NETWORK else network
+    field = _checked(name, part.make(_filled(options, section), config.scene.box), Field)
     if fixed_order and field.apply_in_fixed_order is not None:
         field = field._replace(apply=field.apply_in_fixed_order)
     # The paper's networks are not contracted; all other fields are defined in the box.
@@ -324,6 +324,13 @@ def _make_field(config, network, fixed_order) -> Field:
             raise ValueError("scene.lower or scene.upper is 'auto'; resolve the config, or set both")
         return contract_field(field, *config.scene.box)
     return field
+
+
+def _checked(name, made, kind):
+    """Returns what a registered function has made; ValueError if it is of another kind."""
+    if not isinstance(made, kind):
+        raise ValueError(f"{name!r}: its function returned {type(made).__name__}, expected a {kind.__name__}")
+    return made
 
 
 def _filled(options, section):

@@ -22,6 +22,7 @@ from jaxnerf.options import (
     read_value,
     replaced,
     short_repr,
+    unknown_field,
     values_of,
 )
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part, Registry
@@ -149,6 +150,8 @@ def read_config(config: Config) -> RunConfig:
     """
     if isinstance(config, RunConfig):
         return config
+    if not isinstance(config, ConfigDict | Mapping):
+        raise ValueError(f"config is {short_repr(config)}, expected one such as jaxnerf.configs.default.get_config()")
     content, left = in_todays_names(config.to_dict() if isinstance(config, ConfigDict) else config)
     refuse(left, "--config.")
     record = content.pop("fingerprint", "")
@@ -169,10 +172,8 @@ def read_config(config: Config) -> RunConfig:
     used, known = used_sections(config), {*kinds, "losses", *registered}
     unknown = sorted(name for name in parts if name not in known | used)
     if unknown:
-        raise ValueError(
-            f"--config.{unknown[0]} is no field, expected one of {sorted(known | set(declarations(RunConfig)))}; "
-            "correct the name, or import the module that registers it with --plugins=MODULE"
-        )
+        message = unknown_field("config.", unknown[0], known | set(declarations(RunConfig)))
+        raise ValueError(f"{message}; correct the name, or import the module that registers it with --plugins=MODULE")
     config = replaced(config, parts={name: part for name, part in parts.items() if name in {*built_in, *used}})
     _check(config)
     return config
@@ -282,8 +283,7 @@ def _read_part(name, part, section):
     """Returns the options of a registered part; of one that is not registered, or has no class, the section itself."""
     if isinstance(section, Options):
         return section
-    if not isinstance(section, Mapping):
-        raise ValueError(f"--config.{name} is {short_repr(section)}, expected a section; correct it")
+    section = _section({name: section}, name)
     if part is None or part.options is None:
         return {field: as_tuples(value) for field, value in section.items()}
     return read(part.options, {**values_of(part.options()), **section}, f"config.{name}.")

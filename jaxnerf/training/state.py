@@ -71,7 +71,12 @@ def rendered_shapes(model: Model) -> tuple[dict[str, Any], OccupancyGrid | None]
 
 def _create(model, key, cells):
     """Returns parameters, and the grid or None, before training."""
-    return model.init(key), None if model.grid_schedule is None else model.grid_schedule.create(*cells)
+    params = model.init(key)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            name = f"params{jax.tree_util.keystr(path)}"
+            raise ValueError(f"{name} has type {jnp.result_type(leaf)}, expected floats of init; integers do not train")
+    return params, None if model.grid_schedule is None else model.grid_schedule.create(*cells)
 
 
 def _all_cells(model):

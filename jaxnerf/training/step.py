@@ -132,7 +132,7 @@ def make_train_step(
         def total(values):
             return jnp.where(complete, values, 0).sum()
 
-        parts = {loss.name: total(loss.function(renderings, batch)) for loss in ray_losses}
+        parts = {loss.name: total(_value(loss, complete.shape, renderings, batch)) for loss in ray_losses}
         weighted = sum(_scaled(loss.weight(state.step), parts[loss.name]) for loss in ray_losses)
         errors = zip(model.image_networks, renderings, strict=True)
         sums = {f"mse_{name}": total(squared_error(rendering, batch)) for name, rendering in errors}
@@ -225,10 +225,19 @@ def _sum_over_microbatches(function, positions):
     return jax.lax.scan(add, zeros, positions)[0]
 
 
+def _value(loss, shape, *arguments):
+    """Returns what a loss returns for its arguments, one value per ray or of the parameters; ValueError on all else."""
+    value = loss.function(*arguments)
+    found = () if isinstance(value, int | float) else getattr(value, "shape", type(value).__name__)
+    if found != shape:
+        raise ValueError(f"losses.{loss.name}: the function returned {found}, expected the shape {shape}")
+    return value
+
+
 def _regularized(regularizers, state, metrics, grads):
     """Adds the regularizers' values to the metrics and to the loss, and their gradients."""
     for loss in regularizers:
-        value, gradient = jax.value_and_grad(loss.function)(networks(state.params))
+        value, gradient = jax.value_and_grad(lambda params, loss=loss: _value(loss, (), params))(networks(state.params))
         weight = loss.weight(state.step)
         metrics[f"loss_{loss.name}"] = value
         metrics["loss"] += weight * value

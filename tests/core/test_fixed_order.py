@@ -81,7 +81,7 @@ def test_segments_have_the_sums_and_gradients_of_jax():
 )
 def test_the_hash_grid_of_an_accelerator_is_that_of_a_cpu(monkeypatch, name):
     field = hash_grid_field(lower=(-1,) * 3, upper=(1,) * 3, resolutions=(4, 8, 32), table_size=2**9)
-    params = field.init(jax.random.key(0))
+    params = jax.jit(field.init)(jax.random.key(0))
     x = jax.random.uniform(jax.random.key(1), (32, 16, 3), minval=-1.1, maxval=1.1)
     viewdirs = jnp.full((32, 1, 3), 3**-0.5)
 

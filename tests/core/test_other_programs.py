@@ -79,7 +79,7 @@ def test_a_stack_of_cameras_has_any_leading_axes_and_a_near_of_each():
     nested = dataclasses.replace(one, to_world=poses.reshape(2, 3, 3, 4), center=jnp.full((2, 3, 2), 3.0))
     nested = make_rays(nested, pixels, near=near.reshape(2, 3), far=9.0)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a.reshape(b.shape), b, atol=1e-6), nested, flat)
-    with pytest.raises(ValueError, match=r"focal has shape \(2, 2\), expected \(2,\) or \(6, 2\) beside to_world"):
+    with pytest.raises(ValueError, match=r"focal has shape \(2, 2\), which does not fit \(6, 2\)"):
         wrong = dataclasses.replace(one, to_world=poses, focal=jnp.ones((2, 2)))
         jaxnerf.rays_from_pixels(wrong, pixels, near=near, far=9.0)
 
@@ -186,7 +186,7 @@ def test_what_needs_one_key_refuses_all_else(key):
         lambda: jaxnerf.mlp_field(depth=2, width=8).init(key),
         lambda: jaxnerf.hash_grid_field(lower=(0, 0, 0), upper=(1, 1, 1)).init(key),
     ):
-        with pytest.raises(ValueError, match=r"key is .*, expected a key such as jax.random.key\(0\)$"):
+        with pytest.raises(ValueError, match=r"key is .*, expected a key such as jax.random.key\(0\)(;|$)"):
             call()
 
 

@@ -203,6 +203,11 @@ def test_wrong_arguments(rays):
         "render_samples: delta": lambda: render_samples(ball, rays, Samples(t=t, delta=t[..., :1])),
         "render_samples: t": lambda: render_samples(ball, rays, Samples(t=t[0], delta=t[0])),
         "scene returned density": lambda: render_samples(lambda x, v: (x, x), rays, both),
+        r"scene returned \(4, 3, 2, 4\) in place of a pair": lambda: render_samples(
+            lambda x, v: jnp.concatenate([x, x[..., :1]], axis=-1), rays, both
+        ),
+        "render returned tuple, expected a Rendering": lambda: render_image(lambda rays: (rays,), rays, chunk=4),
+        "num_samples is 0": lambda: render_rays(None, ball, rays, num_samples=0),
         "background": lambda: render_samples(ball, rays, both, background=np.ones(4)),
         "points_on_rays: t": lambda: points_on_rays(rays, t[0]),
         "rule is 'other'": lambda: render_rays(None, ball, rays, num_samples=4, rule="other"),

@@ -258,6 +258,15 @@ def test_what_is_missing_is_named(name, samples):
     assert compiled(functools.partial(jaxnerf.render_samples, bound))(rays, samples).rgb.shape == (RAYS, 3)
 
 
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_what_no_scene_can_ask_for_is_named(renderer, rays, samples):
+    render = RENDERERS.get(renderer, jaxnerf.render_samples)
+    with pytest.raises(
+        ValueError, match="asks for sigma by a keyword.*expected one of radius, length, time, image_index"
+    ):
+        jax.eval_shape(functools.partial(render, lambda x, viewdirs, *, sigma: plain(x, viewdirs)), rays, samples)
+
+
 def test_a_field_of_rays_has_the_shape_of_near(rays, samples):
     with pytest.raises(ValueError, match=r"render_samples: time has shape \(\), expected \[...\] beside near"):
         jax.eval_shape(

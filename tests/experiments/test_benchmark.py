@@ -103,8 +103,9 @@ def test_a_missing_dataset_is_reported_with_the_command_that_makes_it(monkeypatc
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAXNERF_SCENES", str(tmp_path))
     (tmp_path / "lego").mkdir()
-    notes = run.missing(["lego_100", "can_reposed"])
-    assert list(notes) == ["can_reposed"] and "`jaxnerf-cameras --images=can/images" in notes["can_reposed"]
+    notes = run.missing(["lego_100", "can_undistorted"])
+    assert list(notes) == ["can_undistorted"]
+    assert "`jaxnerf-cameras --images=can/images" in notes["can_undistorted"]
 
 
 def test_a_signal_lets_the_run_save_before_the_program_ends(tmp_path):
@@ -179,6 +180,11 @@ def test_the_headline_has_figures_of_the_same_views_only():
     (row,) = [line for line in tables.headline(scores_of_lego()) if "its full size" in line]
     assert "33.3 dB (600 s), 35.8 dB (2400 s) | 1.50 s | 3DGS: 35.9 dB (6 min); Zip-NeRF: 35.9 dB (5.3 h)" in row
     assert "TensoRF" not in row and "one CPU core" in tables.headline(scores_of_lego())[0]
+
+
+def test_figures_of_another_program_that_does_not_use_alpha_are_beside_the_run_that_does_not():
+    scores = {"lego_100_no_alpha": [fake_score("lego_100_no_alpha", 60.0, 32.0, size=[100, 100])]}
+    assert sum("| TensoRF |" in line for line in tables.beside(scores)) == 4
 
 
 def test_options_of_a_try_are_in_the_table():

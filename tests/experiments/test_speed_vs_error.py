@@ -30,7 +30,7 @@ def test_a_curve_has_medians_where_all_seeds_were_scored():
 
 @pytest.mark.parametrize("step, ended", [(5, False), (7, True)])
 def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, tmp_path, step, ended):
-    config = training.configuration("grid 200")
+    config = training.configuration("fox")
     assert config.train.max_steps == "auto"
 
     def train(config, where):
@@ -59,18 +59,18 @@ def test_views_of_a_config_with_fields_to_infer_are_read_once(tmp_path):
     assert common.load_split(config, "train") is not views
 
 
-def test_an_operation_is_not_charged_for_those_inside():
+def test_an_operation_is_charged_until_the_next_one_starts():
     events = [
         {"name": "loop", "ph": "X", "tid": 1, "ts": 0, "dur": 10},
         {"name": "add", "ph": "X", "tid": 1, "ts": 1, "dur": 3},
         {"name": "inside", "ph": "X", "tid": 1, "ts": 2, "dur": 1},
-        {"name": "add", "ph": "X", "tid": 1, "ts": 5, "dur": 4},
-        {"name": "add", "ph": "X", "tid": 2, "ts": 5, "dur": 7},
+        {"name": "add", "ph": "X", "tid": 2, "ts": 5, "dur": 4},
         {"name": "not an operation", "ph": "X", "tid": 1, "ts": 5, "dur": 1},
         {"name": "loop", "ph": "M", "tid": 1},
     ]
-    found = step_parts.own_times(events, {"loop", "add", "inside"})
-    assert found == [("loop", 3), ("add", 2), ("inside", 1), ("add", 4), ("add", 7)]
+    found = step_parts.wall_times(events, {"loop", "add", "inside"})
+    assert found == [("loop", 1), ("add", 1), ("inside", 3), ("add", 5)]
+    assert step_parts.wall_times([], {"loop"}) == []
 
 
 def test_the_compiler_says_which_function_an_operation_comes_from():
@@ -78,3 +78,12 @@ def test_the_compiler_says_which_function_an_operation_comes_from():
     assert set(step_parts.parts_of_operations(text).values()) >= {"networks"}
     text = jax.jit(inverse_cdf).lower(jnp.linspace(0, 1, 5), jnp.ones(4), jnp.linspace(0, 1, 3)).compile().as_text()
     assert set(step_parts.parts_of_operations(text).values()) >= {"compositing and losses"}
+
+
+def test_the_serial_part_follows_from_the_gain_of_more_cores():
+    cores = study("speed/cores")
+    assert cores.serial_fraction(2.0, 2) == 0.0 and cores.serial_fraction(0.9, 2) == 1.0
+    assert cores.serial_fraction(1 / (0.4 + 0.6 / 8), 8) == pytest.approx(0.4)
+    results = lambda ms, part: [{"ms": ms, "parts": {"networks": part}}]  # noqa: E731
+    lines = cores.table({1: results(10.0, 8.0), 2: results(6.0, 4.0)})
+    assert lines[2:] == ["| whole step | 10.00 | 6.00 | 1.67 | 20% |", "| networks | 8.00 | 4.00 | 2.00 | 0% |"]

@@ -11,6 +11,7 @@ import sys
 import cell_sampler  # noqa: F401
 import density_exporter
 import gabor_field  # noqa: F401
+import jax.numpy as jnp
 import mask_loss  # noqa: F401
 import novelty_estimator
 import numpy as np
@@ -24,15 +25,19 @@ from scipy.spatial.transform import Rotation
 import captures
 import export_sources
 import jaxnerf
+from jaxnerf.extend import Field
 from jaxnerf.options import Options, option
-from jaxnerf.registry import FIELDS, Part
+from jaxnerf.registry import FIELDS, SAMPLERS, Part
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.config_fields import typed
 from jaxnerf.tools.exporters.registration import EXPORTERS
 from jaxnerf.tools.uncertainty.base import UncertaintySource
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from jaxnerf.training import auto_config
+from jaxnerf.training.build import build_model
 from jaxnerf.training.metric_log import read_rows
+from jaxnerf.training.state import rendered_shapes
+from jaxnerf.training.step import StepLoss, _value
 from runs import ROOT, SMOKE_FLAGS, run_forked, smoke_config, start
 
 pytest_plugins = ["run_fixtures"]
@@ -253,10 +258,39 @@ def test_registrations_that_cannot_work_are_refused(monkeypatch):
         smoke_config()
 
 
+def of_integers(options, box):
+    return Field(lambda key: {"w": jnp.ones(3, int)}, lambda params, x, viewdirs: (x[..., 0], x))
+
+
+@pytest.mark.parametrize(
+    "registry, make, message",
+    [
+        (FIELDS, lambda options, box: None, "'wrong': its function returned NoneType, expected a Field"),
+        (SAMPLERS, lambda context: {}, "'wrong': its function returned dict, expected a Model"),
+        (FIELDS, of_integers, r"params\['fine'\]\['w'\] has type int32, expected floats"),
+    ],
+)
+def test_what_a_part_makes_is_checked(monkeypatch, registry, make, message):
+    monkeypatch.setitem(registry._parts, "wrong", Part(make))
+    config = smoke_config()
+    config["field" if registry is FIELDS else "sampler"] = "wrong"
+    with pytest.raises(ValueError, match=message):
+        rendered_shapes(build_model(auto_config.resolve_for_device(config)[0]))
+
+
+@pytest.mark.parametrize(
+    "value, found", [(0.0, r"\(\)"), (jnp.ones((4, 3)), r"\(4, 3\)"), (None, "NoneType"), (jnp.ones(3), r"\(3,\)")]
+)
+def test_what_a_loss_returns_is_checked(value, found):
+    loss = StepLoss("wrong", lambda *_: value, "renderings", lambda step: 1.0, ())
+    with pytest.raises(ValueError, match=rf"losses.wrong: the function returned {found}, expected the shape \(4,\)"):
+        _value(loss, (4,), None, None)
+
+
 def test_a_section_that_no_part_has_is_refused(tmp_path):
     config = smoke_config(max_steps=1)
     config.trian = {"batch_size": 64}
-    with pytest.raises(ValueError, match="--config.trian is no field, expected one of .*'train'"):
+    with pytest.raises(ValueError, match="--config.trian is no field, did you mean train.*"):
         jaxnerf.train_and_evaluate(config, tmp_path / "run")
 
 

@@ -456,7 +456,7 @@ def test_a_prefiltered_field_forgets_what_is_smaller_than_the_footprint():
     options = {**BOX, "resolutions": (3, 17), "table_size": 2000, "prefilter": True}
     field = hash_grid_field(**options)
     assert needs_of(field.apply) == ("radius",) and needs_of(hash_grid_field(**BOX).apply) == ()
-    params = field.init(jax.random.key(0))
+    params = jax.jit(field.init)(jax.random.key(0))
     params["table"] = jnp.asarray(np.random.default_rng(0).normal(size=params["table"].shape), jnp.float32)
     x, viewdirs = inside((6, 4)), directions((6, 1))
 

@@ -331,7 +331,7 @@ def test_fields_are_evaluated_at_no_points(shape, prefilter):
     x, viewdirs = np.zeros((*shape, 3), np.float32), np.zeros((*shape[:-1], 1, 3), np.float32)
     sizes = {"radius": np.zeros(shape, np.float32), "length": np.zeros(shape, np.float32)} if prefilter else {}
     for field in fields[: 2 - prefilter]:
-        params = field.init(jax.random.key(0))
+        params = jax.jit(field.init)(jax.random.key(0))
         for apply in filter(None, (field.apply, field.apply_in_fixed_order)):
 
             def total(params, apply=apply):

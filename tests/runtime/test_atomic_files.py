@@ -7,6 +7,7 @@ import threading
 import pytest
 
 from jaxnerf.runtime import atomic_files
+from jaxnerf.tools.exporters.partial_folder import partial_folder
 
 
 def test_partial_file_replaces_the_file_at_the_end(tmp_path):
@@ -140,11 +141,11 @@ def test_first_writer_wins(tmp_path):
 
 def test_a_folder_appears_complete_or_not_at_all(tmp_path):
     target = tmp_path / "mesh-10"
-    with pytest.raises(OSError, match="full.*mesh-10"), atomic_files.partial_folder(target):
+    with pytest.raises(OSError, match="full.*mesh-10"), partial_folder(target):
         raise OSError(28, "full")
     assert not list(tmp_path.iterdir())
     for content in ("old", "new"):
-        with atomic_files.partial_folder(target) as partial:
+        with partial_folder(target) as partial:
             (partial / "mesh.ply").write_text(content)
             assert not (target / "mesh.ply").exists() or (target / "mesh.ply").read_text() == "old"
     assert (target / "mesh.ply").read_text() == "new" and list(tmp_path.iterdir()) == [target]
@@ -157,7 +158,7 @@ def test_a_folder_replaces_a_file_or_a_link_and_leaves_nothing_behind(tmp_path, 
     precious.write_text("kept")
     target = tmp_path / "mesh-10"
     target.symlink_to(precious.parent) if link else target.write_text("a file")
-    with atomic_files.partial_folder(target) as partial:
+    with partial_folder(target) as partial:
         (partial / "mesh.ply").write_text("new")
     assert (target / "mesh.ply").read_text() == "new" and precious.read_text() == "kept"
     assert sorted(tmp_path.iterdir()) == [target, precious.parent] and not target.is_symlink()
@@ -169,7 +170,7 @@ def test_partial_folders_of_killed_processes_are_removed_and_those_of_running_on
     (killed / "mesh.ply").write_text("half")
     mine = tmp_path / "my.tmp"
     mine.mkdir()
-    with atomic_files.partial_folder(tmp_path / "splats-10") as running:
+    with partial_folder(tmp_path / "splats-10") as running:
         assert not killed.exists() and mine.exists()
-        with atomic_files.partial_folder(tmp_path / "mesh-10"):
+        with partial_folder(tmp_path / "mesh-10"):
             assert running.exists()

@@ -205,14 +205,60 @@ def test_a_limit_is_a_number_or_auto(tmp_path, value, printed):
 
 @pytest.mark.parametrize(
     "field, message",
-    [("occupancy.sizes", "'sizes'"), ("qqq.step_size", "'qqq'")]
-    + [("occupancy.resolutions", '\'resolutions\', did you mean "resolution" instead of "resolutions"')],
+    [
+        ("occupancy.sizes", ""),
+        ("qqq.step_size", "did you mean --config.occupancy.step_size? "),
+        ("occupancy.resolutions", "did you mean --config.occupancy.resolution? "),
+        ("lr", "did you mean --config.train.lr_init or --config.train.lr_final or "),
+        ("train.lr", "did you mean --config.train.lr_init or --config.train.lr_final or "),
+    ],
 )
 def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
     code, out, err = run_forked("train", "--config=smoke", f"--workdir={tmp_path}", f"--config.{field}=3")
     assert code == 2 and not out
-    assert err.startswith(f"error: the config has no such field: {message}; ")
-    assert "--config=help:options lists all fields" in err and err.count("\n") == 1
+    assert err.startswith(f"error: --config.{field}: no such option; {message}")
+    assert "--config=help:options lists all options" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "lines, message",
+    [
+        (
+            ["c.data.widht = 3", "return c"],
+            "{file}: config.data.widht is no field, did you mean width? expected one of",
+        ),
+        (["c.train.lr_init = -1.0", "return c"], "{file}: config.train.lr_init is -1.0, expected more than 0"),
+        (["c.trian.batch_size = 3"], "--config: {file}, line 5: AttributeError: 'trian', did you mean \"train\""),
+        (["c.train.lr_init = 'low'"], "--config: {file}, line 5: TypeError: "),
+        (["open('nothing')"], "--config: {file}: [Errno 2] No such file or directory: 'nothing'"),
+        (["pass"], "--config: {file}: get_config() returns NoneType, expected a ConfigDict"),
+        (["return {'train': {}}"], "--config: {file}: get_config() returns dict, expected a ConfigDict"),
+    ],
+)
+def test_a_wrong_config_file_is_named(tmp_path, lines, message):
+    file = tmp_path / "mine.py"
+    head = "from jaxnerf.configs import smoke\n\ndef get_config():\n    c = smoke.get_config()\n"
+    file.write_text(head + "".join(f"    {line}\n" for line in lines))
+    code, out, err = run_forked("train", f"--config={file}", f"--workdir={tmp_path}/run", "--data_dir=nothing")
+    assert code in (1, 2) and not out
+    assert err.startswith("error: " + message.format(file=file)) and err.count("\n") == 1, err
+
+
+def test_other_flags_that_a_beginner_gets_wrong(tmp_path):
+    (tmp_path / "mine.py").write_text("config = 3\n")
+    for flags, message in {
+        ("--config=mine",): "did you mean mine.py?",
+        ("--config=mine.py",): "--config: mine.py: defines no get_config()",
+        ("--config=smoke", "--plugins=mine.py"): f"not a file: mine, with PYTHONPATH={tmp_path}",
+        ("--config=smoke", "--data_dir="): "--data_dir is empty",
+        (
+            "--config=smoke",
+            "--config.data.format=auto",
+            "--config.data.dir=",
+        ): "data.dir is '': no such folder",
+    }.items():
+        code, out, err = run_forked("train", "--workdir=run", *flags, folder=tmp_path)
+        assert code in (1, 2) and not out and message in err and err.count("\n") == 1, err
 
 
 @pytest.mark.parametrize(
@@ -227,6 +273,7 @@ def test_an_unknown_field_is_named_in_one_line(tmp_path, field, message):
         ("train", "--train.lr_init=1", "--train.lr_init: no such flag; did you mean --config.train.lr_init?"),
         ("train", "--max-step=1", "--max-step: no such flag; did you mean --config.train.max_steps?"),
         ("train", "--field=mlp", "--field: no such flag; did you mean --config.field?"),
+        ("train", "--lr=1", "--lr: no such flag; did you mean --config.train.lr_init or --config.train.lr_final or"),
         ("train", "--chunk=3", "--chunk: no such flag; did you mean --config.eval.chunk?"),
         ("train", "--nomuon", "--nomuon: no such flag; did you mean --config.train.muon?"),
         ("train", "--seed=1", "--seed: no such flag; did you mean --config.seed?"),
@@ -267,7 +314,7 @@ def test_a_fault_in_a_config_file_is_not_an_unknown_field(tmp_path, fault):
         ("optax", "import nowhere_to_be_found\n", "nowhere_to_be_found cannot be imported (ModuleNotFoundError: No m"),
         ("jaxtyping", "1 / 0\n", "jaxtyping cannot be imported (ZeroDivisionError: division by zero)"),
         ("config", "1 / 0\n", "--config: config.py, line 1: ZeroDivisionError: division by zero; correct the file"),
-        ("config", "import nowhere_to_be_found\n", "No module named 'nowhere_to_be_found'"),
+        ("config", "import nowhere_to_be_found\n", "--config: config.py, line 1: ModuleNotFoundError: No module named"),
     ],
 )
 def test_a_package_that_cannot_be_imported_is_named(tmp_path, package, content, expected):

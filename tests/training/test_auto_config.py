@@ -215,7 +215,7 @@ def test_rays_that_hit_nothing_have_the_mean_color_of_an_unbounded_capture(views
         assert ("mean colour" in "".join(resolved.lines)) == (value == AUTO)
         experiment = build(resolve_for_device(resolved.config)[0])
         rays = view_rays(shown, 0, np.float32([[1.5, 1.5]]))
-        model, params = experiment.model, experiment.model.init(jax.random.key(0))
+        model, params = experiment.model, jax.jit(experiment.model.init)(jax.random.key(0))
         empty = model.grid_schedule.create(np.zeros(model.grid_schedule.shape, bool))
         training = model.render(jax.random.split(jax.random.key(1), 1), params, empty, rays, 0)["fine"]
         for image in (model.view(params, empty, rays), training, model.cull(empty, rays)[1]):

@@ -243,7 +243,7 @@ def test_a_regularizer_of_levels_gets_those_of_the_hash_grid():
     config = auto_config.resolve_for_device(auto_config.resolve(config).config)[0]
     experiment = build(config)
     (variation,) = [loss for loss in experiment.losses if loss.name == "total_variation"]
-    params = experiment.model.init(jax.random.key(0))
+    params = jax.jit(experiment.model.init)(jax.random.key(0))
     # Of independent entries, uniform in [-0.025, 0.025], along three axes.
     assert variation.needs == () and variation.function(params) == pytest.approx(3 * 2 * 0.05**2 / 12, rel=0.1)
     with pytest.raises(ValueError, match="losses.total_variation needs a field that brings it, as a hash grid does"):

@@ -109,9 +109,6 @@ def visible_samples(
         [..., S] bool; False where the scene is not evaluated. A ray whose transmittance is below 1e-3 keeps
         the samples that make it opaque, whatever their colours, as opacity and depth depend on them. A sample that
         is NaN is needed, so that it is visible.
-
-    Raises:
-        ValueError: as render_packed.
     """
     name, shape = "visible_samples", samples.t.shape
     rays, samples = flattened(name, rays, samples, max_samples)

@@ -16,8 +16,8 @@ from jaxnerf.core import contraction, volume_rendering
 from jaxnerf.core.loops import vary_like
 from jaxnerf.core.safe_math import at_least_float32
 from jaxnerf.core.sampling import ONE_KEY, typed_key
-from jaxnerf.core.scene import inputs_of, needs_of
-from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, check_shapes, pytree
+from jaxnerf.core.scene import evaluate_scene, inputs_of, needs_of
+from jaxnerf.core.types import Keys, Rays, Samples, SceneFn, Vector, broadcast, check_order, check_shapes, pytree
 
 _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 _ABSORBED = 0.01  # the fraction of light that matter of the threshold's density absorbs between samples
@@ -71,14 +71,12 @@ def create_grid(
 
     Returns:
         OccupancyGrid with fields [X, Y, Z], occupied wherever it is valid, unless its own density is 0.
-
-    Raises:
-        ValueError: on other shapes, or if valid is not bool.
     """
     lower, upper, valid = (jnp.asarray(value) for value in (lower, upper, valid))
     check_shapes("create_grid", lower=(lower, "3"), upper=(upper, "3"), valid=(valid, "X Y Z"))
     _check_bool("create_grid", valid=valid)
-    density = jnp.broadcast_to(jnp.asarray(initial_density, jnp.float32), valid.shape)
+    check_order("create_grid", lower=lower, upper=upper)
+    (density,) = broadcast("create_grid", valid.shape, initial_density=jnp.asarray(initial_density, jnp.float32))
     # Without an update a single number says nothing about any cell.
     occupied = valid if jnp.ndim(initial_density) == 0 else valid & (density > 0)
     return OccupancyGrid(
@@ -159,7 +157,7 @@ def update_grid(
         x, inputs = at
         # Density has no direction; any will do.
         given = {name: value[None, None] for name, value in inputs.items()}
-        return scene(x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]), **given)[0][0, 0]
+        return evaluate_scene("update_grid", scene, x[None, None], jnp.array([[[0.0, 0.0, 1.0]]]), given)[0][0, 0]
 
     found = jax.lax.map(density_at, (x, inputs), batch_size=min(chunk, cells.size)).astype(grid.density_max.dtype)
     largest, mean = grid.density_max.reshape(-1), jnp.maximum(grid.density_mean.reshape(-1), 0)
@@ -421,9 +419,6 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
         A scene, whose density is 0, with gradient 0, in empty cells; its colour there is that of another position.
         The given scene is not evaluated in empty cells unless no position is in an occupied one. NaN is evaluated, so
         that it is visible.
-
-    Raises:
-        ValueError: if the grid's occupied cells are not bool.
     """
     _check_bool("mask_scene", occupied=grid.occupied)
 
@@ -440,7 +435,7 @@ def mask_scene(scene: SceneFn, grid: OccupancyGrid) -> SceneFn:
             per_sample = {name: value for name, value in inputs.items() if jnp.shape(value) == kept.shape}
             fixed = {name: jax.lax.stop_gradient(value.reshape(-1)[first]) for name, value in per_sample.items()}
             inputs |= {name: jnp.where(kept, value, fixed[name]) for name, value in per_sample.items()}
-        density, rgb = scene(x, viewdirs, **inputs)
+        density, rgb = evaluate_scene("mask_scene", scene, x, viewdirs, inputs)
         return jnp.where(kept, density, 0), rgb
 
     return masked

@@ -18,7 +18,7 @@ from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.fixed_order import segment_sums
 from jaxnerf.core.loops import vary_like
 from jaxnerf.core.occupancy.grid import OccupancyGrid, is_occupied
-from jaxnerf.core.scene import needs_of
+from jaxnerf.core.scene import evaluate_scene, needs_of
 from jaxnerf.core.types import Background, PackedSamples, PlacedSamples, Rays, Rendering, Samples, SceneFn, check_shapes
 
 _HIGH_EPS = 0.01  # an early_stop_eps above which rays end so soon that long runs waste samples
@@ -298,7 +298,7 @@ def evaluate_samples(
     x = sample_rays.origins + t[:, None] * sample_rays.directions
     x = jnp.where(used[:, None], x, jax.lax.stop_gradient(x))[None]
     inputs = _packed_inputs(function, scene, sample_rays, t, used, delta) if needs_of(scene) else {}
-    density, rgb = rendering.evaluate_scene(function, scene, x, sample_rays.viewdirs[None], inputs)
+    density, rgb = evaluate_scene(function, scene, x, sample_rays.viewdirs[None], inputs)
     return jnp.where(used, density[0], 0), jnp.where(used[:, None], rgb[0], 0)
 
 
@@ -480,7 +480,7 @@ def _sum_run(function, scene, rays, samples, used, rule, transmittance):
     t, delta = samples
     x = rendering.points_on_rays(rays, t)
     inputs = rendering.sample_inputs(function, scene, rays, t, delta)
-    density, rgb = rendering.evaluate_scene(function, scene, x, rays.viewdirs[:, None], inputs)
+    density, rgb = evaluate_scene(function, scene, x, rays.viewdirs[:, None], inputs)
     density, rgb = jnp.where(used, density, 0), jnp.where(used[..., None], rgb, 0)
     length = rendering.segment_lengths(delta, rays)
     weights = volume_rendering.weights_from_density(density, length)

@@ -12,6 +12,7 @@ from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, r
 from jaxnerf.options import read, values_of
 from jaxnerf.runtime import atomic_files
 from jaxnerf.tools.exporters.options import ExportOptions
+from jaxnerf.tools.exporters.partial_folder import partial_folder
 from jaxnerf.tools.exporters.registration import EXPORTERS
 from jaxnerf.tools.uncertainty.cleaning import cleaned
 
@@ -86,7 +87,7 @@ def export_run(
     variables = cleaned(run, workdir, max_uncertainty).variables(step)
     views = refined_views(run, run.experiment.load_split("train", images=None), "train", variables[0])
     target.parent.mkdir(exist_ok=True)
-    with atomic_files.partial_folder(target) as partial:
+    with partial_folder(target) as partial:
         if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
             say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
         if isinstance(options, ExportOptions):

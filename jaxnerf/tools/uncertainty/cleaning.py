@@ -17,8 +17,9 @@ from jaxnerf.core.views import check_pixels
 from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.options import is_auto
-from jaxnerf.runtime import atomic_files, stages
+from jaxnerf.runtime import stages
 from jaxnerf.tools.uncertainty.base import UncertaintySource
+from jaxnerf.tools.uncertainty.one_at_a_time import one_at_a_time
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 
 MAX_UNCERTAINTY = "max_uncertainty"  # in the settings of a run that is cleaned
@@ -64,7 +65,7 @@ def cleaned(run: TrainedRun, workdir: str | os.PathLike, limit: float | str | No
             )
         source = UncertaintySource.of(run, workdir, step, (params, grid), say=_say)
         # Not the lock of a predictor: one that reads the members of an ensemble holds that of the run itself.
-        with atomic_files.one_at_a_time(source.folder / "cleaning.lock", lambda: _say("waits for another process")):
+        with one_at_a_time(source.folder / "cleaning.lock", lambda: _say("waits for another process")):
             estimate = ESTIMATORS.get(ESTIMATOR)(source)
         uncertainty = jax.jit(lambda planes: jax.lax.map(estimate.uncertainty_at, planes))(cell_centers(grid))
         used = _lowest_limit(source, uncertainty) if is_auto(limit) else limit

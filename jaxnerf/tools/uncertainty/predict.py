@@ -14,12 +14,13 @@ from jaxnerf.core.views import Views
 from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views
 from jaxnerf.options import is_auto
-from jaxnerf.runtime import atomic_files, stages
+from jaxnerf.runtime import stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty import calibration as calibrations
 from jaxnerf.tools.uncertainty.base import Score, UncertaintySource
 from jaxnerf.tools.uncertainty.calibration import Calibration, pixel_error, score_order
 from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY
+from jaxnerf.tools.uncertainty.one_at_a_time import one_at_a_time
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 
 
@@ -147,7 +148,7 @@ def make_predictor(
     path, limit = source.folder / f"{name}.json", run.settings.get(MAX_UNCERTAINTY)
     if limit is not None:
         path = path.with_stem(f"{name}-max_uncertainty-{limit if is_auto(limit) else f'{limit:g}'}")
-    with atomic_files.one_at_a_time(path.with_suffix(".lock"), lambda: say(f"{path}: waits for another process")):
+    with one_at_a_time(path.with_suffix(".lock"), lambda: say(f"{path}: waits for another process")):
         found = estimate(source)
         key = fingerprint(key, found.identity)
         known = calibrations.load(path, key) if path.is_file() else None

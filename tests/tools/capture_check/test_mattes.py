@@ -2,9 +2,9 @@
 
 import pathlib
 
-import jax
 import numpy as np
 
+from helpers import compiled
 from jaxnerf.core.cameras import pixel_grid, rays_from_pixels
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.types import Camera
@@ -22,7 +22,7 @@ def capture_of_a_ball(count=16):
         pose = np.asarray(look_at(eye, np.zeros(3), np.float32([0, 0, 1])))
         focal, center = np.full(2, 1.2 * SIDE), np.full(2, SIDE / 2)
         camera = Camera(to_world=pose, focal=focal, center=center, height=SIDE, width=SIDE)
-        rays = jax.tree.map(np.asarray, rays_from_pixels(camera, pixel_grid(SIDE, SIDE), near=2.0, far=6.0))
+        rays = compiled(rays_from_pixels)(camera, pixel_grid(SIDE, SIDE), near=2.0, far=6.0)
         aside = np.linalg.norm(np.cross(rays.origins, rays.viewdirs), axis=-1)
         frames.append(Frame(f"image_{len(frames)}", pathlib.Path("none.png"), camera))
         mattes.append(np.float32(aside < 1))

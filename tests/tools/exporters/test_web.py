@@ -218,7 +218,7 @@ def test_a_table_that_no_texture_holds_is_refused(monkeypatch):
 
 def test_parameters_that_are_not_finite_are_refused():
     network, options = HashGrid(**SMALL), FIELDS["dense"]
-    params = hash_grid_field(**options).init(jax.random.key(0))
+    params = jax.jit(hash_grid_field(**options).init)(jax.random.key(0))
     params = {**params, "bias": params["bias"].at[0].set(jnp.nan)}
     with pytest.raises(ValueError, match="not finite"):
         web_scene.pack(network, params, None, precision="8 bits", step_size=1, early_stop_eps=0, background=None)

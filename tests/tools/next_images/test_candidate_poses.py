@@ -4,17 +4,19 @@ import numpy as np
 import pytest
 
 import captures
-from jaxnerf.core.poses import look_at
+from helpers import compiled
+from jaxnerf.core import poses
 from jaxnerf.tools.next_images.candidate_poses import azimuth_to_right, candidate_poses, farthest_poses
 
 UP = np.array([0.0, 0.0, 1.0])
+look_at = compiled(poses.look_at)
 
 
 def ring(count=12, height=30.0, distance=4.0):
     """Returns poses at an angle of height, from -y on, each to the right of the one before."""
     angle, low = 2 * np.pi * np.arange(count) / count - np.pi / 2, np.radians(height)
     away = np.stack([np.cos(low) * np.cos(angle), np.cos(low) * np.sin(angle), 0 * angle + np.sin(low)], axis=-1)
-    return np.stack([np.asarray(look_at(np.float32(distance * each), np.zeros(3), UP)) for each in away])
+    return np.stack([look_at(np.float32(distance * each), np.zeros(3), UP) for each in away])
 
 
 def test_candidates_around_an_object_are_on_the_dome_of_its_cameras():

@@ -27,7 +27,7 @@ def hash_grid_run():
     schedule = SimpleNamespace(step_size=0.1)
     model = run.experiment.model._replace(grid_schedule=schedule, fields={"fine": field})
     experiment = SimpleNamespace(model=model, config=config, cameras=None, background=(1.0, 1.0, 1.0))
-    fine = field.init(jax.random.key(0))
+    fine = jax.jit(field.init)(jax.random.key(0))
     grid = create_grid(np.float32(LOWER), np.float32(UPPER), np.ones((4, 4, 4), bool), initial_density=1.0)
     return run._replace(experiment=experiment), views, ({"radius": np.float32(0.7), "fine": fine}, grid)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import captures
+from helpers import compiled
 from jaxnerf import turntable
 from jaxnerf.data import dataset
 from jaxnerf.data.dataset import DataOptions
@@ -15,7 +16,7 @@ from jaxnerf.evaluation.paths.camera_path import make_path, read_path_file
 from jaxnerf.tools.viewer.frame_renderer import FrameCamera
 from jaxnerf.tools.viewer.keyframes import cameras_through, load_keyframes, save_path
 
-POSES = np.asarray(turntable(4, center=(0, 0, 0), radius=3.0, elevation=0.3))
+POSES = compiled(turntable, "num_frames", "elevation")(4, center=np.zeros(3), radius=3.0, elevation=0.3)
 VIEWS = load_synthetic(size=8)
 KEYFRAMES = [FrameCamera(pose, fov, 64, 48) for pose, fov in zip(POSES, (0.5, 0.7, 0.9, 0.7), strict=True)]
 
