@@ -30,9 +30,9 @@ class Stage:
 
     shown, unsaid = True, False  # whether it is shown; whether it has a result that no line has kept
 
-    def __init__(self, text: str, note: str = ""):
-        """Takes what is done, such as "reading images", and a note about it, such as how long it took before."""
-        self.name, self.text, self._note, self.started = text, text, note, _now()
+    def __init__(self, text: str):
+        """Takes what is done, such as "reading images"."""
+        self.name, self.text, self.started = text, text, _now()
         self.done, self._total = 0, 0
 
     def __enter__(self) -> Any:
@@ -51,7 +51,7 @@ class Stage:
     def part(self, seconds: str = "") -> str:
         """Returns what the stage does and how far it is."""
         done = f", {self.done:,} of {self._total:,} done" if self._total else ""
-        return f"{self.text}{seconds}{done}{self._note}"
+        return f"{self.text}{seconds}{done}"
 
     def head(self) -> str:
         """Returns how the line begins if no other stage contains this one."""

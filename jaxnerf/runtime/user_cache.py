@@ -3,8 +3,6 @@
 What it holds is believed, and compiled programs are run, so its folders belong to the user alone.
 """
 
-import contextlib
-import json
 import logging
 import os
 import time
@@ -14,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnerf.runtime.atomic_files import open_regular, partial_file, read_json, write_text
+from jaxnerf.runtime.atomic_files import open_regular, partial_file
 
 _logger = logging.getLogger(__name__)
-_SECONDS, _MAX_SECONDS = "seconds.json", 100  # the file of `keep_seconds`, and how many it keeps
 _CHECKSUM = "checksum"  # the name of an array in each file
 
 
@@ -62,28 +59,6 @@ def load_or_make(
     if path is not None and time.perf_counter() - start >= min_seconds:
         _store(path, arrays, _checksum(name, arrays))
     return arrays
-
-
-def last_seconds(key: str) -> float | None:
-    """Returns how long what a key names took the last time, see `keep_seconds`; None if that is unknown."""
-    seconds = _all_seconds().get(key)
-    return seconds if isinstance(seconds, int | float) else None
-
-
-def keep_seconds(key: str, seconds: float) -> None:
-    """Keeps how long something took, with what was kept of some other keys."""
-    with contextlib.suppress(OSError, RuntimeError):
-        found = {other: value for other, value in _all_seconds().items() if other != key}
-        kept = [*found.items()][-_MAX_SECONDS:]
-        write_text(private_folder() / _SECONDS, json.dumps(dict([*kept, (key, round(seconds, 1))])))
-
-
-def _all_seconds():
-    try:
-        found = read_json(private_folder() / _SECONDS, "")
-    except (OSError, RuntimeError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def default_folder() -> Path:

@@ -12,11 +12,8 @@ import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import BatchPixels
-from jaxnerf.options import Changes
-from jaxnerf.runtime import devices, memory, processes, stages, user_cache
-from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.runtime import devices, memory, processes, stages
 from jaxnerf.training.build import Experiment
-from jaxnerf.training.config import declared
 from jaxnerf.training.dead_networks import CHECK_EVERY
 from jaxnerf.training.optimizer import DecayData
 from jaxnerf.training.options import TrainOptions
@@ -38,12 +35,9 @@ def compile_training(experiment: Experiment, views: Views) -> tuple["CompiledSte
     prepared = time.perf_counter()
     memory.release()
     step = CompiledStep(experiment, cells, data)
-    key = _program_name(experiment, views)
-    before = user_cache.last_seconds(key)
-    with stages.stage("compiling the training step", "" if before is None else f", {before:.0f} s the last time"):
+    with stages.stage("compiling the training step"):
         state = step.compile()
     step.prepare_seconds, step.compile_seconds = prepared - started, time.perf_counter() - prepared
-    user_cache.keep_seconds(key, step.compile_seconds)
     return step, state
 
 
@@ -129,14 +123,6 @@ def _host_intervals(options):
     if options.max_reinits:
         intervals += (CHECK_EVERY,)
     return intervals + ((processes.AGREE_EVERY,) if jax.process_count() > 1 else ())
-
-
-def _program_name(experiment, views):
-    """Returns a name for the compiled step: the same for runs that differ in how long they train."""
-    part_of_it = Changes.TRAINING | Changes.SPEED
-    values = {name: value for name, option, _, value in declared(experiment.config) if option.changes & part_of_it}
-    values = {**values, "seed": 0, "train.lr_steps": 0}
-    return fingerprint(repr(values), views.pixels.shape, [device.device_kind for device in jax.devices()])
 
 
 def _stay_on_host(pixels):

@@ -39,7 +39,7 @@ def clock(monkeypatch):
 
 
 def test_a_log_file_gets_a_line_for_each_stage_that_lasts_and_one_for_each_further_minute(clock, capsys):
-    with stages.stage("reading the dataset"), stages.stage("reading images", "; 9 s the last time") as stage:
+    with stages.stage("reading the dataset"), stages.stage("reading images") as stage:
         clock(3)
         assert capsys.readouterr().err == ""
         clock(1)
@@ -47,7 +47,7 @@ def test_a_log_file_gets_a_line_for_each_stage_that_lasts_and_one_for_each_furth
         clock(120)
     with stages.stage("compiling"):
         clock(3)
-    shown = "working       reading the dataset for %d s: reading images%s; 9 s the last time\n"
+    shown = "working       reading the dataset for %d s: reading images%s\n"
     done = ", 1,200 of 3,000 done"
     assert capsys.readouterr().err == shown % (4, "") + shown % (64, done) + shown % (124, done)
     clock(59)
@@ -141,6 +141,5 @@ def test_each_long_stage_of_a_run_says_what_it_does(monkeypatch, unoptimized, tm
         cells = ["finding the cells that the cameras see", "finding the cells in front of surfaces"]
         for text in stated + cells * (start == "first"):  # they are cached
             assert f"working       {text}" in said
-        assert ("the last time" in said) == (start == "second")
         assert "\nviews " in err and ("values are inferred; --verbosity=1" in err) == (start == "first")
         assert all((f"\n{name} " in err) == (start == "second") for name in ("parameters", "microbatch"))
