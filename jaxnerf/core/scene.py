@@ -31,7 +31,7 @@ def evaluate_scene(
     function: str,
     scene: SceneFn,
     x: Float[ArrayLike, "*batch samples 3"],
-    viewdirs: Float[ArrayLike, "*batch #samples 3"],
+    viewdirs: Float[ArrayLike, "*#batch #samples 3"],
     inputs: Mapping[str, Num[ArrayLike, "..."]],
 ) -> tuple[Num[Array, "*batch samples"], Num[Array, "*batch samples channels"]]:
     """Evaluates a scene, and checks what it returns.
