@@ -123,7 +123,7 @@ def test_wrong_arguments(keys):
         "far": lambda: jaxnerf.stepped_edges(None, ones(2), ones(3), step_size=1.0, num_segments=2),
         "num_segments is 0": lambda: jaxnerf.stepped_edges(None, ones(2), ones(2), step_size=1.0, num_segments=0),
         "key": lambda: jaxnerf.stepped_edges(keys[:3], ones(2), ones(2), step_size=1.0, num_segments=2),
-        "broadcast": lambda: jaxnerf.stepped_edges(None, ones(2), ones(2), step_size=ones(3), num_segments=2),
+        "fit": lambda: jaxnerf.stepped_edges(None, ones(2), ones(2), step_size=ones(3), num_segments=2),
     }.items():
         with pytest.raises(ValueError, match=message):
             call()
