@@ -311,7 +311,7 @@ class _Progress(Stage):
 
     def __call__(self, count):
         if count is not None:
-            self.update(count, self.total)
+            self.update(min(count, self.total), self.total)  # COLMAP counts images again that another model has
 
     def end(self, count):
         """Says the final count; returns the stage's seconds."""
