@@ -17,7 +17,7 @@ from jaxnerf.training.compiled_step import compile_training
 from jaxnerf.training.config import Config, changed
 from jaxnerf.training.dead_networks import make_reinitializer
 from jaxnerf.training.pace import Clock, Pace, PreviewTimes
-from jaxnerf.training.state import TrainState
+from jaxnerf.training.state import TrainState, rendered_shapes
 
 # Steps in a row without a finite gradient after which a run fails. They change nothing, and each draws other rays: a
 # bad pixel makes a few of them, bad poses or a learning rate that is too high make all.
@@ -77,12 +77,23 @@ def train(
             )
         processes.print_once(*lines, f"dataset       read in {time.perf_counter() - started:.1f} s")
         steps = Checkpoints(folder).steps()
-        if finished := processes.any_of(metric_log.has_ended(options, steps, folder)):
+        ended = processes.any_of(metric_log.has_ended(options, steps, folder))
+        if finished := ended and not processes.any_of(_is_damaged(experiment, folder, steps[-1])):
             processes.print_once(f"steps         {metric_log.of_all(steps[-1], options)} done, so training is complete")
         else:
             finished = run_training(experiment, views, folder, preview=preview, observe=observe)
         memory.release()
         return finished and (at_end is None or at_end(views))
+
+
+def _is_damaged(experiment, folder, step):
+    """Returns whether a checkpoint cannot be rendered; `run_training` then sets it aside and takes its steps again."""
+    averaged = experiment.config.train.averaging_power > 0
+    try:
+        Checkpoints(folder).load_rendered(step, rendered_shapes(experiment.model), averaged=averaged)
+    except ValueError:
+        return True
+    return False
 
 
 def run_training(
