@@ -3,7 +3,7 @@
 import ctypes
 import pathlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -59,17 +59,26 @@ def available() -> float | None:
     return _HOST_FRACTION * min(found) / jax.local_device_count() if found else None
 
 
+def control_groups(system: str | pathlib.Path = "/") -> Iterator[pathlib.Path]:
+    """Yields the folders that limit what a process uses: of its control group and those that hold it, on Linux."""
+    system = pathlib.Path(system)
+    try:
+        group_path = (system / "proc/self/cgroup").read_text().strip().rpartition("::")[2].strip("/")
+    except OSError:
+        return
+    folder = system / "sys/fs/cgroup"
+    yield from {folder, folder / group_path, *(folder / group_path).parents} - set(folder.parents)
+
+
 def _host_available(system="/"):
     """Returns the bytes that the host and each limit of the process's control group allow."""
     found, system = [], pathlib.Path(system)
     try:
         lines = (system / "proc/meminfo").read_text().splitlines()
-        found += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-        group_path = (system / "proc/self/cgroup").read_text().strip().rpartition("::")[2].strip("/")
     except OSError:  # not Linux
         return found
-    folder = system / "sys/fs/cgroup"
-    for group in {folder, folder / group_path, *(folder / group_path).parents} - set(folder.parents):
+    found += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    for group in control_groups(system):
         try:
             limit, used = ((group / f"memory.{name}").read_text().strip() for name in ("max", "current"))
             stats = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())

@@ -1,0 +1,59 @@
+"""CPU cores: how many a program may use, and calls that run on several at once."""
+
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+
+from jaxnerf.runtime import memory
+
+JAX_THREADS = "PJRT_NPROC"  # the environment variable by which JAX's programs use fewer threads than there are cores
+
+
+def usable() -> int:
+    """Returns the number of CPU cores that this process may use, at least 1.
+
+    The least of the cores that it may run on (`taskset`, a scheduler of a cluster), of the CPU time that each control
+    group of it has, rounded up (a container of two CPUs), and of $PJRT_NPROC.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    asked = os.environ.get(JAX_THREADS, "")
+    return max(min([cores, *_allowed(), *([int(asked)] if asked.isdecimal() else [])]), 1)
+
+
+def limit_jax() -> None:
+    """Lets the programs of JAX use no more threads than there are usable cores, of which JAX knows control groups not.
+
+    It has an effect before JAX's devices are first used.
+    """
+    os.environ.setdefault(JAX_THREADS, str(usable()))
+
+
+def map_on_cores(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    """Yields function(item) for each of the items, in order; on a CPU several at once, each in a thread of its own.
+
+    A program of JAX keeps several cores busy in a part of its operations only, and programs that one thread starts run
+    one after the other. On other devices, and on one core, this is `map`.
+    """
+    count = usable() if jax.default_backend() == "cpu" else 1
+    if count == 1:
+        yield from map(function, items)
+        return
+    with ThreadPoolExecutor(count) as pool:
+        yield from pool.map(lambda item: jax.block_until_ready(function(item)), items)
+
+
+def _allowed(system="/"):
+    """Returns the number of cores that each control group of the process allows, rounded up."""
+    found = []
+    for group in memory.control_groups(system):
+        try:
+            quota, period = (group / "cpu.max").read_text().split()
+        except (OSError, ValueError):
+            continue
+        if quota != "max":
+            found.append(math.ceil(int(quota) / int(period)))
+    return found
