@@ -49,7 +49,7 @@ SURFACE = {
     "median_depth=False",
     "render_hierarchical": "key coarse fine rays | num_coarse num_fine rule='segments' in_disparity=False "
     "importance_padding=0.0 background=None median_depth=False",
-    "render_image": "render rays | chunk",
+    "render_image": "render rays | chunk map",
     "create_grid": "lower upper valid | initial_density contracted=False",
     "update_grid": "key grid scene cells | threshold spacing=None decay=0.6 smoothing=0.2 spread=True chunk=8192 "
     "radii=None",

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
@@ -188,7 +188,9 @@ def render_hierarchical(
     return first, render_samples(fine, rays, samples, background=background, median_depth=median_depth)
 
 
-def render_image(render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int) -> Rendering:
+def render_image(
+    render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int, map: Callable[..., Iterable] = map
+) -> Rendering:
     """Renders a whole image in chunks of equal size, so that `render` is compiled once.
 
     Args:
@@ -196,6 +198,8 @@ def render_image(render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int)
             them with functools.partial, so that new parameters need no compilation.
         rays: Rays [H, W], or any other leading axes.
         chunk: rays per call. The last chunk is padded with copies of the last ray.
+        map: (function, chunks) -> results in order, as `map` or `ThreadPoolExecutor.map`: on a CPU with several cores
+            chunks that several threads start are rendered at once.
 
     Returns:
         Rendering [H, W] without weights and samples.
@@ -206,13 +210,14 @@ def render_image(render: Callable[[Rays], Rendering], rays: Rays, *, chunk: int)
     shape, count = rays.near.shape, rays.near.size
     if chunk < 1 or count < 1:
         raise ValueError(f"render_image: chunk is {chunk} and there are {count} rays, expected at least 1 of each")
-    parts = []
-    for start in range(0, count, chunk):
+
+    def render_from(start):
         part = render(_take_chunk(rays, start, chunk=chunk))
         if not isinstance(part, Rendering):
             raise ValueError(f"render_image: render returned {type(part).__name__}, expected a Rendering of its rays")
-        parts.append(without_samples(part))
-    return _join_chunks(parts, shape=shape)
+        return without_samples(part)
+
+    return _join_chunks(list(map(render_from, range(0, count, chunk))), shape=shape)
 
 
 # Both are jitted: run op by op, they would take longer than rendering a small image.

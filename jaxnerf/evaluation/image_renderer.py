@@ -9,6 +9,7 @@ from jaxnerf.core.occupancy.ray_culling import render_selected
 from jaxnerf.core.rendering import render_image
 from jaxnerf.core.types import Rays, Rendering
 from jaxnerf.runtime import memory, stages
+from jaxnerf.runtime.cores import map_on_cores
 
 
 def image_renderer(
@@ -39,9 +40,11 @@ def image_renderer(
                     checked.add((size, key))
                 return render(variables, rays)
 
+            # The first image, which compiles, has one thread.
+            options = {"chunk": size, "map": map_on_cores if (size, key) in checked else map}
             if cull is None:
-                return jax.block_until_ready(render_image(part, rays, chunk=size))
-            return jax.block_until_ready(render_selected(part, rays, *cull(variables, rays), chunk=size))
+                return jax.block_until_ready(render_image(part, rays, **options))
+            return jax.block_until_ready(render_selected(part, rays, *cull(variables, rays), **options))
 
         with stages.stage("rendering an image"):
             result, fitting[key] = memory.back_off(

@@ -69,8 +69,10 @@ def run(
             if len(argv) > 1 and not positional:
                 raise ValueError(f"unexpected argument {argv[1]!r}; flags look like --name=value")
             # Imported after the flags are parsed, so that a wrong flag is reported at once.
+            from jaxnerf.runtime import cores
             from jaxnerf.runtime.compilation_cache import use_compilation_cache
 
+            cores.limit_jax()
             use_compilation_cache()
             result = main(argv)
             sys.stdout.flush()

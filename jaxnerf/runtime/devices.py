@@ -9,20 +9,22 @@ process writes config.json and metrics.jsonl and prints; all take part in a chec
 
 import contextlib
 import functools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, SingleDeviceSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxnerf.runtime import memory, processes
+from jaxnerf.runtime import cores, memory, processes
 from jaxnerf.runtime.fingerprint import fingerprint
 
 CPU_MICROBATCH_SAMPLES = 12_288  # the fastest in experiments/speed: activations stay in the cache
+_MAX_THREADS = 8  # of a step on a CPU
 _MAX_SHARED = 4  # a run compiles at most two: of one step, and of several in a dispatch
 _shared: dict[Any, Any] | None = None  # compiled steps, by what they were compiled from; None: they are not shared
 
@@ -50,6 +52,7 @@ def compile_step(
     batch_size: int,
     microbatch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
+    num_threads: int = 1,
 ) -> tuple[Callable[..., tuple], Any, Any]:
     """Compiles a training step for the devices, and places its state and data there.
 
@@ -62,6 +65,8 @@ def compile_step(
         batch_size: rays per step, over all devices of all processes.
         microbatch_size: rays whose gradient is computed at once; None, or more than a device has: all of them.
         devices: of all processes; None: all. On several the step is jitted over a mesh of them.
+        num_threads: of the host, that compute the gradient of an equal part of the rays each, on one device; see
+            `threads_of_step`. For more than one the step must be a `TrainStep`.
 
     Returns:
         step, state, data: step(state, data) -> (state, metrics) consumes its state; step.compiled is what JAX
@@ -72,15 +77,17 @@ def compile_step(
         memory.OutOfMemory: if the step needs more memory than is free.
     """
     devices = jax.devices() if devices is None else devices
-    positions = split_positions(batch_size, len(devices), microbatch_size)
+    if num_threads > 1:  # a part of the rays may be no multiple of a microbatch
+        microbatch_size = math.gcd(microbatch_size or batch_size, batch_size // num_threads)
+    positions = split_positions(batch_size, max(len(devices), num_threads), microbatch_size)
     mesh = Mesh(np.array(devices), ("batch",))
     single = len(devices) == 1
     everywhere = SingleDeviceSharding(devices[0]) if single else NamedSharding(mesh, P())
     if single:
-        jitted, positions = jax.jit(train_step, donate_argnums=0), jnp.asarray(positions[0])
+        parts = list(place(positions, everywhere))
+        jitted, positions = jax.jit(train_step, donate_argnums=0), parts if num_threads > 1 else parts[0]
     else:
-        jitted = _sharded(train_step, mesh)
-        positions = place(positions, NamedSharding(mesh, P("batch")))
+        jitted, positions = _sharded(train_step, mesh), place(positions, NamedSharding(mesh, P("batch")))
     make = state if callable(state) else lambda: state
     shapes = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=everywhere), jax.eval_shape(make)
@@ -90,7 +97,10 @@ def compile_step(
     create = unoptimized(state, devices[0]) if callable(state) else make
     with ThreadPoolExecutor(1) as pool:
         made = None if devices[0].platform == "cpu" else pool.submit(create)
-        compiled = _compiled(jitted.lower(shapes, data, positions), devices)
+        if num_threads > 1:
+            compiled = _compile_on_threads(train_step, shapes, data, positions, devices)
+        else:
+            compiled = _compiled(jitted.lower(shapes, data, positions), devices)
         memory.check(compiled)
         memory.release()
         state = place(processes.broadcast(made.result() if made else create()), everywhere)
@@ -113,6 +123,37 @@ def _compiled(lowered, devices):
             _shared.clear()
         _shared[key] = lowered.compile()
     return _shared[key]
+
+
+class _StepOnThreads(NamedTuple):
+    """A compiled step of which each thread computes the gradient of a part of the rays.
+
+    On a CPU a program keeps several cores busy in a part of its operations only, and programs that one thread starts
+    run one after the other.
+    """
+
+    gradient: Any
+    finish: Any
+    pool: ThreadPoolExecutor
+    num_threads: int
+
+    def __call__(self, state, data, positions):
+        totals = self.pool.map(lambda part: self.gradient(state, data, part), positions)
+        return self.finish(state, data, *totals)
+
+    def memory_analysis(self):
+        programs = [each.memory_analysis() for each in [self.finish] + [self.gradient] * self.num_threads]
+        names = ("temp_size_in_bytes", "output_size_in_bytes", "alias_size_in_bytes")
+        return SimpleNamespace(**{name: sum(getattr(each, name) for each in programs) for name in names})
+
+
+def _compile_on_threads(train_step, state, data, positions, devices):
+    """Returns the _StepOnThreads of a TrainStep, with one thread for each of the positions [N, B]."""
+    gradient, count = jax.jit(train_step.gradient).lower(state, data, positions[0]), len(positions)
+    finish = jax.jit(train_step.finish, donate_argnums=0).lower(state, data, *[gradient.out_info] * count)
+    with ThreadPoolExecutor(2) as pool:
+        compiled = pool.map(lambda lowered: _compiled(lowered, devices), (gradient, finish))
+    return _StepOnThreads(*compiled, ThreadPoolExecutor(count), count)
 
 
 def _sharded(train_step, mesh):
@@ -161,7 +202,21 @@ def default_microbatch(rays: int, samples_per_ray: float, platform: str) -> int:
     if platform != "cpu":
         return rays
     fitting = max(CPU_MICROBATCH_SAMPLES // max(int(samples_per_ray), 1), 1)
-    return max(size for size in range(1, min(rays, fitting) + 1) if rays % size == 0) if rays > 0 else 0
+    return _largest_divisor(rays, fitting) if rays > 0 else 0
+
+
+def threads_of_step(num_pixels: int) -> int:
+    """Returns how many threads compute the gradient of a step: on a single CPU, one for each core that may be used.
+
+    At most _MAX_THREADS, as each adds a gradient of the whole table, and so many that the step's pixels split evenly.
+    """
+    if jax.device_count() > 1 or jax.default_backend() != "cpu":
+        return 1
+    return _largest_divisor(num_pixels, min(cores.usable(), _MAX_THREADS))
+
+
+def _largest_divisor(number, most):
+    return max(part for part in range(1, min(number, most) + 1) if number % part == 0)
 
 
 def split_positions(batch_size: int, num_devices: int, microbatch_size: int | None = None) -> np.ndarray:

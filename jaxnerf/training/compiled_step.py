@@ -49,6 +49,7 @@ class CompiledStep:
 
     Attributes:
         data: TrainData on the devices.
+        num_threads: of the host, that compute the gradient of a part of the rays each; see `devices.threads_of_step`.
         prepare_seconds, compile_seconds: that it took to prepare the data, and to compile.
     """
 
@@ -59,6 +60,7 @@ class CompiledStep:
         options = experiment.config.train
         self.data = data._replace(decay=DecayData(np.float32(options.lr_steps), np.float32(1)))
         self._experiment, self._options, self._by_count = experiment, options, {}
+        self.num_threads = devices.threads_of_step(options.batch_size // options.rays_per_side**2)
         create = functools.partial(create_state, experiment.model, experiment.optimizer, experiment.config.seed)
         self._initial_state = jax.tree_util.Partial(create, cells)
         pixels = data.views.pixels
@@ -89,6 +91,7 @@ class CompiledStep:
 
     def _compile(self, count):
         experiment, size = self._experiment, self._options.batch_size
+        num_threads = self.num_threads if count == 1 else 1
         train_step = make_train_step(
             experiment.model,
             experiment.optimizer,
@@ -99,8 +102,8 @@ class CompiledStep:
         )
 
         def compile_step(state, data, microbatch_size):
-            sizes = {"batch_size": size, "microbatch_size": microbatch_size}
-            return devices.compile_step(repeat_step(train_step, count), state, data, **sizes)
+            options = {"batch_size": size, "microbatch_size": microbatch_size, "num_threads": num_threads}
+            return devices.compile_step(repeat_step(train_step, count), state, data, **options)
 
         microbatch_size = min(self._options.microbatch_size, size // jax.device_count())
         step, state, data = memory.fit_step(compile_step, self._initial_state, self.data, microbatch_size)

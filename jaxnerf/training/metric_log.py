@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxnerf.core.metrics import decibels
 from jaxnerf.core.views import Views
+from jaxnerf.runtime import cores
 from jaxnerf.runtime.atomic_files import naming, open_regular, parse_json, partial_file, read_bytes, write_text
 from jaxnerf.runtime.processes import Detail
 from jaxnerf.training.dead_networks import dead_networks
@@ -161,6 +162,8 @@ def header(experiment: Any, views: Views, state: TrainState, compiled: Any) -> l
     """Returns the lines that describe a run before its first step; compiled: its CompiledStep."""
     options, devices = experiment.config.train, jax.devices()
     processes = f", in {jax.process_count()} processes" if jax.process_count() > 1 else ""
+    if devices[0].platform == "cpu":
+        processes = f" on {cores.usable()} cores{processes}"
     counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
     parts = ", ".join(f"{name} {count:,}" for name, count in counts.items())
     dtype = jax.tree.leaves(state.params)[0].dtype
@@ -181,7 +184,7 @@ def header(experiment: Any, views: Views, state: TrainState, compiled: Any) -> l
     lines += [
         f"compiled      in {compiled.compile_seconds:.1f} s",
         f"steps         {of_all(int(state.step), options)} done, {options.batch_size} rays per step in "
-        f"microbatches of {min(options.microbatch_size, options.batch_size // len(devices))}",
+        f"microbatches of {min(options.microbatch_size, options.batch_size // len(devices) // compiled.num_threads)}",
     ]
     return lines
 

@@ -1,5 +1,6 @@
 """The training step: draw rays, render them, and descend on the weighted sum of the losses."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -76,6 +77,26 @@ class StepLoss(NamedTuple):
     needs: tuple[str, ...] = ()
 
 
+@dataclasses.dataclass(frozen=True)
+class TrainStep:
+    """The pure training step: train_step(state, data, positions, *, axis_name=None) -> (state, metrics).
+
+    Its two halves may be programs of their own, so that each of several threads computes the gradient of a part of the
+    rays.
+
+    Attributes:
+        gradient: (state, data, positions [N, B]) -> total: sums over the rays at some positions, and their gradient.
+        finish: (state, data, *totals, axis_name=None) -> (state, metrics), from the totals of parts of the batch.
+    """
+
+    gradient: Callable[..., tuple]
+    finish: Callable[..., tuple]
+
+    def __call__(self, state: TrainState, data: Any, positions: jax.Array, *, axis_name: str | None = None) -> tuple:
+        """Takes a step; see `make_train_step`."""
+        return self.finish(state, data, self.gradient(state, data, positions), axis_name=axis_name)
+
+
 def make_train_step(
     model: Model,
     optimizer: optax.GradientTransformation,
@@ -83,7 +104,7 @@ def make_train_step(
     losses: Sequence[StepLoss],
     cameras: CameraParameters | None = None,
     pixel_rays: PixelRays | None = None,
-) -> Callable[..., tuple]:
+) -> TrainStep:
     """Makes the pure training step.
 
     Args:
@@ -136,7 +157,7 @@ def make_train_step(
         weighted = sum(_scaled(loss.weight(state.step), parts[loss.name]) for loss in ray_losses)
         errors = zip(model.image_networks, renderings, strict=True)
         sums = {f"mse_{name}": total(squared_error(rendering, batch)) for name, rendering in errors}
-        sums["rays"] = complete.sum(dtype=jnp.int32)
+        sums |= {"rays": complete.sum(dtype=jnp.int32), "dropped": (~complete).sum(dtype=jnp.int32)}
         if len(losses) > 1:
             sums |= {f"loss_{name}": part for name, part in parts.items()}
         return weighted, sums
@@ -146,12 +167,15 @@ def make_train_step(
         (loss, sums), grads = differentiated(state.params, state, data, positions)
         return {"loss": loss, **sums}, grads
 
-    def train_step(state, data, positions, *, axis_name=None):
-        total = _sum_over_microbatches(lambda part: sums_and_gradient(state, data, part), positions)
+    def gradient(state, data, positions):
+        return _sum_over_microbatches(lambda part: sums_and_gradient(state, data, part), positions)
+
+    def finish(state, data, *totals, axis_name=None):
+        total = functools.reduce(functools.partial(jax.tree.map, jnp.add), totals)
         if axis_name is not None:
             total = jax.lax.psum(total, axis_name)
         sums, grads = total
-        rays = sums.pop("rays")
+        rays, dropped = sums.pop("rays"), sums.pop("dropped")
         scale = 1 / jnp.maximum(rays, 1)
         metrics = jax.tree.map(lambda leaf: leaf * scale, sums)
         errors = {name: metrics[f"mse_{name}"] for name in model.image_networks}
@@ -171,8 +195,7 @@ def make_train_step(
         }
         grid = state.grid
         if model.grid_schedule is not None:
-            drawn = positions.size * (1 if axis_name is None else jax.lax.axis_size(axis_name))
-            counters["rays_dropped"] = state.counters["rays_dropped"] + drawn - rays
+            counters["rays_dropped"] = state.counters["rays_dropped"] + dropped
             # No ray has this position in the batch, so the key is unused otherwise.
             key = jax.random.fold_in(ray_batches.step_key(data.seed, state.step), 2**32 - 2)
             now = {**params, **_progress_at(state.step, model, data)}
@@ -181,7 +204,7 @@ def make_train_step(
         state = TrainState(step=state.step + 1, params=params, opt_state=opt_state, grid=grid, counters=counters)
         return state, {**metrics, "rays": rays, **counters}
 
-    return train_step
+    return TrainStep(gradient, finish)
 
 
 def repeat_step(train_step: Callable[..., tuple], num_steps: int) -> Callable[..., tuple]:

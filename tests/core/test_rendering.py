@@ -1,4 +1,5 @@
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -194,6 +195,8 @@ def test_an_image_does_not_depend_on_its_chunks(rays, chunk):
     got = render_image(render, rays, chunk=chunk)
     assert compiled == [(chunk,)] and got.weights is None and got.samples is None
     assert_same(got, without_samples(draw["rays"](None, rays)))
+    with ThreadPoolExecutor(2) as pool:
+        assert_same(render_image(render, rays, chunk=chunk, map=pool.map), got, rtol=0, atol=0)
 
 
 def test_wrong_arguments(rays):

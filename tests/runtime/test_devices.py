@@ -10,12 +10,12 @@ import optax
 import pytest
 
 from helpers import assert_same, random_rays
-from jaxnerf.runtime import devices
+from jaxnerf.runtime import cores, devices, memory
 from jaxnerf.training.build import build
 from jaxnerf.training.state import create_state
 from jaxnerf.training.step import TrainData, make_train_step
 from runs import smoke_config, smoke_experiment
-from toys import LOSSES, run_steps, toy_draw, toy_model
+from toys import LOSSES, OPTIMIZER, run_steps, toy_draw, toy_model
 
 pytest_plugins = ["run_fixtures"]
 
@@ -134,6 +134,44 @@ def test_the_compiled_step_sums_the_gradient_and_four_numbers():
     sums = re.findall(r"= (.*?) all-reduce(?:-start)?\(", run.compiled.as_text())
     shapes = [shape for each in sums for shape in re.findall(r"\w+\[([\d,]*)\]", each)]
     assert sum(np.prod([int(side) for side in shape.split(",") if side]) for shape in shapes) == 2 * 9 + 4
+
+
+def test_threads_have_a_part_of_the_rays_each():
+    model, data = toy_model(), (random_rays(0, (24,)), jnp.array([2]))
+    step = make_train_step(model, OPTIMIZER, toy_draw, LOSSES)
+    options = {"batch_size": 24, "microbatch_size": 12}
+    one, one_rows = run_steps(step, create_state(model, OPTIMIZER, 0), data, 4, 1, **options)
+    runs = [run_steps(step, create_state(model, OPTIMIZER, 0), data, 4, 1, num_threads=3, **options) for _ in range(2)]
+    assert_same(runs[0], runs[1], rtol=0, atol=0)
+    several, rows = runs[0]
+    assert_same(several, one, rtol=1e-5, atol=1e-6)
+    for row, one_row in zip(rows, one_rows, strict=True):
+        assert_same(row, one_row, rtol=1e-5)
+    assert int(several.counters["nonfinite"]) == 1
+
+
+def test_memory_of_a_step_on_threads_is_that_of_all(monkeypatch):
+    model, data = toy_model(), (random_rays(0, (24,)), jnp.array([2]))
+    step, state = make_train_step(model, OPTIMIZER, toy_draw, LOSSES), create_state(model, OPTIMIZER, 0)
+    few, many = (
+        devices.compile_step(step, state, data, batch_size=24, devices=jax.devices()[:1], num_threads=count)[0].compiled
+        for count in (2, 6)
+    )
+    assert few.memory_analysis().output_size_in_bytes < many.memory_analysis().output_size_in_bytes
+    monkeypatch.setattr(memory, "available", lambda: 100)
+    with pytest.raises(memory.OutOfMemory):
+        memory.check(many)
+
+
+def test_threads_of_a_step_are_cores_that_split_its_pixels(monkeypatch):
+    monkeypatch.setattr(cores, "usable", lambda: 6)
+    assert devices.threads_of_step(1024) == 1  # there are several devices
+    monkeypatch.setattr(jax, "device_count", lambda: 1)
+    assert [devices.threads_of_step(count) for count in (1, 7, 64, 1020)] == [1, 1, 4, 6]
+    monkeypatch.setattr(cores, "usable", lambda: 64)
+    assert devices.threads_of_step(1024) == 8
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert devices.threads_of_step(1024) == 1
 
 
 def test_seed_does_not_change_the_program():

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -83,11 +83,12 @@ def render_selected(
     otherwise: Rendering | None,
     *,
     chunk: int,
+    map: Callable[..., Iterable] = map,
 ) -> Rendering:
     """Renders only some rays of an image, those that may hit an occupied cell.
 
     Args:
-        render, rays, chunk: see render_image; but the last chunk is padded with rays of length 0, which
+        render, rays, chunk, map: see render_image; but the last chunk is padded with rays of length 0, which
             cost least.
         selected: [H, W] bool, which rays are rendered.
         otherwise: Rendering [H, W] without weights, of the other rays; see render_background.
@@ -103,9 +104,13 @@ def render_selected(
     if selected.shape != rays.near.shape:
         raise ValueError(f"render_selected: selected has shape {selected.shape}, expected {rays.near.shape}, the rays'")
     order, whole = _order(selected), jax.tree.map(jnp.copy, otherwise)  # a copy, as it is written into
-    for start in range(0, int(selected.sum()), chunk):
+
+    def render_from(start):
         places, part = _selected_of(rays, order, start, chunk=chunk)
-        whole = _with_part(whole, places, without_samples(render(part)))
+        return places, without_samples(render(part))
+
+    for places, part in map(render_from, range(0, int(selected.sum()), chunk)):
+        whole = _with_part(whole, places, part)
     return whole
 
 

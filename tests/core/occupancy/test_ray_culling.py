@@ -1,6 +1,7 @@
 """Ray culling skips no ray that hits an occupied cell, and images are the same without it."""
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -81,6 +82,9 @@ def test_rays_that_are_not_selected_are_not_rendered(fraction):
     assert len(evaluated) == -(-int(selected.sum()) // 5)
     origins = [origin for part, length in evaluated for origin in np.asarray(part)[np.asarray(length) > 0].tolist()]
     assert sorted(origins) == sorted(np.asarray(rays.origins)[np.asarray(selected)].tolist())
+    with ThreadPoolExecutor(2) as pool:
+        again = render_selected(jax.jit(through_ball), rays, selected, nothing, chunk=5, map=pool.map)
+    assert_same(again, got)
 
 
 @pytest.mark.slow

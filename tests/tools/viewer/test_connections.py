@@ -260,7 +260,7 @@ def test_a_large_message_closes_the_page(pages, megabytes):
     with pytest.raises(websockets.exceptions.ConnectionClosedError) as caught:
         for _ in range(40):
             page.socket.send(bytes(megabytes * MEGABYTE))
-        page.socket.recv(timeout=10)
+        page.wait(lambda: False, seconds=10)
     assert caught.value.rcvd is None or caught.value.rcvd.code == 1009
     assert time.monotonic() - started < 5
 
@@ -269,7 +269,7 @@ def test_a_large_message_in_parts_closes_the_page(pages):
     page = pages()
     with pytest.raises(websockets.exceptions.ConnectionClosedError):
         page.socket.send(bytes(2**14) for _ in range(1000))
-        page.socket.recv(timeout=10)
+        page.wait(lambda: False, seconds=10)
 
 
 @pytest.mark.parametrize(
@@ -372,21 +372,26 @@ def test_a_slow_transfer_goes_on_and_few_are_under_way_at_once(viewer, monkeypat
     with contextlib.ExitStack() as stack:
         readers = [stack.enter_context(request(viewer.port, "/scene.bin")) for _ in range(8)]
         time.sleep(0.5)
-        began = []
-        for reader in readers:
-            reader.settimeout(0.1)
-            with contextlib.suppress(TimeoutError):
-                began.append((reader, len(reader.recv(2**10))))
-        assert len(began) == connections._MAX_TRANSFERS
+        began = {}
+
+        def have_begun():
+            for reader in set(readers) - set(began):
+                reader.settimeout(0.1)
+                with contextlib.suppress(TimeoutError):
+                    began[reader] = len(reader.recv(2**10))
+            return len(began)
+
+        wait_for(lambda: have_begun() >= connections._MAX_TRANSFERS)
+        assert have_begun() == connections._MAX_TRANSFERS
         assert ask(viewer.port)[0] == 200
-        slow, received = began[0]
+        slow, received = next(iter(began.items()))
         slow.settimeout(10)
         while part := slow.recv(MEGABYTE):
             received += len(part)
             time.sleep(0.05)
         assert received > 16 * MEGABYTE
-        for reader, _ in began[1:]:  # pages that close make room, too
+        for reader in set(began) - {slow}:  # pages that close make room, too
             reader.close()
-        for reader in set(readers) - {reader for reader, _ in began}:
+        for reader in set(readers) - set(began):
             reader.settimeout(10)
             assert reader.recv(12) == b"HTTP/1.1 200"
