@@ -52,7 +52,7 @@ def confident_observations(views: Views) -> SparsePoints:
     sparse = views.sparse
     positions, point = np.asarray(sparse.positions), np.asarray(sparse.point)
     cameras = jax.tree.map(lambda leaf: np.asarray(leaf)[sparse.view], views.cameras)
-    projected = np.asarray(jax.jit(jax.vmap(lambda camera, x: project(camera, x)[0]))(cameras, positions[point]))
+    projected = np.asarray(_project(cameras, positions[point]))
     errors = ((projected - sparse.pixel) ** 2).sum(axis=-1)  # inf behind the camera
     count = np.bincount(point, minlength=len(positions))
     variance = np.bincount(point, errors, minlength=len(positions)) / np.maximum(2 * count - 3, 1)
@@ -74,3 +74,6 @@ def confident_observations(views: Views) -> SparsePoints:
     view, point, pixel = (np.asarray(values)[kept] for values in (sparse.view, sparse.point, sparse.pixel))
     confidence = np.float32(confidence[kept])
     return dataclasses.replace(sparse, view=view, point=point, pixel=pixel, confidence=confidence)
+
+
+_project = jax.jit(jax.vmap(lambda camera, x: project(camera, x)[0]))
