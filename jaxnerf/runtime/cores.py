@@ -38,22 +38,14 @@ def num_at_once() -> int:
     return usable() if jax.default_backend() == "cpu" else 1
 
 
-def map_on_cores(
-    function: Callable[[Any], Any], items: Iterable[Any], *, compiles: bool = False, uses_jax: bool = True
-) -> Iterator[Any]:
+def map_on_cores(function: Callable[[Any], Any], items: Iterable[Any], *, compiles: bool = False) -> Iterator[Any]:
     """Yields function(item) for each of the items, in order; on a CPU several at once, each in a thread of its own.
 
     A program of JAX keeps several cores busy in a part of its operations only, and programs that one thread starts run
-    one after the other. On other devices, and on one core, this is `map`.
-
-    Args:
-        function: is called from several threads.
-        items: whose results do not depend on each other.
-        compiles: whether the first call is made before the others, as it compiles what all of them run.
-        uses_jax: whether the function runs programs of JAX; False: it does not depend on the device.
+    one after the other. On other devices, and on one core, this is `map`. A first call that compiles what the others
+    run is made alone.
     """
-    count = num_at_once() if uses_jax else usable()
-    items = iter(items)
+    count, items = num_at_once(), iter(items)
     if compiles or count == 1:
         yield from map(function, items if count == 1 else itertools.islice(items, 1))
     if count > 1:

@@ -93,8 +93,7 @@ def _interpolated(views):
         confidence = (corners.min(axis=1) / corners.max(axis=1)) ** 2
         result[view, y, x] = np.where((simplex >= 0)[:, None], np.stack([values, confidence], axis=-1), 0)
 
-    for _ in cores.map_on_cores(fill, range(len(views.size)), uses_jax=False):
-        pass
+    list(cores.map_on_cores(fill, range(len(views.size))))
     return result
 
 
@@ -107,13 +106,12 @@ def scipy_spatial() -> Any:
     that took 35 ms an image, and seconds beside another program, in place of 5 ms.
     """
     name = "OPENBLAS_NUM_THREADS"
-    given = os.environ.get(name)
-    os.environ[name] = given or "1"
-    try:
-        from scipy import spatial
-    finally:
-        if given is None:
-            os.environ.pop(name, None)
+    is_set = name in os.environ
+    os.environ.setdefault(name, "1")
+    from scipy import spatial
+
+    if not is_set:
+        del os.environ[name]
     return spatial
 
 

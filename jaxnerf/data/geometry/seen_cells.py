@@ -51,24 +51,18 @@ def seen_cells(
         ValueError: if the lens of a view shows no pixel; names the view.
     """
     cubes = tuple(-(-size // _CUBE) for size in schedule.shape)
-    number, num_views = math.prod(cubes), len(views.offset)
-    slabs = _slabs(number, cores.num_at_once())
-    count = _view_counter(views, schedule, cubes, len(slabs[0]))
-
-    def cells_of(slab):
-        counts = _no_counts(len(slab))
-        for view in range(num_views):
-            stage.update(view, num_views)
-            counts = count(counts, view, slab)
-        num_seen, num_free, clear = (np.asarray(each)[:-1] for each in counts)
-        return num_seen >= min_views, clear | ((num_free > 0) & (num_free >= np.minimum(num_seen, 2)))
-
+    number, num_slabs = math.prod(cubes), cores.num_at_once()
+    length = -(-number // num_slabs)
+    count = _view_counter(views, schedule, cubes, length)
+    # Each slab has cubes from everywhere, so that all take as long; some cubes may repeat.
+    slabs = np.minimum(np.arange(length * num_slabs), number - 1).reshape(length, num_slabs).T
     cells = np.zeros((2, number, _CUBE, _CUBE, _CUBE), bool)
     with stages.stage("finding the cells that the cameras see, by images") as stage:
-        for slab, of_slab in zip(slabs, cores.map_on_cores(cells_of, slabs), strict=True):
-            cells[:, slab] = of_slab
-    seen, free = (_joined(each, cubes, schedule.shape) for each in cells)
-    return seen, free
+        counts = cores.map_on_cores(functools.partial(count, stage), slabs)
+        for slab, (num_seen, num_free, clear) in zip(slabs, counts, strict=True):
+            free = clear | ((num_free > 0) & (num_free >= np.minimum(num_seen, 2)))
+            cells[:, slab] = num_seen >= min_views, free
+    return tuple(_joined(each, cubes, schedule.shape) for each in cells)
 
 
 def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
@@ -137,20 +131,8 @@ def likely_empty_cells(
     return ~np.asarray(widen(surface)) | in_front
 
 
-def _slabs(number, count):
-    """Returns so many parts [N] of equal length of the indices of cubes, each from everywhere; some indices repeat."""
-    length = -(-number // count)
-    return np.minimum(np.arange(length * count), number - 1).reshape(length, count).T
-
-
-def _no_counts(size):
-    """Returns what `_view_counter` counts in so many cubes before the first view; one more takes what is padding."""
-    shape = size + 1, _CUBE, _CUBE, _CUBE
-    return np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, bool)
-
-
 def _view_counter(views, schedule, cubes, size):
-    """Returns the function (counts, view, slab) -> counts that adds a view, compiled for slabs of so many cubes.
+    """Returns the function (stage, slab) -> counts in a slab of so many cubes, compiled.
 
     The counts are, for the cells of each cube of a slab, how many views see them, how many of these see them free, and
     whether they touch a clear sphere. Only cubes of cells are looked at whose boxes, see `_boxes`, a view may see.
@@ -171,17 +153,24 @@ def _view_counter(views, schedule, cubes, size):
 
         return jax.lax.fori_loop(0, num_chunks, add, counts)
 
-    def count_view(counts, view, slab):
-        seen_by = tuple(each[view] for each in stack)
-        indices = np.flatnonzero(_may_see(*seen_by[:4], *seen_by[5:7], *(corner[slab] for corner in boxes)))
-        num_chunks = -(-len(indices) // _CHUNK_CUBES)
-        indices = np.append(indices, np.full(padding - len(indices), size))
-        return compiled(counts, seen_by, np.int32(np.append(slab, slab[-1])), np.int32(indices), np.int32(num_chunks))
+    def no_counts():  # the last cube takes what is only padding
+        return tuple(np.zeros((size + 1, _CUBE, _CUBE, _CUBE), kind) for kind in (np.int32, np.int32, bool))
+
+    def count_views(stage, slab):
+        counts, ids, of_slab = no_counts(), np.int32(np.append(slab, slab[-1])), [each[slab] for each in boxes]
+        for view in range(len(views.offset)):
+            stage.update(view, len(views.offset))
+            seen_by = tuple(each[view] for each in stack)
+            indices = np.flatnonzero(_may_see(*seen_by[:4], *seen_by[5:7], *of_slab))
+            num_chunks = np.int32(-(-len(indices) // _CHUNK_CUBES))
+            indices = np.append(indices, np.full(padding - len(indices), size))
+            counts = compiled(counts, seen_by, ids, np.int32(indices), num_chunks)
+        return [np.asarray(each)[:-1] for each in counts]
 
     # Here, as the calls that several threads make at once would compile it as often.
     integers = (jax.ShapeDtypeStruct(shape, np.int32) for shape in ((size + 1,), (padding,), ()))
-    compiled = count.lower(_no_counts(size), tuple(each[0] for each in stack), *integers).compile()
-    return count_view
+    compiled = count.lower(no_counts(), tuple(each[0] for each in stack), *integers).compile()
+    return count_views
 
 
 def _corners(schedule, cubes, ids):
@@ -258,11 +247,10 @@ def _shown_slopes(views):
     Returns:
         The least x and y [V, 2], entries per unit of x and y [V, 2], and the table [V, _SLOPES, _SLOPES], y first.
     """
+    least, scale, shown = [], [], []
     pixels = np.stack(np.meshgrid(*[np.linspace(0, 1, _SLOPES // 4)] * 2), axis=-1)
-
-    def of(view):
-        height, width = np.asarray(views.size[view])
-        camera = jax.tree.map(lambda leaf: np.asarray(leaf)[view], views.cameras)
+    for view, (height, width) in enumerate(np.asarray(views.size)):
+        camera = jax.tree.map(lambda leaf, view=view: np.asarray(leaf)[view], views.cameras)
         camera = dataclasses.replace(camera, to_world=np.eye(3, 4, dtype=np.float32))
         slopes, exists = map(np.asarray, _undistort(camera, pixels * [width, height]))
         if not exists.any():
@@ -279,10 +267,8 @@ def _shown_slopes(views):
         if views.mask is not None:
             column, row = np.moveaxis(np.where(inside[..., None], at, 0).astype(int), -1, 0)
             inside &= np.asarray(views.mask)[views.offset[view] + row * width + column]
-        return lower, _SLOPES / (upper - lower), inside
-
-    least, scale, shown = zip(*cores.map_on_cores(of, range(len(views.size)), compiles=True), strict=True)
-    return np.float32(least), np.float32(scale), np.array(shown)
+        least.append(lower), scale.append(_SLOPES / (upper - lower)), shown.append(inside)
+    return jnp.float32(least), jnp.float32(scale), jnp.array(shown)
 
 
 _undistort = jax.jit(undistort)

@@ -60,7 +60,7 @@ def visual_hull(views: Views, lower: Vector, upper: Vector, *, resolution: int) 
 
     # Several views carve the tree at once: whether a view finds a cell empty does not depend on the others.
     with stages.stage("finding the visual hull, by images") as stage:
-        for done, _ in enumerate(cores.map_on_cores(carve, order, compiles=True, uses_jax=False), 1):
+        for done, _ in enumerate(cores.map_on_cores(carve, order, compiles=True), 1):
             stage.update(done, len(order))
     for above, below in zip(tree[:-1], tree[1:], strict=True):
         below &= np.repeat(above, 8)
