@@ -54,11 +54,15 @@ class RunConfig(Options):
     fingerprint: str = ""
     data: DataOptions = dataclasses.field(default_factory=DataOptions)
     scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
-    losses: Mapping[str, Schedule] = dataclasses.field(default_factory=lambda: default_weights())
+    losses: Mapping[str, Schedule] = dataclasses.field(
+        default_factory=lambda: {name: LOSSES.get(name).weight for name in LOSSES.names()}
+    )
     cameras: CameraOptions = dataclasses.field(default_factory=CameraOptions)
     train: TrainOptions = dataclasses.field(default_factory=TrainOptions)
     eval: EvalOptions = dataclasses.field(default_factory=EvalOptions)
-    parts: Mapping[str, Any] = dataclasses.field(default_factory=lambda: default_parts())
+    parts: Mapping[str, Any] = dataclasses.field(
+        default_factory=lambda: {name: part.options() for name, part in part_sections().items() if part.options}
+    )
 
     def __getattr__(self, name: str) -> Any:
         parts = self.__dict__.get("parts", {})
@@ -108,11 +112,6 @@ class RunConfig(Options):
 Config: TypeAlias = RunConfig | ConfigDict | Mapping[str, Any]
 
 
-def default_weights() -> dict[str, Any]:
-    """Returns the weights of all registered losses where a config sets none."""
-    return {name: LOSSES.get(name).weight for name in LOSSES.names()}
-
-
 def part_sections() -> dict[str, Part]:
     """Returns the registered fields and samplers, and the fields of a sampler's further networks, by their section.
 
@@ -131,11 +130,6 @@ def part_sections() -> dict[str, Part]:
                 )
             found |= {**part.networks, section: part}
     return found
-
-
-def default_parts() -> dict[str, Options]:
-    """Returns the default options of all registered fields and samplers, by the name of their section."""
-    return {name: part.options() for name, part in part_sections().items() if part.options}
 
 
 def read_config(config: Config) -> RunConfig:

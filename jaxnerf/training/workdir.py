@@ -112,8 +112,12 @@ def load_config_dict(path: str | os.PathLike) -> ConfigDict:
     return to_config_dict(load_config(path.parent))
 
 
-def _content(workdir):
-    """Returns what config.json holds; ValueError if it is no config."""
+def _saved(workdir):
+    """Returns the content of a config.json; ValueError if it is no config.
+
+    What it lacks was added after it was written, or registered since: losses are off, and other options on which
+    training does not depend have their defaults.
+    """
     path = pathlib.Path(workdir) / "config.json"
     try:
         content = atomic_files.read_json(path, "restore it or train again")
@@ -121,16 +125,6 @@ def _content(workdir):
         raise ValueError(f"{path}: no such file, expected the workdir of a training run; correct --workdir") from None
     if not isinstance(content, dict) or not isinstance(content.get("train"), dict):
         raise ValueError(f"{path}: is not a config, expected what training has written; restore it or train again")
-    return content
-
-
-def _saved(workdir):
-    """Returns the content of a config.json.
-
-    What it lacks was added after it was written, or registered since: losses are off, and other options on which
-    training does not depend have their defaults.
-    """
-    content = _content(workdir)
     added = {name: value for name, option, _, value in declared(RunConfig()) if not option.changes & Changes.TRAINING}
     for name, value in {**added, **{f"losses.{name}": 0.0 for name in LOSSES.names()}}.items():
         section, _, field = name.partition(".")
