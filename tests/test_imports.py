@@ -30,6 +30,7 @@ ALLOWED = {
     ("models", "fields"),
     ("tools.capture_check", "tools.next_images"),
     ("tools.viewer", "tools.exporters"),
+    ("tools.viewer", "tools.next_images"),
     ("tools.viewer", "tools.uncertainty"),
     ("tools.exporters", "tools.uncertainty"),
 }

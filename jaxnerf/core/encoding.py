@@ -51,7 +51,7 @@ def positional_encoding(
         ValueError: on a scalar or integer x, if F is outside [0, 64], or if there are no features.
     """
     (x,) = _checked("positional_encoding", x, num_freqs, include_input)
-    return _features(x.shape, encode_planes(_planes(x), num_freqs=num_freqs, include_input=include_input))
+    return _features(x.shape, encode_planes(planes_of(x), num_freqs=num_freqs, include_input=include_input))
 
 
 def integrated_encoding(
@@ -83,8 +83,8 @@ def integrated_encoding(
     """
     x, variance = _checked("integrated_encoding", x, num_freqs, include_input, variance)
     check_shapes("integrated_encoding", x=(x, "... D"), variance=(variance, "... D"))
-    planes = encode_planes(_planes(x), num_freqs=num_freqs, include_input=include_input, variance=_planes(variance))
-    return _features(x.shape, planes)
+    options = {"num_freqs": num_freqs, "include_input": include_input, "variance": planes_of(variance)}
+    return _features(x.shape, encode_planes(planes_of(x), **options))
 
 
 def frustum_variance(
@@ -130,7 +130,8 @@ def _checked(function, x, num_freqs, include_input, *others):
     return at_least_float32(x, *others)
 
 
-def _planes(x):
+def planes_of(x: Float[ArrayLike, "*batch D"]) -> Float[Array, "D N"]:
+    """Returns vectors [..., D] as [D, N]."""
     return jnp.moveaxis(x, -1, 0).reshape(x.shape[-1], math.prod(x.shape[:-1]))
 
 

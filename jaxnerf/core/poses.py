@@ -42,31 +42,10 @@ def turntable(
     across = jnp.cross(up, jnp.array([1.0, 0.1, 0.0]))
     first = normalize(jnp.where(norm(across) > 1e-3, across, jnp.cross(up, jnp.array([0.0, 1.0, 0.0]))))
     flat = radius * math.cos(elevation)
-    axes = jnp.stack([flat * first, flat * jnp.cross(up, first)])
     middle = center + radius * math.sin(elevation) * up
-    return ellipse(num_frames, middle=middle, axes=axes, target=center, up=up)
-
-
-def ellipse(
-    num_frames: int, *, middle: Vector, axes: Num[ArrayLike, "2 3"], target: Vector, up: Vector
-) -> Float[Array, "N 3 4"]:
-    """Places cameras on an ellipse, all looking at one point.
-
-    Args:
-        num_frames: N, one turn, from middle + axes[0] towards middle + axes[1].
-        middle: [3] center of the ellipse, world.
-        axes: [2, 3] half axes, world units.
-        target: [3] the point that all cameras look at, world.
-        up: [3] upwards in the images.
-
-    Returns:
-        Poses [N, 3, 4].
-    """
-    middle, axes, target, up = (jnp.asarray(value, jnp.float32) for value in (middle, axes, target, up))
-    check_shapes("ellipse", middle=(middle, "3"), axes=(axes, "2 3"), target=(target, "3"), up=(up, "3"))
     angle = 2 * math.pi * jnp.arange(num_frames)[:, None] / num_frames
-    eyes = middle[None] + jnp.cos(angle) * axes[:1] + jnp.sin(angle) * axes[1:]
-    return jax.vmap(lambda eye: look_at(eye, target, up))(eyes)
+    eyes = middle[None] + jnp.cos(angle) * (flat * first)[None] + jnp.sin(angle) * (flat * jnp.cross(up, first))[None]
+    return jax.vmap(lambda eye: look_at(eye, center, up))(eyes)
 
 
 def spiral(
@@ -75,21 +54,17 @@ def spiral(
     pose: Num[ArrayLike, "3 4"],
     radii: Vector,
     focus: Num[ArrayLike, ""],
-    rotations: float = 2,
-    zrate: float = 0.5,
 ) -> Float[Array, "N 3 4"]:
     """Places cameras on a spiral around one pose, looking at a point in front of it.
 
-    This is the path of the LLFF code (Mildenhall et al. 2019): the camera circles in the plane perpendicular to the
-    viewing direction and oscillates along that direction. The path is closed if rotations * zrate is an integer.
+    This is the path of the LLFF code (Mildenhall et al. 2019): the camera circles twice in the plane perpendicular to
+    the viewing direction and oscillates once along that direction.
 
     Args:
         num_frames: N.
         pose: [3, 4] the pose in the middle of the path.
         radii: [3] amplitudes along the pose's x, y and z, world units.
         focus: distance from the pose to the point that all cameras look at, world units.
-        rotations: number of circles.
-        zrate: oscillations per circle.
 
     Returns:
         Poses [N, 3, 4].
@@ -99,10 +74,10 @@ def spiral(
     target = pose[:, 3] - focus * pose[:, 2]
 
     def pose_at(angle):
-        around = jnp.stack([jnp.cos(angle), -jnp.sin(angle), -jnp.sin(zrate * angle)]) * radii
+        around = jnp.stack([jnp.cos(angle), -jnp.sin(angle), -jnp.sin(angle / 2)]) * radii
         return look_at(pose[:, 3] + (pose[:, :3] * around[None]).sum(axis=-1), target, pose[:, 1])
 
-    return jax.vmap(pose_at)(2 * math.pi * rotations * jnp.arange(num_frames) / num_frames)
+    return jax.vmap(pose_at)(4 * math.pi * jnp.arange(num_frames) / num_frames)
 
 
 def interpolate(num_frames: int, *, poses: Num[ArrayLike, "K 3 4"], closed: bool = False) -> Float[Array, "N 3 4"]:

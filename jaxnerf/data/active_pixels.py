@@ -1,6 +1,7 @@
 """The pixels that training draws from: those that are unmasked and whose rays may hit matter."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -15,7 +16,7 @@ from jaxnerf.data.geometry.seen_cells import likely_empty_cells, seen_cells
 from jaxnerf.data.geometry.visual_hull import visual_hull
 from jaxnerf.data.ray_batches import PixelRuns, view_rays
 from jaxnerf.models.grid_schedule import GridSchedule, InitialCells
-from jaxnerf.runtime import stages
+from jaxnerf.runtime import cores, stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
@@ -62,9 +63,12 @@ def active_region(
         valid = valid_cells(views, schedule, use_alpha=use_alpha)
         empty = np.zeros_like(valid)
         if min_views:
-            seen, free = seen_cells(views, schedule, min_views=min_views)
+            find_seen = functools.partial(seen_cells, views, schedule, min_views=min_views)
+            find_empty = functools.partial(likely_empty_cells, views, schedule, pixel_offset=pixel_offset)
+            # Both at once, as Python traces their programs on a single core.
+            (seen, free), empty = cores.map_on_cores(lambda find: find(), (find_seen, find_empty))
             valid &= seen & ~free
-            empty = valid & likely_empty_cells(views, schedule, pixel_offset=pixel_offset)
+            empty &= valid
         active = find_active_pixels(views, schedule, valid, **options)
         return {"valid": valid, "empty": empty} | ({} if active is None else vars(active))
 
@@ -268,9 +272,13 @@ def _hits(views, schedule, valid, view, pixels, *, ndc, chunk):
 
     cameras = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None)
     found, grid = np.zeros(view.size, bool), schedule.create(valid)
+
+    def test(start):
+        indices = np.minimum(np.arange(start, start + chunk), view.size - 1)  # a single compiled shape
+        found[indices] = hits(cameras, grid, view[indices], pixels[indices])
+        return start
+
     with stages.stage("testing which pixels show the box") as stage:
-        for start in range(0, view.size, chunk):
+        for start in cores.map_on_cores(test, range(0, view.size, chunk), compiles=True):
             stage.update(start, view.size)
-            indices = np.minimum(np.arange(start, start + chunk), view.size - 1)  # a single compiled shape
-            found[indices] = hits(cameras, grid, view[indices], pixels[indices])
     return found

@@ -10,7 +10,7 @@ import numpy as np
 from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt
 from jaxnerf.data.geometry import bounds, world
-from jaxnerf.data.geometry.poses import AXES, axis_of
+from jaxnerf.data.geometry.poses import AXES, axis_of, look_one_way
 from jaxnerf.data.images import downscaled_copies, image_files, load_images, pixel_rays
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
@@ -218,7 +218,7 @@ def _world_of(data, capture):
     """Returns the world of a Capture, and the line that reports it."""
     if capture.normalised:
         return "file", ""
-    forward = data.ndc is True or world.looks_forward(capture)
+    forward = data.ndc is True or look_one_way(world.poses_of(capture))
     unsuited = forward and data.ndc is not True and bounds.unsuited_to_ndc(capture)
     why = f"; the cameras look one way, but {unsuited}" if unsuited else ""
     kind = "forward" if forward and not unsuited else "around"
@@ -350,7 +350,7 @@ def load_split(
 def _in_world(data, capture):
     """Returns a Capture with bounds in every frame in the world of resolved options, and [4, 4] back to the file's."""
     if data.world == "forward":
-        if data.ndc and not world.looks_forward(capture, cosine=0.5):
+        if data.ndc and not look_one_way(world.poses_of(capture), cosine=0.5):
             raise ValueError(
                 f"{dataset_folder(data.dir)}: data.ndc is True and the cameras look in all directions, expected one "
                 "direction; set data.ndc to False"

@@ -131,8 +131,9 @@ def sample_pixels(views: Views) -> Float[np.ndarray, "N C"]:
     Of more than 2^20 pixels some are chosen: runs of them at random places, as single pixels of a file on disk would
     take as long to read as all. Pixels that a mask excludes do not count, unless it excludes all that were chosen.
     """
-    total, chosen = len(views.pixels), np.arange(len(views.pixels))
-    if total > _MEAN_RUNS * _MEAN_RUN:
+    total, runs = len(views.pixels), _MEAN_RUNS * _MEAN_RUN
+    chosen = np.arange(min(total, runs))
+    if total > runs:
         starts = np.sort(np.random.default_rng(0).integers(0, total - _MEAN_RUN, _MEAN_RUNS))
         chosen = (starts[:, None] + np.arange(_MEAN_RUN)).reshape(-1)
     if views.mask is not None and views.mask[chosen].any():

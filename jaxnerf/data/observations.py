@@ -21,15 +21,6 @@ def num_shared(views: Views) -> int:
     return int(count[count >= 2].sum())
 
 
-def check_observed(views: Views) -> None:
-    """Raises a ValueError if the views have no observations of sparse points."""
-    if views.sparse is None or not len(views.sparse.view):
-        raise ValueError(
-            "losses.depth is set, and the dataset has no observations of sparse points, expected those of a COLMAP "
-            "model with points3D; set losses.depth to 0, or add the model"
-        )
-
-
 def confident_observations(views: Views) -> SparsePoints:
     """Returns the views' SparsePoints with the confidence of each observation, without those that are unreliable.
 
@@ -46,13 +37,17 @@ def confident_observations(views: Views) -> SparsePoints:
         shows, or that lie behind one of their cameras; and those in masked pixels.
 
     Raises:
-        ValueError: if no observation is left.
+        ValueError: if there is no observation, or none is left.
     """
-    check_observed(views)
+    if views.sparse is None or not len(views.sparse.view):
+        raise ValueError(
+            "losses.depth is set, and the dataset has no observations of sparse points, expected those of a COLMAP "
+            "model with points3D; set losses.depth to 0, or add the model"
+        )
     sparse = views.sparse
     positions, point = np.asarray(sparse.positions), np.asarray(sparse.point)
     cameras = jax.tree.map(lambda leaf: np.asarray(leaf)[sparse.view], views.cameras)
-    projected = np.asarray(jax.jit(jax.vmap(lambda camera, x: project(camera, x)[0]))(cameras, positions[point]))
+    projected = np.asarray(_project(cameras, positions[point]))
     errors = ((projected - sparse.pixel) ** 2).sum(axis=-1)  # inf behind the camera
     count = np.bincount(point, minlength=len(positions))
     variance = np.bincount(point, errors, minlength=len(positions)) / np.maximum(2 * count - 3, 1)
@@ -74,3 +69,6 @@ def confident_observations(views: Views) -> SparsePoints:
     view, point, pixel = (np.asarray(values)[kept] for values in (sparse.view, sparse.point, sparse.pixel))
     confidence = np.float32(confidence[kept])
     return dataclasses.replace(sparse, view=view, point=point, pixel=pixel, confidence=confidence)
+
+
+_project = jax.jit(jax.vmap(lambda camera, x: project(camera, x)[0]))

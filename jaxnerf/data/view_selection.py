@@ -69,11 +69,6 @@ def selection(data: Any, split: str, max_views: int | None = None) -> Callable[[
         split: whose views.
         max_views: see `load_split`.
     """
-    select = _selection(data, split)
-    return select if max_views is None else _at_most(max_views, select)
-
-
-def _selection(data, split):
     every = data.hold_out if split in ("train", "held_out") else 0
     number = data.num_views if split == "train" else 0
     named = list(data.view_indices) if split == "train" else []
@@ -82,7 +77,7 @@ def _selection(data, split):
             f"data.num_views is {number} and data.view_indices {data.view_indices}, expected only one of them; set "
             "data.num_views to 0 or data.view_indices to ()"
         )
-    if not every and not number and not named:
+    if not every and not number and not named and max_views is None:
         return None
 
     def select(count):
@@ -108,18 +103,13 @@ def _selection(data, split):
                 raise ValueError(
                     f"data.num_views is {number} of {count} views, expected 1 to {count}, or 0 for all; correct it"
                 )
-            indices = indices[np.arange(number) * count // number]
-        return indices
+            indices = _spread(indices, number)
+        return indices if max_views is None else _spread(indices, max_views)
 
     return select
 
 
-def _at_most(number, select):
-    """Returns the selection of at most that many of the views that another one selects."""
-
-    def select_some(count):
-        indices = np.arange(count) if select is None else select(count)
-        kept = min(number, len(indices))
-        return indices[np.arange(kept) * len(indices) // kept]
-
-    return select_some
+def _spread(indices, number):
+    """Returns at most so many of some indices, evenly spread."""
+    number = min(number, len(indices))
+    return indices[np.arange(number) * len(indices) // number]

@@ -96,11 +96,6 @@ def read_results(target: pathlib.Path, remedy: str) -> dict[str, Any]:
     return results
 
 
-def is_finite(value: Any) -> bool:
-    """Returns whether a value that a JSON file holds is a finite number of at least 0."""
-    return type(value) in (int, float) and 0 <= value < math.inf
-
-
 def merge(
     partial: pathlib.Path,
     target: pathlib.Path,

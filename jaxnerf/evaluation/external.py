@@ -3,12 +3,10 @@
 import logging
 import os
 import re
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 
 from jaxnerf.data.geometry.path_poses import natural_key
 from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden, read_image
@@ -56,7 +54,7 @@ def score_folder(
     if config is None:
         truths = _image_paths(folder / "gt-color")
         names = _names(path.relative_to(folder / "gt-color") for path in truths)
-        references, masks = [_colors(path) for path in truths], None
+        references, masks = [_colors(path) for path in truths], [None] * len(truths)
         about = protocol.of_images({"reference": "gt-color"}, [image.shape[:2] for image in references])
     else:
         views, split, conventions = build.load_split(config, split)
@@ -75,33 +73,14 @@ def score_folder(
     order, how = _paired(found, names, place)
     paths = [paths[index] for index in order]
     shown = [path.relative_to(place).as_posix() for path in paths]
-    results = score_predictions(map(_colors, paths), references, names=shown, masks=masks) | {"paired_by": how, **about}
+    results = _scored(map(_colors, paths), references, masks, shown) | {"paired_by": how, **about}
     atomic_files.write_text(target, atomic_files.to_json(results))
     return results
 
 
-def score_predictions(
-    predictions: Iterable[ArrayLike],
-    references: Iterable[ArrayLike],
-    *,
-    names: Sequence[str],
-    masks: Sequence[ArrayLike | None] | None = None,
-) -> dict[str, Any]:
-    """Scores images that were rendered elsewhere with the metrics of `evaluate`.
-
-    Args:
-        predictions, references: [H, W, 3] colours in [0, 1], in the same order.
-        names: one for each pair.
-        masks: one for each pair, see `image_metrics`; None for none.
-
-    Returns:
-        The means, the number of views, and a row for each image.
-
-    Raises:
-        ValueError: if the sizes of a pair differ; names it.
-    """
+def _scored(predictions, references, masks, names):
+    """Returns the means of the metrics of pairs of images [H, W, 3], their number, and a row for each pair."""
     rows = []
-    masks = [None] * len(names) if masks is None else masks
     for name, image, truth, mask in zip(names, predictions, references, masks, strict=True):
         if image.shape != truth.shape:
             times = max(truth.shape[0] // image.shape[0], 1)

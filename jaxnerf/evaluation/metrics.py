@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxnerf.core.metrics import align_colors, decibels, mse, psnr, round_to_8_bits, ssim
+from jaxnerf.core.metrics import align_colors, decibels, mse, round_to_8_bits, ssim
 from jaxnerf.core.views import Views
 from jaxnerf.runtime import memory
 
@@ -97,13 +97,8 @@ def _check_memory(height, width, unmasked):
 
 @jax.jit
 def _whole(image, truth, mask):
-    rounded, target, image, truncated = _roundings(image, truth, mask)
-    return {
-        "psnr": psnr(rounded, target, mask=mask),
-        "ssim": ssim(rounded, target),
-        "psnr_float": psnr(image, truth, mask=mask),
-        "psnr_truncated": psnr(truncated, target, mask=mask),
-    }
+    errors = _mean_square_errors(image, truth, mask)
+    return {name: decibels(error) for name, error in errors.items()} | {"ssim": _similarity(image, truth, mask)}
 
 
 def _roundings(image, truth, mask):

@@ -70,18 +70,16 @@ class Previews:
         else:
             limit, more = "train.max_seconds", 2 * options.max_seconds
             why = f"train.max_seconds = {options.max_seconds:g} have passed at step {metric_log.of_all(step, options)}"
+        few = f"training saw at most {seen:.0%} of the pixels of its images, so it may show little yet"
+        smaller = "--config.data.factor, with a new --workdir"
         return [
             f"done          {why}: {row.get('rays', 0):,} rays in {row['seconds']:.1f} s of training",
-            *([f"note          {self._few(seen)}"] if seen < 1 else []),
+            *([f"note          {few}; train longer, or on smaller images ({smaller})"] if seen < 1 else []),
             *self._cameras(step, views),
             *self._scores(step, views),
             f"workdir       {self._workdir.absolute()}: {', '.join(self._contents())}",
             *self._commands(f"--config.{limit}={more:.10g}", is_early=seen < 1),
         ]
-
-    def _few(self, seen):
-        remedy = "train longer, or on smaller images (--config.data.factor, with a new --workdir)"
-        return f"training saw at most {seen:.0%} of the pixels of its images, so it may show little yet: {remedy}"
 
     def evaluated_run(self) -> TrainedRun:
         """Returns the run as evaluation restores it: the one of the previews, whose program is compiled and whose

@@ -125,7 +125,8 @@ def _read(folder, name):
 
 def _score(results, path, remedy):
     step, seconds, views = (results.get(name) for name in ("step", "training_seconds", "views"))
-    if type(step) is not int or step < 0 or not (seconds is None or aggregate.is_finite(seconds)):
+    timed = type(seconds) in (int, float) and 0 <= seconds < math.inf
+    if type(step) is not int or step < 0 or not (seconds is None or timed):
         raise ValueError(f"{path}: lacks step and training_seconds, expected the result of an evaluation; {remedy}")
     conventions = results.get("conventions")
     split = conventions.get("split") if isinstance(conventions, Mapping) else None

@@ -10,7 +10,7 @@ import numpy as np
 from flax import linen
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxnerf.core.encoding import encode_planes, frustum_variance
+from jaxnerf.core.encoding import encode_planes, frustum_variance, planes_of
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
 from jaxnerf.fields.base import Affine, Dense, Field, apply_network, infer_prefilter
 from jaxnerf.options import DTYPES, Box, Device, Facts, Options, at_least, between, infer, is_auto, option
@@ -185,8 +185,8 @@ class MLP(linen.Module):
         """
         shape = x.shape[:-1]
         num_freqs = self.num_freqs * self.encode
-        variance = planes(cone_variance(viewdirs, radius, length)) if self.prefilter else None
-        encoded = encode_planes(planes(x), num_freqs=num_freqs, variance=variance)
+        variance = planes_of(cone_variance(viewdirs, radius, length)) if self.prefilter else None
+        encoded = encode_planes(planes_of(x), num_freqs=num_freqs, variance=variance)
         if self.prefilter:
             encoded = jnp.concatenate([encoded, damping_of_octaves(variance.mean(axis=0), num_freqs)])
         encoded = encoded.astype(self.compute_dtype)
@@ -199,7 +199,7 @@ class MLP(linen.Module):
         density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
         if self.use_viewdirs:
             # The direction is encoded and multiplied once per ray, and broadcast over its samples.
-            directions = encode_planes(planes(viewdirs), num_freqs=self.num_view_freqs * self.encode)
+            directions = encode_planes(planes_of(viewdirs), num_freqs=self.num_view_freqs * self.encode)
             directions = directions.astype(self.compute_dtype).reshape(len(directions), *viewdirs.shape[:-1])
             bottleneck = Affine(self.width, name="bottleneck")(self.width)
             features = hidden[0].reshape(self.width, *shape)
@@ -219,9 +219,6 @@ def cone_variance(
     The side of the pixel at the sample is sqrt(3) times the radius. The Gaussian of a shorter sample would be flat, and
     another one for each direction of the ray, so that the network would have to learn a surface for all of them. As
     long as the pixel is wide, it is a ball with the variance of the pixel, the same for all directions.
-
-    Args:
-        viewdirs: see `frustum_variance`, as the others.
     """
     return frustum_variance(viewdirs, radius, jnp.maximum(length, _PIXEL_SIDE * radius))
 
@@ -237,8 +234,3 @@ def damping_of_octaves(variance: Float[ArrayLike, " N"], num_freqs: int) -> Floa
     """
     octaves = np.float32(2.0 ** np.arange(num_freqs))[:, None]
     return jnp.exp(-0.5 * octaves**2 * variance[None])
-
-
-def planes(vectors: Float[ArrayLike, "*batch 3"]) -> Float[Array, "3 N"]:
-    """Returns vectors [..., 3] as [3, N]."""
-    return jnp.moveaxis(vectors, -1, 0).reshape(3, -1)

@@ -87,11 +87,6 @@ class Model(NamedTuple):
     needs: tuple[str, ...] = ()
 
 
-def with_field_input(params: Mapping[str, Any], value: Any) -> dict[str, Any]:
-    """Returns the params of a model whose final field has been wrapped to take a pair: its params, and a value."""
-    return {**params, FINAL_NETWORK: (params[FINAL_NETWORK], value)}
-
-
 class SamplerContext(NamedTuple):
     """What a sampler makes a model from.
 

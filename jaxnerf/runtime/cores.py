@@ -1,5 +1,6 @@
 """CPU cores: how many a program may use, and calls that run on several at once."""
 
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -32,18 +33,24 @@ def limit_jax() -> None:
     os.environ.setdefault(JAX_THREADS, str(usable()))
 
 
-def map_on_cores(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+def num_at_once() -> int:
+    """Returns how many of JAX's programs run at once best: on a CPU one on each usable core, on other devices 1."""
+    return usable() if jax.default_backend() == "cpu" else 1
+
+
+def map_on_cores(function: Callable[[Any], Any], items: Iterable[Any], *, compiles: bool = False) -> Iterator[Any]:
     """Yields function(item) for each of the items, in order; on a CPU several at once, each in a thread of its own.
 
     A program of JAX keeps several cores busy in a part of its operations only, and programs that one thread starts run
-    one after the other. On other devices, and on one core, this is `map`.
+    one after the other. On other devices, and on one core, this is `map`. A first call that compiles what the others
+    run is made alone.
     """
-    count = usable() if jax.default_backend() == "cpu" else 1
-    if count == 1:
-        yield from map(function, items)
-        return
-    with ThreadPoolExecutor(count) as pool:
-        yield from pool.map(lambda item: jax.block_until_ready(function(item)), items)
+    count, items = num_at_once(), iter(items)
+    if compiles or count == 1:
+        yield from map(function, items if count == 1 else itertools.islice(items, 1))
+    if count > 1:
+        with ThreadPoolExecutor(count) as pool:
+            yield from pool.map(lambda item: jax.block_until_ready(function(item)), items)
 
 
 def _allowed(system="/"):

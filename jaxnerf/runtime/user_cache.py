@@ -61,20 +61,15 @@ def load_or_make(
     return arrays
 
 
-def default_folder() -> Path:
-    """Returns the folder `jaxnerf` in $XDG_CACHE_HOME or ~/.cache; raises RuntimeError if there is no home."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxnerf"
-
-
 def private_folder(*names: str) -> Path:
-    """Returns `default_folder()` or a folder below it, made if missing; only the user can read and write it.
+    """Returns `jaxnerf` in $XDG_CACHE_HOME or ~/.cache, or a folder below, made if missing and private to the user.
 
     Raises:
         OSError: if it cannot be made, belongs to another user, or can be written by others, who may have put
             something there; names the folder.
         RuntimeError: if there is no home.
     """
-    folder = default_folder()
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxnerf"
     for name in ("", *names):
         folder = folder / name
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

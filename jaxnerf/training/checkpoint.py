@@ -66,7 +66,8 @@ class Checkpoints:
             ValueError: if the checkpoint does not fit, or is not what was saved; names it.
         """
         with self._reading(step) as saved:
-            state = self._open().load(step, _abstract(like))
+            shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
+            state = self._open().load(step, shapes)
             _check(step, state.step, state, saved[_WHOLE])
             return state
 
@@ -171,10 +172,6 @@ class Checkpoints:
         self._writer.reload()  # otherwise it still lists the renamed one
         why = str(error).removesuffix("; remove it to continue from the previous checkpoint")
         return f"{why}; kept as {path.name}, continuing from the previous checkpoint"
-
-
-def _abstract(like):
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like)
 
 
 def _rendered(state):

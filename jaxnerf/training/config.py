@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeAlias
 
-from ml_collections import ConfigDict, FieldReference
+from ml_collections import ConfigDict
 
 from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.scene import SceneOptions
@@ -29,7 +29,6 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part, Registry
 from jaxnerf.runtime import memory
 from jaxnerf.runtime.config_fields import typed
 from jaxnerf.training.camera_parameters import CameraOptions
-from jaxnerf.training.earlier_options import RENAMED, in_todays_names, refuse, today
 from jaxnerf.training.options import EvalOptions, TrainOptions
 
 _MAX_SEED = 2**63 - 1  # what jax.random.key takes
@@ -55,11 +54,15 @@ class RunConfig(Options):
     fingerprint: str = ""
     data: DataOptions = dataclasses.field(default_factory=DataOptions)
     scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
-    losses: Mapping[str, Schedule] = dataclasses.field(default_factory=lambda: default_weights())
+    losses: Mapping[str, Schedule] = dataclasses.field(
+        default_factory=lambda: {name: LOSSES.get(name).weight for name in LOSSES.names()}
+    )
     cameras: CameraOptions = dataclasses.field(default_factory=CameraOptions)
     train: TrainOptions = dataclasses.field(default_factory=TrainOptions)
     eval: EvalOptions = dataclasses.field(default_factory=EvalOptions)
-    parts: Mapping[str, Any] = dataclasses.field(default_factory=lambda: default_parts())
+    parts: Mapping[str, Any] = dataclasses.field(
+        default_factory=lambda: {name: part.options() for name, part in part_sections().items() if part.options}
+    )
 
     def __getattr__(self, name: str) -> Any:
         parts = self.__dict__.get("parts", {})
@@ -109,11 +112,6 @@ class RunConfig(Options):
 Config: TypeAlias = RunConfig | ConfigDict | Mapping[str, Any]
 
 
-def default_weights() -> dict[str, Any]:
-    """Returns the weights of all registered losses where a config sets none."""
-    return {name: LOSSES.get(name).weight for name in LOSSES.names()}
-
-
 def part_sections() -> dict[str, Part]:
     """Returns the registered fields and samplers, and the fields of a sampler's further networks, by their section.
 
@@ -134,11 +132,6 @@ def part_sections() -> dict[str, Part]:
     return found
 
 
-def default_parts() -> dict[str, Options]:
-    """Returns the default options of all registered fields and samplers, by the name of their section."""
-    return {name: part.options() for name, part in part_sections().items() if part.options}
-
-
 def read_config(config: Config) -> RunConfig:
     """Reads a config of unknown origin, such as that of a config file or of a config.json, and checks it.
 
@@ -152,8 +145,7 @@ def read_config(config: Config) -> RunConfig:
         return config
     if not isinstance(config, ConfigDict | Mapping):
         raise ValueError(f"config is {short_repr(config)}, expected one such as jaxnerf.configs.default.get_config()")
-    content, left = in_todays_names(config.to_dict() if isinstance(config, ConfigDict) else config)
-    refuse(left, "--config.")
+    content = config.to_dict() if isinstance(config, ConfigDict) else dict(config)
     record = content.pop("fingerprint", "")
     kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
     top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "config.")
@@ -185,15 +177,6 @@ def to_config_dict(config: RunConfig) -> ConfigDict:
     for name, declaration, kind, value in declared(config):
         section, dot, field = name.rpartition(".")
         (content[section] if dot else content)[field] = typed(value, kind, auto=declaration.auto)
-    for old, new in RENAMED.items():
-        (section, name), (new_section, _, new_name) = old.split("."), new.name.rpartition(".")
-        if not new_section:  # a record, not an option
-            continue
-        # One reference under both names: whichever is set, the other follows.
-        value = content[new_section][new_name]
-        if not isinstance(value, FieldReference):
-            value = content[new_section][new_name] = FieldReference(value)
-        content[section][name] = value
     return ConfigDict(content)
 
 
@@ -217,7 +200,7 @@ def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
     """Returns a config with other values, {"section.option": value}, checked as `read_config` does."""
     content = config.to_dict()
     for name, value in values.items():
-        section, dot, field = today(name).partition(".")
+        section, dot, field = name.partition(".")
         if dot:
             content[section] = {**content.get(section, {}), field: value}
         else:

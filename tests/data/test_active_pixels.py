@@ -11,6 +11,7 @@ from jaxnerf.data import active_pixels, synthetic
 from jaxnerf.data.active_pixels import active_region, find_active_pixels, valid_cells
 from jaxnerf.fields import still_life
 from jaxnerf.models.grid_schedule import make_grid_schedule
+from jaxnerf.runtime import cores
 
 BOX = (-1.5, -1.5, -1.0), (1.5, 1.5, 1.3)  # contains the embedded scene
 
@@ -162,6 +163,17 @@ def test_results_that_change_have_a_new_version(views):
         found.append((valid.sum(), active.size))
     expected = np.array(FOUND[active_pixels._VERSION])
     assert found == pytest.approx(expected, rel=0.003), "increase active_pixels._VERSION and add what it finds to FOUND"
+
+
+def test_any_number_of_cores_finds_the_same_cells_and_pixels(views, monkeypatch):
+    found = []
+    for count in (1, 2, 3):
+        monkeypatch.setattr(cores, "usable", lambda count=count: count)
+        schedule = a_schedule(resolution=32)
+        valid = valid_cells(views, schedule, use_alpha=True)
+        found.append((valid, vars(find_active_pixels(views, schedule, valid, chunk=2**10))))
+    for other in found[1:]:
+        jax.tree.map(np.testing.assert_array_equal, found[0], other)
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.5, 1.0])

@@ -100,17 +100,6 @@ def test_a_turntable_needs_only_the_direction_of_up(up):
     np.testing.assert_allclose(above, 3 * math.sin(0.4), rtol=1e-5)
 
 
-def test_an_ellipse_has_its_half_axes():
-    middle, axes = np.array([0.0, 1.0, 2.0]), np.array([[3.0, 0, 0], [0, 0.5, 0]])
-    poses = compiled(poses_module.ellipse, "num_frames")(16, middle=middle, axes=axes, target=np.zeros(3), up=UP)
-    assert_rigid(poses)
-    assert_looks_at(poses, np.zeros(3))
-    x, y, z = (poses[:, :, 3] - middle).T
-    np.testing.assert_allclose((x / 3) ** 2 + (y / 0.5) ** 2, 1, atol=1e-6)
-    np.testing.assert_allclose(z, 0, atol=1e-6)
-    np.testing.assert_allclose(poses[[0, 4], :, 3], middle + axes, atol=1e-6)
-
-
 def test_a_spiral_is_the_llff_codes():
     """Against render_path_spiral, written out again, from a pose that is no identity."""
     middle, radii = pose(turn([1, 2, 3], 40), [1.0, 2.0, 3.0]), np.array([0.5, 0.3, 0.1])

@@ -119,13 +119,7 @@ def _parts(along, weights, kept, number, count, uniform_fraction):
 
     A part of the probability is in proportion to the candidate's weight, only where the ray gets fewer samples than
     candidates, and the rest is even, so that the sum is about 1. Sums of parts are exact in float32 whatever the order;
-    each candidate has at least one.
-
-    Args:
-        along: sums along rays.
-        weights, kept: of the candidates.
-        number, count: [B] samples and candidates of each ray.
-        uniform_fraction: see importance_samples.
+    each candidate has at least one. Rays have number [B] samples and count [B] candidates.
     """
     weights = jnp.where(along.of_rows(number < count)[:, None], (1 - uniform_fraction) * weights, 0)
     even = (1 - along.total(weights.sum(axis=-1))) / jnp.maximum(count, 1)
@@ -245,7 +239,7 @@ class _WholeRays:
 
 
 class _RaysInRuns:
-    """Does what _WholeRays does, for values [U, W] of SampleRuns."""
+    """Does what _WholeRays does, for values [U, W] of SampleRuns; the sums of a ray without runs are 0."""
 
     def __init__(self, runs: SampleRuns):
         self._runs, self.most_runs = runs, runs.max_count
@@ -253,32 +247,25 @@ class _RaysInRuns:
         self._last = jnp.maximum(runs.first + runs.count - 1, 0)
 
     def of_rows(self, tree: Any) -> Any:
-        """Returns what belongs to the ray of each run: arrays [B, ...] -> [U, ...]."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[self._runs.ray_index], tree)
 
     def total(self, values: Array) -> Array:
-        """Returns the sum [B] of one value [U] of each run."""
         return self._of_last(self._since_start(values))
 
     def any(self, values: Bool[Array, " U"]) -> Bool[Array, " B"]:
-        """Returns whether any run of a ray is true."""
         return self.total(values.astype(jnp.int32)) > 0
 
     def through(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
-        """Returns the running sum along each ray."""
         inside = running_sum(values)
         return inside + self._in_front(inside)
 
     def before(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
-        """Returns the sum of what is in front of each value."""
         return exclusive_sum(values) + self._in_front(running_sum(values))
 
     def last(self, sums: Float[Array, "U W"]) -> Float[Array, " B"]:
-        """Returns the last of running sums; 0 for a ray without runs."""
         return self._of_last(sums[:, -1])
 
     def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
-        """Returns the flat index of the first value of each of some rays, and how many values it has."""
         return self._runs.first[ray] * width, self._runs.count[ray] * width
 
     def _of_last(self, values):

@@ -364,20 +364,11 @@ class _Slots(NamedTuple):
 def _march_until_terminated(function, scene, rays, samples, words, *, max_samples, early_stop_eps, median_depth=False):
     """Marches each ray until its transmittance is at most early_stop_eps, or to its end.
 
-    The remaining light of a terminated ray is assumed to look like the rest of the ray, so such a ray is opaque.
-
-    Args:
-        function: name of the public function, for errors.
-        scene: see render_samples; it is evaluated at [L, N, 3] positions with [L, 1, 3] directions.
-        rays: Rays [B].
-        samples: Samples [B, S].
-        words: [B, W] uint32, see occupied_words.
-        max_samples: samples evaluated at once, L N at most.
-        early_stop_eps: > 0.
-        median_depth: whether it is computed.
+    The remaining light of a terminated ray is assumed to look like the rest of the ray, so such a ray is opaque. The
+    scene is evaluated at [L, N, 3] positions with [L, 1, 3] directions, L N being at most max_samples.
 
     Returns:
-        _Sums [B].
+        _Sums [B] of Rays [B] and Samples [B, S], whose `occupied_words` are [B, W].
     """
     ray_count = rays.near.size
     samples_per_slot = (

@@ -1,15 +1,16 @@
-"""Where the pixels of a view may see matter, according to the dataset's sparse points.
+"""Where the pixels of a view may see matter, according to the dataset's sparse points."""
 
-SciPy is imported where it is used: it takes 50 MB, and a start that finds its results in the cache does not need it.
-"""
-
+import functools
+import os
 import pathlib
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.core.views import Views
 from jaxnerf.data.ray_batches import DEPTH_STRIDE
+from jaxnerf.runtime import cores
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.user_cache import load_or_make
 
@@ -75,30 +76,50 @@ def interpolated_depths(views: Views) -> Float[np.ndarray, "V H W 2"]:
 
 
 def _interpolated(views):
-    from scipy.interpolate import LinearNDInterpolator
-
     height, width = -(-np.asarray(views.size).max(axis=0) // DEPTH_STRIDE)
     result = np.zeros((len(views.size), height, width, 2), np.float32)
     y, x = (places.reshape(-1) for places in np.mgrid[:height, :width])
     pixels = (np.stack([x, y], axis=-1) + 0.5) * DEPTH_STRIDE
-    for view in range(len(views.size)):
+
+    def fill(view):
         found = _triangulated(views, view)
         if found is None:
-            continue
+            return
         triangles, inverse = found
-        corners = inverse[triangles.simplices[triangles.find_simplex(pixels)]]
-        values = LinearNDInterpolator(triangles, inverse)(pixels)
-        confidence = np.where(np.isfinite(values), (corners.min(axis=1) / corners.max(axis=1)) ** 2, 0)
-        result[view, y, x] = np.stack([np.nan_to_num(values), confidence], axis=-1)
+        simplex = triangles.find_simplex(pixels)
+        corners, affine = inverse[triangles.simplices[simplex]], triangles.transform[simplex]
+        weights = (affine[:, :2] * (pixels - affine[:, 2])[:, None]).sum(axis=-1)
+        values = (weights * corners[:, :2]).sum(axis=-1) + (1 - weights[:, 0] - weights[:, 1]) * corners[:, 2]
+        confidence = (corners.min(axis=1) / corners.max(axis=1)) ** 2
+        result[view, y, x] = np.where((simplex >= 0)[:, None], np.stack([values, confidence], axis=-1), 0)
+
+    list(cores.map_on_cores(fill, range(len(views.size))))
     return result
+
+
+@functools.cache
+def scipy_spatial() -> Any:
+    """Imports scipy.spatial where it is used: it takes 50 MB, and a start that finds its results cached needs none.
+
+    SciPy's OpenBLAS gets a single thread, unless it has been loaded before or $OPENBLAS_NUM_THREADS is set. A Delaunay
+    triangulation inverts thousands of 2 x 2 matrices, and for each, OpenBLAS waits for all its threads: on two cores
+    that took 35 ms an image, and seconds beside another program, in place of 5 ms.
+    """
+    name = "OPENBLAS_NUM_THREADS"
+    is_set = name in os.environ
+    os.environ.setdefault(name, "1")
+    from scipy import spatial
+
+    if not is_set:
+        del os.environ[name]
+    return spatial
 
 
 def _triangulated(views, view):
     """Returns the triangles between a view's observations, without outliers, and the inverse depths; None: too few."""
-    from scipy.spatial import Delaunay, QhullError, cKDTree
-
     if views.sparse is None:
         return None
+    spatial = scipy_spatial()
     first, end = np.searchsorted(views.sparse.view, [view, view + 1])
     at = np.asarray(views.sparse.pixel[first:end], np.float64)
     to_world = np.asarray(views.cameras.to_world[view], np.float64)
@@ -107,10 +128,10 @@ def _triangulated(views, view):
     at, inverse = at[depth > 0], 1 / depth[depth > 0]
     if len(inverse) < _FEW:
         return None
-    others = cKDTree(at).query(at, _NEIGHBOURS + 1)[1]
+    others = spatial.cKDTree(at).query(at, _NEIGHBOURS + 1)[1]
     typical = np.median(inverse[others], axis=1)
     kept = np.abs(inverse - typical) < _OUTLIER * typical
     try:
-        return Delaunay(at[kept]), inverse[kept]
-    except (QhullError, ValueError):  # all on a line
+        return spatial.Delaunay(at[kept]), inverse[kept]
+    except (spatial.QhullError, ValueError):  # all on a line
         return None

@@ -147,7 +147,7 @@ def _sense(poses, turned, up):
 
 
 def look_one_way(poses: Float[np.ndarray, "V 3 4"], *, cosine: float = 0.85) -> bool:
-    """Returns whether all cameras, two or more, look in one direction.
+    """Returns whether all cameras, two or more, look in one direction, so that NDC contain what they see.
 
     Args:
         poses: of the cameras.

@@ -2,8 +2,8 @@
 
 import dataclasses
 import functools
+import itertools
 import math
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +15,15 @@ from jaxnerf.core.cameras import project, undistort
 from jaxnerf.core.occupancy.grid import cells_along, create_grid, widen
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.sampling import samples_from_edges, uniform_edges
-from jaxnerf.core.types import Rays
 from jaxnerf.core.views import Views
-from jaxnerf.data.geometry.free_space import surface_range
+from jaxnerf.data.geometry.free_space import scipy_spatial, surface_range
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.models.grid_schedule import GridSchedule
-from jaxnerf.runtime import stages
+from jaxnerf.runtime import cores, stages
 
-_CHUNK = 2**13  # rays
+_CHUNK = 2**10  # rays
 _CUBE = 8  # cells along each side of a cube, of which all or none are looked at for a view
-_CHUNK_CUBES = 256  # that are looked at at once
+_CHUNK_CUBES = 32  # that are looked at at once, so that their arrays fit the processor's cache
 _SLOPES = 128  # directions along each side of an image that are looked up
 _STEEPEST = 10.0  # of these: 84 degrees from the axis
 _FREE_SAMPLES = 16  # between a camera and a surface
@@ -52,16 +51,18 @@ def seen_cells(
         ValueError: if the lens of a view shows no pixel; names the view.
     """
     cubes = tuple(-(-size // _CUBE) for size in schedule.shape)
-    count, boxes = _view_counter(views, schedule, cubes), _boxes(schedule, cubes)
-    number = len(boxes[0])
-    shape = (number + 1, _CUBE, _CUBE, _CUBE)  # the last cube takes what is only padding
-    counts = np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, bool)
+    number, num_slabs = math.prod(cubes), cores.num_at_once()
+    length = -(-number // num_slabs)
+    count = _view_counter(views, schedule, cubes, length)
+    # Each slab has cubes from everywhere, so that all take as long; some cubes may repeat.
+    slabs = np.minimum(np.arange(length * num_slabs), number - 1).reshape(length, num_slabs).T
+    cells = np.zeros((2, number, _CUBE, _CUBE, _CUBE), bool)
     with stages.stage("finding the cells that the cameras see, by images") as stage:
-        for view in range(len(views.offset)):
-            stage.update(view, len(views.offset))
-            counts = count(counts, view, boxes)
-    num_seen, num_free, clear = (_joined(np.asarray(each)[:-1], cubes, schedule.shape) for each in counts)
-    return num_seen >= min_views, clear | ((num_free > 0) & (num_free >= np.minimum(num_seen, 2)))
+        counts = cores.map_on_cores(functools.partial(count, stage), slabs)
+        for slab, (num_seen, num_free, clear) in zip(slabs, counts, strict=True):
+            free = clear | ((num_free > 0) & (num_free >= np.minimum(num_seen, 2)))
+            cells[:, slab] = num_seen >= min_views, free
+    return tuple(_joined(each, cubes, schedule.shape) for each in cells)
 
 
 def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
@@ -74,10 +75,8 @@ def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
     known = np.zeros(len(views.offset)) if views.free_depth is None else np.asarray(views.free_depth)
     nearest = np.where(known > 0, known, np.inf)
     if views.sparse is not None and len(views.sparse.positions) >= _FEW_POINTS:
-        from scipy.spatial import cKDTree  # see free_space.py
-
         centers = np.asarray(views.cameras.to_world)[:, :, 3]
-        distances, _ = cKDTree(views.sparse.positions).query(centers, [_FEW_POINTS])
+        distances, _ = scipy_spatial().cKDTree(views.sparse.positions).query(centers, [_FEW_POINTS])
         nearest = np.minimum(nearest, distances[:, 0])
     return np.float32(np.where(np.isinf(nearest), 0, _CLEARANCE * nearest))
 
@@ -108,49 +107,70 @@ def likely_empty_cells(
         samples = march_rays(None, grid, rays, step_size=min(schedule.cell), cell=schedule.cell)
         return cells_along(grid, rays, samples_from_edges(None, edges)), cells_along(grid, rays, samples)
 
-    surface, num_in_front = np.zeros(grid.valid.size + 1, bool), np.zeros(grid.valid.size + 1, np.int32)
+    cameras = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None, sparse=None)
+    surface = np.zeros(grid.valid.size + 1, bool)
+    in_front = np.zeros((min_views, surface.size), bool)  # of a surface, by at least 1, 2, ... views
+
+    def cells_of(view):
+        pixels = _some_pixels(views, view, max(schedule.shape) // 2) + pixel_offset
+        near, far = surface_range(views, view, pixels)
+        of_view = np.zeros_like(surface)
+        for start in range(0, len(pixels), _CHUNK):
+            index = np.minimum(np.arange(start, start + _CHUNK), len(pixels) - 1)  # a single compiled shape
+            before, between = cells_between(_view_rays(cameras, view, pixels[index]), near[index], far[index])
+            of_view[np.asarray(before)] = surface[np.asarray(between)] = True
+        return of_view
+
     with stages.stage("finding the cells in front of surfaces, by images") as stage:
-        for view in range(len(views.offset)):
-            stage.update(view, len(views.offset))
-            in_front = np.zeros_like(surface)
-            for pixels, rays in _rays_of(views, view, max(schedule.shape) // 2, pixel_offset):
-                before, between = cells_between(rays, *surface_range(views, view, pixels))
-                in_front[np.asarray(before)] = surface[np.asarray(between)] = True
-            num_in_front += in_front
-    surface, in_front = (cells[:-1].reshape(schedule.shape) for cells in (surface, num_in_front >= min_views))
+        for done, of_view in enumerate(cores.map_on_cores(cells_of, range(len(views.offset)), compiles=True), 1):
+            stage.update(done, len(views.offset))
+            for fewer, more in reversed(list(itertools.pairwise(in_front))):
+                more |= fewer & of_view
+            in_front[0] |= of_view
+    surface, in_front = (cells[:-1].reshape(schedule.shape) for cells in (surface, in_front[-1]))
     return ~np.asarray(widen(surface)) | in_front
 
 
-def _view_counter(views, schedule, cubes):
-    """Returns the function (counts, view, boxes) -> counts that adds a view.
+def _view_counter(views, schedule, cubes, size):
+    """Returns the function (stage, slab) -> counts in a slab of so many cubes, compiled.
 
-    The counts are, for the cells of each cube, how many views see them, how many of these see them free, and whether
-    they touch a clear sphere. Only cubes of cells are looked at whose boxes, see `_boxes`, a view may see.
+    The counts are, for the cells of each cube of a slab, how many views see them, how many of these see them free, and
+    whether they touch a clear sphere. Only cubes of cells are looked at whose boxes, see `_boxes`, a view may see.
     """
     free_depth = np.zeros(len(views.offset), np.float32) if views.free_depth is None else views.free_depth
     known = views.cameras.to_world, clear_radii(views), views.near, views.far, free_depth
     stack = *(np.asarray(each, np.float32) for each in known), *map(np.asarray, _shown_slopes(views))
-    number = math.prod(cubes)
+    boxes, padding = _boxes(schedule, cubes), (-size) % _CHUNK_CUBES + size
 
     @functools.partial(jax.jit, donate_argnums=0)
-    def count(counts, seen_by, ids, num_chunks):
+    def count(counts, seen_by, slab, indices, num_chunks):
         def add(chunk, counts):
-            chosen = jax.lax.dynamic_slice_in_dim(ids, chunk * _CHUNK_CUBES, _CHUNK_CUBES)
-            seen, behind, clear = map(_any_corner, _sees(seen_by, _corners(schedule, cubes, chosen)))
+            chosen = jax.lax.dynamic_slice_in_dim(indices, chunk * _CHUNK_CUBES, _CHUNK_CUBES)
+            seen, behind, clear = map(_any_corner, _sees(seen_by, _corners(schedule, cubes, slab[chosen])))
             before = [each[chosen] for each in counts]
             after = before[0] + seen, before[1] + (seen & ~behind), before[2] | clear
             return tuple(each.at[chosen].set(new) for each, new in zip(counts, after, strict=True))
 
         return jax.lax.fori_loop(0, num_chunks, add, counts)
 
-    def count_view(counts, view, boxes):
-        seen_by = tuple(each[view] for each in stack)
-        ids = np.flatnonzero(_may_see(*seen_by[:4], *seen_by[5:7], *boxes))
-        num_chunks = -(-len(ids) // _CHUNK_CUBES)
-        padding = np.full((-number) % _CHUNK_CUBES + number - len(ids), number)
-        return count(counts, seen_by, np.int32(np.append(ids, padding)), num_chunks)
+    def no_counts():  # the last cube takes what is only padding
+        return tuple(np.zeros((size + 1, _CUBE, _CUBE, _CUBE), kind) for kind in (np.int32, np.int32, bool))
 
-    return count_view
+    def count_views(stage, slab):
+        counts, ids, of_slab = no_counts(), np.int32(np.append(slab, slab[-1])), [each[slab] for each in boxes]
+        for view in range(len(views.offset)):
+            stage.update(view, len(views.offset))
+            seen_by = tuple(each[view] for each in stack)
+            indices = np.flatnonzero(_may_see(*seen_by[:4], *seen_by[5:7], *of_slab))
+            num_chunks = np.int32(-(-len(indices) // _CHUNK_CUBES))
+            indices = np.append(indices, np.full(padding - len(indices), size))
+            counts = compiled(counts, seen_by, ids, np.int32(indices), num_chunks)
+        return [np.asarray(each)[:-1] for each in counts]
+
+    # Here, as the calls that several threads make at once would compile it as often.
+    integers = (jax.ShapeDtypeStruct(shape, np.int32) for shape in ((size + 1,), (padding,), ()))
+    compiled = count.lower(no_counts(), tuple(each[0] for each in stack), *integers).compile()
+    return count_views
 
 
 def _corners(schedule, cubes, ids):
@@ -263,9 +283,8 @@ def _any_corner(flags):
     return flags
 
 
-def _rays_of(views: Views, view: int, number: int, pixel_offset: float) -> Iterator[tuple[np.ndarray, Rays]]:
-    """Yields pixels and Rays [_CHUNK], about number x number unmasked pixels of a view; the last are repeated."""
-    cameras = dataclasses.replace(views, pixels=np.zeros((1, 1), np.uint8), mask=None, sparse=None)
+def _some_pixels(views, view, number):
+    """Returns the places [N, 2] of about number x number unmasked pixels of a view."""
     height, width = np.asarray(views.size)[view]
     side = max(int(np.sqrt(height * width) / number), 1)
     y, x = (places.reshape(-1) for places in np.mgrid[side // 2 : height : side, side // 2 : width : side])
@@ -273,10 +292,7 @@ def _rays_of(views: Views, view: int, number: int, pixel_offset: float) -> Itera
         first = views.offset[view]
         unmasked = np.asarray(views.mask[first : first + height * width]).reshape(height, width)[y, x]
         y, x = y[unmasked], x[unmasked]
-    for start in range(0, y.size, _CHUNK):
-        index = np.minimum(np.arange(start, start + _CHUNK), y.size - 1)  # a single compiled shape
-        pixels = (np.stack([x[index], y[index]], axis=-1) + pixel_offset).astype(np.float32)
-        yield pixels, _view_rays(cameras, view, pixels)
+    return np.stack([x, y], axis=-1).astype(np.float32)
 
 
 _view_rays = jax.jit(view_rays)

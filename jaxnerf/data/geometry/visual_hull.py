@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from jaxnerf.core.cameras import project, undistort
 from jaxnerf.core.types import Camera, Vector
 from jaxnerf.core.views import Views
-from jaxnerf.runtime import stages
+from jaxnerf.runtime import cores, stages
 
 _MARGIN = 1  # px around a box: matter that covers only a pixel's corner may have left no alpha
 _MAX_TANGENT = 3.0  # of the angle from the axis up to which a distorted image is used
@@ -50,14 +50,18 @@ def visual_hull(views: Views, lower: Vector, upper: Vector, *, resolution: int) 
     roots = np.indices((levels[0],) * 3, np.float32).reshape(3, -1)
     # Consecutive views are similar; a random order empties the coarse cells sooner.
     order = np.random.default_rng(0).permutation(len(views.offset))[:_MAX_VIEWS]
+
+    def carve(index):
+        view = _silhouette(views, index)
+        projections = [_projection(view, lower, (upper - lower) / level) for level in levels]
+        alive = np.flatnonzero(tree[0].copy())  # which counts before it fills
+        for chosen in np.array_split(alive, alive.size // _CHUNK + 1):
+            _carve(tree, view.table, projections, chosen, roots[:, chosen])
+
+    # Several views carve the tree at once: whether a view finds a cell empty does not depend on the others.
     with stages.stage("finding the visual hull, by images") as stage:
-        for done, index in enumerate(order):
+        for done, _ in enumerate(cores.map_on_cores(carve, order, compiles=True), 1):
             stage.update(done, len(order))
-            view = _silhouette(views, index)
-            projections = [_projection(view, lower, (upper - lower) / level) for level in levels]
-            alive = np.flatnonzero(tree[0])
-            for chosen in np.array_split(alive, alive.size // _CHUNK + 1):
-                _carve(tree, view.table, projections, chosen, roots[:, chosen])
     for above, below in zip(tree[:-1], tree[1:], strict=True):
         below &= np.repeat(above, 8)
     # The axes are x y z of the roots, then x y z of each halving; all of one direction become adjacent.
@@ -140,7 +144,8 @@ def _footprints(projection, cells):
     spread. The box is the whole image and its rim for cells that reach the camera.
     """
     matrix, start, half, center = projection
-    middle = matrix @ cells + start
+    # Not a matrix product: for so small a matrix, BLAS only waits for its threads.
+    middle = sum(matrix[:, axis, None] * cells[axis] for axis in range(3)) + start
     place = middle[:2] / np.maximum(middle[2], 1e-9 * half[2])
     spread = (half[:2] + np.abs(place) * half[2]) / np.maximum(middle[2] - half[2], 1e-9 * half[2])
     return place + center - spread, place + center + spread

@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxnerf.data.geometry.poses import gaze_center, look_one_way, up_of
+from jaxnerf.data.geometry.poses import gaze_center, up_of
 from jaxnerf.data.readers.base import Capture
 
 
@@ -62,16 +62,6 @@ def _parts(to_file):
 def poses_of(capture: Capture) -> Float[np.ndarray, "V 3 4"]:
     """Returns the poses of a dataset's frames."""
     return np.stack([frame.camera.to_world for frame in capture.frames])
-
-
-def looks_forward(capture: Capture, *, cosine: float = 0.85) -> bool:
-    """Returns whether all cameras of a dataset look in one direction, so that NDC contain what they see.
-
-    Args:
-        capture: any.
-        cosine: of the largest angle between an axis and the mean axis. In LLFF's datasets it is 20 degrees.
-    """
-    return look_one_way(poses_of(capture), cosine=cosine)
 
 
 def recenter(capture: Capture, *, bound_factor: float = 0.75) -> tuple[Capture, Float[np.ndarray, "4 4"]]:

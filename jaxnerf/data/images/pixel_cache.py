@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt
 
 from jaxnerf.data.images import image_files
-from jaxnerf.runtime import stages
+from jaxnerf.runtime import cores, stages
 from jaxnerf.runtime.atomic_files import open_regular, partial_file
 from jaxnerf.runtime.fingerprint import file_sha256, fingerprint
 from jaxnerf.runtime.user_cache import private_folder
@@ -90,7 +90,7 @@ def fill_pixels(
 
 def num_workers() -> int:
     """Returns how many files are read at a time; Pillow and zlib release Python's lock."""
-    return min(max(os.cpu_count() or 1, 2), 8)
+    return min(max(cores.usable(), 2), 8)
 
 
 def _in_memory(fill, shape, dtype):

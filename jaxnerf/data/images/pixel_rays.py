@@ -11,6 +11,7 @@ from jaxtyping import Bool
 from jaxnerf.core.cameras import rays_from_pixels
 from jaxnerf.core.types import Camera
 from jaxnerf.core.views import Views
+from jaxnerf.runtime import cores
 
 _CHUNK = 2**12  # pixels that are tested at a time
 _TILES = 32  # along each side of an image
@@ -47,20 +48,18 @@ def sees_sideways(views: Views) -> bool:
 
 def _of_lenses(cameras, function, pinhole):
     """Returns function(lens, height, width) for each camera, called once for equal ones; pinhole without a lens."""
-    found, values = {}, []
+    lenses, keys = {}, []
     for camera in cameras:
-        if camera.distortion is None:
-            values.append(pinhole)
-            continue
         arrays = {name: np.float32(getattr(camera, name)) for name in ("focal", "center", "distortion")}
         size = camera.height, camera.width
-        key = camera.lens, *size, *(each.tobytes() for each in arrays.values())
-        if key not in found:
+        keys.append((camera.lens, *size, *(each.tobytes() for each in arrays.values())))
+        if camera.distortion is not None:
             # In float32, as in training, and without size and pose, so that few are compiled.
             lens = Camera(to_world=np.eye(3, 4, dtype=np.float32), **arrays, lens=camera.lens)
-            found[key] = function(lens, *size)
-        values.append(found[key])
-    return values
+            lenses[keys[-1]] = lens, *size
+    values = cores.map_on_cores(lambda arguments: function(*arguments), lenses.values(), compiles=True)
+    found = dict(zip(lenses, values, strict=True))
+    return [found.get(key, pinhole) for key in keys]
 
 
 def _with_rays(lens, height, width):

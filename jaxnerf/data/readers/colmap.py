@@ -45,20 +45,8 @@ _LENSES = {  # COLMAP's camera model: its number of focal lengths, and the lens 
 }
 
 
-def find_model(folder: str | os.PathLike) -> Path | None:
-    """Returns the folder of the COLMAP model that `read_capture` reads, or None if there is none.
-
-    Of several models sparse/0, sparse/1, ... it is the one with most images.
-
-    Raises:
-        ValueError: if there are several and the images of one cannot be counted.
-    """
-    models = models_in(Path(folder))
-    return models[0] if len(models) == 1 else max(models, key=count_images, default=None)
-
-
 def read_capture(folder: str | os.PathLike) -> Capture:
-    """Returns the Capture of the COLMAP model in a folder, in the model's world.
+    """Returns the Capture of the COLMAP model in a folder, of several the one with most images, in the model's world.
 
     Registered images whose file is missing are skipped, and so are observations of points that points3D lacks:
     users delete points, and the remaining ones stay correct. Both are noted. If there are no points, or no
@@ -74,17 +62,18 @@ def read_capture(folder: str | os.PathLike) -> Capture:
             the images are missing, or a camera model is not supported.
     """
     folder = Path(folder)
-    model = find_model(folder)
-    if model is None:
+    models = models_in(folder)
+    if not models:
         check_complete(folder)
         raise ValueError(
             f"{folder}: has no cameras and images, .bin or .txt, in sparse/0, sparse, colmap/sparse/0, dense/0/sparse "
             "or itself, expected a COLMAP model; correct the folder"
         )
+    model = models[0] if len(models) == 1 else max(models, key=count_images)
     cameras, images, ids, points = read_model(model)
     present, notes = _find_images(images, _image_folder(folder, model), model_file(model, "images"))
     frames = [_frame(path, name, image, cameras[image.camera], ids) for path, name, image in present]
-    notes += _check_seen(frames, present, model) + _other_models(folder, model)
+    notes += _check_seen(frames, present, model) + _other_models(models, model)
     if not len(ids):
         points, frames = None, [frame._replace(seen=None, seen_at=None) for frame in frames]
     frames = tuple(sorted(frames, key=lambda frame: frame.name))
@@ -110,8 +99,7 @@ def _image_folder(folder, model):
     return folder / "images" if (folder / "images").is_dir() else folder
 
 
-def _other_models(folder, model):
-    models = models_in(folder)
+def _other_models(models, model):
     base = os.path.commonpath(models)
     others = [os.path.relpath(path, base) for path in models if path != model]
     note = f"{model}: used, as it has most images; other models skipped: {', '.join(others)}"

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden
-from jaxnerf.data.readers.validation import check_inside, short_repr
+from jaxnerf.data.readers.validation import check_inside
+from jaxnerf.options import short_repr
 
 _TRIED = 5  # paths that are compared with the files
 

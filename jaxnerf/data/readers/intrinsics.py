@@ -9,7 +9,8 @@ import numpy as np
 from jaxnerf.core.types import Camera
 from jaxnerf.data.images.image_files import image_size
 from jaxnerf.data.readers.colmap_model import convert
-from jaxnerf.data.readers.validation import is_number, short_repr
+from jaxnerf.data.readers.validation import is_number
+from jaxnerf.options import short_repr
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's order of distortion_params
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")

@@ -11,6 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from jaxtyping import Shaped
 
+from jaxnerf.options import short_repr
 from jaxnerf.runtime import atomic_files
 
 MAX_FLOAT32 = 3.4e38
@@ -25,14 +26,6 @@ def check_factor(factor: Any) -> int:
     if whole < 1 or isinstance(factor, bool):
         raise ValueError(f"factor is {factor!r}, expected a whole number >= 1; 1 keeps the images as they are")
     return whole
-
-
-def check_range(near: Any, far: Any) -> None:
-    """Checks that 0 <= near < far, both finite in float32; raises ValueError otherwise."""
-    if not (is_number(near) and is_number(far) and 0 <= near < far):
-        raise ValueError(
-            f"near, far is {near!r}, {far!r}, expected finite numbers with 0 <= near < far; enclose the scene"
-        )
 
 
 def check_background(background: Any) -> tuple[float, float, float] | None:
@@ -165,9 +158,3 @@ def check_inside(name: Any, *, key: str, source: Any) -> str:
             f"{source}: {key} {short_repr(name)} leaves the folder, expected a path inside; move the image"
         )
     return inside
-
-
-def short_repr(value: Any) -> str:
-    """Returns a value's repr for a message: one line of at most 80 characters."""
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."

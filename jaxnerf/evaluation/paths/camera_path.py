@@ -1,11 +1,9 @@
 """Camera paths through a dataset: from the cameras of its views, or from a file."""
 
 import dataclasses
-import json
 import math
 import os
 import pathlib
-import re
 from typing import NamedTuple
 
 import numpy as np
@@ -17,16 +15,14 @@ from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import axis_of, check_pose
-from jaxnerf.data.geometry.world import direction_in_run, poses_in_file, poses_in_run
+from jaxnerf.data.geometry.world import direction_in_run, poses_in_run
 from jaxnerf.data.readers.validation import is_number, read_json
 from jaxnerf.runtime import atomic_files
 from jaxnerf.runtime.fingerprint import fingerprint
 
-FOLDER = "camera_paths"  # of path files, in a workdir
 _SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
 _FAR_AWAY = 1.1  # times as far as the farthest view, from where frames have bounds of their own
 _MAX_FRAMES, _MAX_PIXELS = 100_000, 16_384
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _FPS = {"above": 0.01, "below": 1000}
 
 
@@ -212,39 +208,6 @@ def _through_views(views, num_frames, closed):
     focal = np.float64(views.cameras.focal)[order] * (views.size[0, 0] / height)  # as if all were of one size
     focal = [np.interp(times, np.arange(count), side, period=count if closed else None) for side in focal.T]
     return poses, np.stack(focal, axis=-1)
-
-
-def file_of(workdir: str | os.PathLike, name: str) -> pathlib.Path:
-    """Returns <workdir>/camera_paths/<name>.json.
-
-    Raises:
-        ValueError: on a name of other characters than letters, digits, "_", "." and "-", or a folder that is a link.
-    """
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise ValueError(f"the name is {str(name)[:80]!r}, expected up to 64 letters, digits, '_', '.' and '-'")
-    folder = pathlib.Path(workdir) / FOLDER
-    atomic_files.check_tree(folder)
-    return folder / f"{name}.json"
-
-
-def write_path_file(file: pathlib.Path, path: CameraPath, views: Views) -> None:
-    """Writes a CameraPath as `read_path_file` reads it, in the world of the dataset's files; as 1 frame per second if
-    the path states none.
-
-    Args:
-        file: ends in .json; it is replaced.
-        path: in the run's world.
-        views: of the run, which say where its world is in that of the files.
-    """
-    poses = poses_in_file(path.poses, views.to_file)
-    poses[:, :, 3] += views.file_origin
-    frames = [
-        {"transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
-        | dict(zip(("fl_x", "fl_y", "cx", "cy"), [*map(float, focal), *map(float, center)], strict=True))
-        for pose, focal, center in zip(poses, path.focal, path.center, strict=True)
-    ]
-    content = {"w": path.width, "h": path.height, "fps": path.fps or 1.0, "frames": frames}
-    atomic_files.write_text(file, json.dumps(content, indent=1) + "\n")
 
 
 class PathFile(NamedTuple):

@@ -61,10 +61,11 @@ def _check_dataset():
         ) from None
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.data.dataset import dataset_folder
-    from jaxnerf.data.readers.validation import check_range
     from jaxnerf.tools.capture_check.report import inspect
 
-    check_range(0 if _NEAR.value is None else _NEAR.value, 3e38 if _FAR.value is None else _FAR.value)
+    near, far = _NEAR.value or 0.0, float("inf") if _FAR.value is None else _FAR.value
+    if not 0 <= near < far:
+        raise ValueError(f"--near is {near:g} and --far {far:g}, expected 0 <= near < far; enclose the scene")
     folder = dataset_folder(_DATA_DIR.value)
     camera_plot, plot = _plot_of(folder)
     with stages.stage("checking the dataset"):

@@ -11,8 +11,8 @@ from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.bounds import known_bounds
 from jaxnerf.data.geometry.path_poses import coverage
-from jaxnerf.data.geometry.poses import axis_of, gaze_center, sideways, up_of
-from jaxnerf.data.geometry.world import looks_forward, poses_of
+from jaxnerf.data.geometry.poses import axis_of, gaze_center, look_one_way, sideways, up_of
+from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.images.load_images import scored_splits, split_indices
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import TIME_UNUSED, Capture
@@ -264,7 +264,7 @@ def _counted(counter):
 def _view_direction(capture):
     """Returns how the cameras look: "inwards", "outwards", "forward" or "along a path"."""
     poses = poses_of(capture)
-    if looks_forward(capture):
+    if look_one_way(poses):
         return "forward"
     inwards = (((poses[:, :, 3] - gaze_center(poses)) * poses[:, :, 2]).sum(axis=1) > 0).mean()
     return "inwards" if inwards > 0.9 else "outwards" if inwards < 0.1 else "along a path"

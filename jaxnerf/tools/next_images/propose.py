@@ -17,6 +17,7 @@ from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.paths.camera_path import CameraPath
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.runtime import stages
+from jaxnerf.tools.next_images import path_files
 from jaxnerf.tools.next_images.candidate_poses import Candidates, azimuth_to_right, candidate_poses, farthest_poses
 from jaxnerf.tools.next_images.coverage import ViewCoverage, choose_views
 
@@ -220,9 +221,9 @@ def propose_images(
 
 def save_path(report: CoverageReport, workdir: str | os.PathLike) -> pathlib.Path:
     """Writes the proposals to <workdir>/camera_paths/next_images.json, which jaxnerf-render and the viewer show."""
-    file = camera_path.file_of(workdir, NAME)
+    file = path_files.file_of(workdir, NAME)
     file.parent.mkdir(exist_ok=True)
-    camera_path.write_path_file(file, report.path, report.views)
+    path_files.write_path_file(file, report.path, report.views)
     return file
 
 

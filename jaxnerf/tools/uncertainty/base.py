@@ -2,7 +2,7 @@
 
 import os
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxnerf.core.types import Rays
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.models.base import FINAL_NETWORK
 from jaxnerf.runtime.fingerprint import fingerprint
 
 Score = Callable[[Rays], Float[Array, "*batch"]]
@@ -80,3 +81,8 @@ class Estimate(NamedTuple):
     score: Score
     identity: str
     uncertainty_at: Callable[[Float[Array, "*batch 3"]], Float[Array, "*batch"]] | None = None
+
+
+def with_field_input(params: Mapping[str, Any], value: Any) -> dict[str, Any]:
+    """Returns the params of a model whose final field has been wrapped to take a pair: its params, and a value."""
+    return {**params, FINAL_NETWORK: (params[FINAL_NETWORK], value)}

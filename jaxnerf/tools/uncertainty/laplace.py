@@ -29,10 +29,9 @@ from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.image_renderer import image_renderer
 from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.fields.base import Field
-from jaxnerf.models.base import with_field_input
 from jaxnerf.runtime import atomic_files, stages
 from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource, fingerprint_of, folder_of
+from jaxnerf.tools.uncertainty.base import Estimate, UncertaintySource, fingerprint_of, folder_of, with_field_input
 
 RESOLUTION = 64  # cells of the deformation along each axis of the box
 # Each adds one random product: the precision then has a relative error of sqrt(2 / 32), and the standard deviation half

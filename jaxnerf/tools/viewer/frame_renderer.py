@@ -23,7 +23,7 @@ from jaxnerf.data.ray_batches import with_needs
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.evaluation.supersampling import MAX_RAYS, trained_footprint
-from jaxnerf.models.base import with_field_input
+from jaxnerf.tools.uncertainty.base import with_field_input
 
 UNCERTAINTY = "uncertainty"
 MODES = ("colour", "depth", "opacity", "normals", UNCERTAINTY)

@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry.path_poses import poses_through
-from jaxnerf.evaluation.paths.camera_path import CameraPath, file_of, make_path, write_path_file
+from jaxnerf.evaluation.paths.camera_path import CameraPath, make_path
+from jaxnerf.tools.next_images.path_files import file_of, write_path_file
 from jaxnerf.tools.viewer.frame_renderer import MAX_SIDE, FrameCamera
 
 MAX_KEYFRAMES, MAX_FRAMES = 500, 10_000

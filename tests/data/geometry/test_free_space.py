@@ -1,6 +1,8 @@
 """Depths between the sparse points of a view, and their cache."""
 
+import builtins
 import dataclasses
+import os
 
 import jax
 import numpy as np
@@ -51,3 +53,20 @@ def test_depths_are_read_from_the_cache(views, tmp_path, monkeypatch):
     smaller = dataclasses.replace(views, size=views.size - 8)
     with pytest.raises(pytest.fail.Exception):
         free_space.interpolated_depths(smaller)
+
+
+def test_scipy_is_imported_with_a_single_thread_of_its_blas(monkeypatch):
+    """Each of thousands of small matrices would otherwise wait for all threads."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    during, imported = [], builtins.__import__
+
+    def spy(name, *rest, **options):
+        during.append((name, os.environ.get("OPENBLAS_NUM_THREADS")))
+        return imported(name, *rest, **options)
+
+    monkeypatch.setattr(builtins, "__import__", spy)
+    free_space.scipy_spatial.__wrapped__()
+    assert ("scipy", "1") in during and "OPENBLAS_NUM_THREADS" not in os.environ
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
+    free_space.scipy_spatial.__wrapped__()
+    assert ("scipy", "3") in during and os.environ["OPENBLAS_NUM_THREADS"] == "3"

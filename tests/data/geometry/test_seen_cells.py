@@ -12,9 +12,11 @@ from jaxnerf.core.cameras import project
 from jaxnerf.core.types import Camera, SparsePoints
 from jaxnerf.core.views import Views
 from jaxnerf.data.active_pixels import active_region
+from jaxnerf.data.geometry import free_space
 from jaxnerf.data.geometry.free_space import surface_range
 from jaxnerf.data.geometry.seen_cells import _may_see, clear_radii, likely_empty_cells, seen_cells
 from jaxnerf.models.grid_schedule import make_grid_schedule
+from jaxnerf.runtime import cores
 
 SIZE, FOCAL = 48, 48.0  # px: each view covers 53 degrees
 WALL = -4.0  # z of a wall that faces the cameras
@@ -233,3 +235,17 @@ def test_training_starts_from_what_is_known():
     np.testing.assert_array_equal(indices, np.flatnonzero(cells.valid))
     unknown, _, _ = active_region(dataclasses.replace(views, sparse=None), schedule, use_alpha=False, min_views=1)
     assert unknown.empty is None and (unknown.valid == cells.valid).all()
+
+
+def test_any_number_of_cores_finds_the_same_cells(monkeypatch):
+    x = np.linspace(-0.5, 0.5, 6)
+    views, schedule = with_wall(some_views(x, far=np.full(6, 9.0, np.float32))), a_schedule()
+    found = []
+    for count in (1, 2, 3):
+        monkeypatch.setattr(cores, "usable", lambda count=count: count)
+        depths = free_space.interpolated_depths(views)
+        cells = *seen_cells(views, schedule, min_views=2), likely_empty_cells(views, schedule)
+        assert all(each.any() and not each.all() for each in cells[::2])
+        found.append((*cells, depths, active_region(views, schedule, use_alpha=False, min_views=2)[2]))
+    for other in found[1:]:
+        jax.tree.map(np.testing.assert_array_equal, found[0], other)

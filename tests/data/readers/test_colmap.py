@@ -210,9 +210,8 @@ def test_the_advice_for_a_camera_model_leads_somewhere(tmp_path, name, todo):
 
 @pytest.mark.parametrize("base", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."])
 def test_the_model_is_found(tmp_path, base):
-    assert colmap.find_model(tmp_path) is None
+    assert not colmap.models_in(tmp_path)
     put(tmp_path, binary(*model()), base=base)
-    assert colmap.find_model(tmp_path) == tmp_path / base
     assert colmap.read_capture(tmp_path).source == tmp_path / base
 
 
@@ -231,7 +230,7 @@ def test_of_several_models_the_one_with_most_images_is_read_and_noted(tmp_path, 
     put(tmp_path, write(cameras, images, points), base="sparse/1")
     put(tmp_path, write(cameras, images[:1], points), base="sparse/10")
     capture = colmap.read_capture(tmp_path)
-    assert capture.source == colmap.find_model(tmp_path) == tmp_path / "sparse" / "1"
+    assert capture.source == tmp_path / "sparse" / "1"
     assert len(capture.frames) == 3
     assert len(capture.notes) == 1 and capture.notes[0].endswith("other models skipped: 0, 10")
 
