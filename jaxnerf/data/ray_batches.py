@@ -59,11 +59,6 @@ class PixelRuns:
         within = bounds - jnp.asarray(self.first)[run]
         return jnp.clip(jnp.asarray(self.before)[run] + within, 0, ends[run])
 
-    def all_ids(self) -> Int[np.ndarray, " N"]:
-        """Returns all ids as int32, on the host."""
-        lengths = np.diff(np.append(self.before, self.size))
-        return (np.arange(self.size) + np.repeat(self.first - self.before, lengths)).astype(np.int32)
-
 
 def view_rays(
     views: Views,

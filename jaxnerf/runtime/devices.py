@@ -210,9 +210,7 @@ def threads_of_step(num_pixels: int) -> int:
 
     At most _MAX_THREADS, as each adds a gradient of the whole table, and so many that the step's pixels split evenly.
     """
-    if jax.device_count() > 1 or jax.default_backend() != "cpu":
-        return 1
-    return _largest_divisor(num_pixels, min(cores.usable(), _MAX_THREADS))
+    return 1 if jax.device_count() > 1 else _largest_divisor(num_pixels, min(cores.num_at_once(), _MAX_THREADS))
 
 
 def _largest_divisor(number, most):

@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeAlias
 
-from ml_collections import ConfigDict
+from ml_collections import ConfigDict, FieldReference
 
 from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.scene import SceneOptions
@@ -29,6 +29,7 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part, Registry
 from jaxnerf.runtime import memory
 from jaxnerf.runtime.config_fields import typed
 from jaxnerf.training.camera_parameters import CameraOptions
+from jaxnerf.training.earlier_options import RENAMED, in_todays_names, refuse, today
 from jaxnerf.training.options import EvalOptions, TrainOptions
 
 _MAX_SEED = 2**63 - 1  # what jax.random.key takes
@@ -145,7 +146,8 @@ def read_config(config: Config) -> RunConfig:
         return config
     if not isinstance(config, ConfigDict | Mapping):
         raise ValueError(f"config is {short_repr(config)}, expected one such as jaxnerf.configs.default.get_config()")
-    content = config.to_dict() if isinstance(config, ConfigDict) else dict(config)
+    content, left = in_todays_names(config.to_dict() if isinstance(config, ConfigDict) else config)
+    refuse(left, "--config.")
     record = content.pop("fingerprint", "")
     kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
     top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "config.")
@@ -177,6 +179,15 @@ def to_config_dict(config: RunConfig) -> ConfigDict:
     for name, declaration, kind, value in declared(config):
         section, dot, field = name.rpartition(".")
         (content[section] if dot else content)[field] = typed(value, kind, auto=declaration.auto)
+    for old, (new, _) in RENAMED.items():
+        (section, name), (new_section, _, new_name) = old.split("."), new.rpartition(".")
+        if not new_section:  # a record, not an option
+            continue
+        # One reference under both names: whichever is set, the other follows.
+        value = content[new_section][new_name]
+        if not isinstance(value, FieldReference):
+            value = content[new_section][new_name] = FieldReference(value)
+        content[section][name] = value
     return ConfigDict(content)
 
 
@@ -200,7 +211,7 @@ def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
     """Returns a config with other values, {"section.option": value}, checked as `read_config` does."""
     content = config.to_dict()
     for name, value in values.items():
-        section, dot, field = name.partition(".")
+        section, dot, field = today(name).partition(".")
         if dot:
             content[section] = {**content.get(section, {}), field: value}
         else:

@@ -16,6 +16,7 @@ from jaxnerf.options import Changes
 from jaxnerf.registry import LOSSES
 from jaxnerf.runtime import atomic_files
 from jaxnerf.training.config import RunConfig, changed, declared, flatten, read_config, to_config_dict
+from jaxnerf.training.earlier_options import in_todays_names, refuse
 
 try:
     import fcntl
@@ -47,7 +48,9 @@ def save_config(workdir: str | os.PathLike, config: RunConfig) -> None:
 
 
 def _check_same_run(workdir, config):
-    old, new = (_as_saved(each) for each in (load_config(workdir), config))
+    content, left = _saved(workdir)
+    refuse(left, f"{workdir}: belongs to a run of another version, whose ", Changes.TRAINING)
+    old, new = (_as_saved(each) for each in (read_config(content), config))
     free = {name for name, option, _, _ in declared(config) if not option.changes & Changes.TRAINING}
     fixed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key) and key not in free]
     if "fingerprint" in fixed:
@@ -72,7 +75,7 @@ def saved_options(workdir: str | os.PathLike) -> dict[str, Any]:
     Raises:
         ValueError: if there is no run; names the file.
     """
-    return _without_unused_losses(flatten(_saved(workdir)))
+    return _without_unused_losses(flatten(_saved(workdir)[0]))
 
 
 def _as_saved(config):
@@ -90,8 +93,10 @@ def load_config(workdir: str | os.PathLike, **values: Any) -> RunConfig:
     Raises:
         ValueError: if there is no run; names the file.
     """
+    content, left = _saved(workdir)
+    refuse(left, f"{workdir}: ", Changes.IMAGES)
     try:
-        config = read_config(_saved(workdir))
+        config = read_config(content)
     except ValueError as error:
         if not str(error).startswith("--config."):
             raise
@@ -113,7 +118,7 @@ def load_config_dict(path: str | os.PathLike) -> ConfigDict:
 
 
 def _saved(workdir):
-    """Returns the content of a config.json; ValueError if it is no config.
+    """Returns the content of a config.json in today's names, and its options that are gone, see `in_todays_names`.
 
     What it lacks was added after it was written, or registered since: losses are off, and other options on which
     training does not depend have their defaults.
@@ -125,12 +130,13 @@ def _saved(workdir):
         raise ValueError(f"{path}: no such file, expected the workdir of a training run; correct --workdir") from None
     if not isinstance(content, dict) or not isinstance(content.get("train"), dict):
         raise ValueError(f"{path}: is not a config, expected what training has written; restore it or train again")
+    content, left = in_todays_names(content)
     added = {name: value for name, option, _, value in declared(RunConfig()) if not option.changes & Changes.TRAINING}
     for name, value in {**added, **{f"losses.{name}": 0.0 for name in LOSSES.names()}}.items():
         section, _, field = name.partition(".")
         if isinstance(content.get(section), dict):
             content[section].setdefault(field, value)
-    return content
+    return content, left
 
 
 @contextlib.contextmanager

@@ -47,7 +47,7 @@ def errors(views, *, sky=False):
     """Returns |colour of the pixel - colour of the scene along its ray| [N, 3] at random unmasked pixels."""
     rng, found = np.random.default_rng(0), []
     active = unmasked_pixels(views)
-    active = np.arange(len(views.pixels)) if active is None else active.all_ids()
+    active = np.arange(len(views.pixels)) if active is None else active.ids(np.arange(active.size))
     back = np.asarray(views.to_file, np.float64)
     unit = np.cbrt(np.linalg.det(back[:3, :3]))
     for index, (height, width) in enumerate(views.size):

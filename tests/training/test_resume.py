@@ -13,10 +13,11 @@ import pytest
 from jaxnerf import load_scene, pixel_grid, render_image
 from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.options import AUTO
-from jaxnerf.training import loop, metric_log, workdir
+from jaxnerf.options import AUTO, Changes, values_of
+from jaxnerf.training import earlier_options, loop, metric_log, workdir
 from jaxnerf.training.checkpoint import Checkpoints
-from jaxnerf.training.config import to_config_dict
+from jaxnerf.training.config import read_config, to_config_dict
+from jaxnerf.training.earlier_options import Gone
 from jaxnerf.training.options import UNLIMITED_STEPS
 from runs import SMOKE_FLAGS, run_forked, smoke_config, start
 
@@ -114,14 +115,42 @@ def test_a_config_to_resume_has_the_types_of_its_fields(trained, tmp_path):
         config.train.max_steps = 1.5
 
 
-def test_a_run_with_an_option_that_is_gone_is_refused(trained, tmp_path):
-    saved = json.loads((trained / "config.json").read_text())
-    saved["occupancy"]["margin"] = 0.0
-    (tmp_path / "config.json").write_text(json.dumps(saved))
-    config = workdir.load_config(trained)
-    for read in (workdir.load_config, lambda folder: workdir.save_config(folder, config)):
-        with pytest.raises(ValueError, match="config.json: occupancy.margin is no field, .* the version that wrote it"):
-            read(tmp_path)
+@pytest.fixture
+def earlier(trained, tmp_path, monkeypatch):
+    """A function that writes the config.json of the previous release, with two options that it had, and reads it."""
+    gone = {
+        "occupancy.margin": Gone((0.0,), Changes.TRAINING, "use that version"),
+        "eval.fog": Gone((1.0,), Changes.IMAGES, "give --fog"),
+    }
+    monkeypatch.setattr(earlier_options, "GONE", gone)
+    monkeypatch.setattr(earlier_options, "RENAMED", {"train.rate": ("train.lr_init", 5e-4)})
+
+    def load(margin=0.0, fog=1.0):
+        saved = json.loads((trained / "config.json").read_text())
+        saved["train"]["rate"] = saved["train"].pop("lr_init")
+        saved["occupancy"]["margin"], saved["eval"]["fog"] = margin, fog
+        (tmp_path / "config.json").write_text(json.dumps(saved))
+        return workdir.load_config(tmp_path)
+
+    return load
+
+
+def test_a_run_of_the_previous_release_is_resumed(earlier, trained, tmp_path):
+    config = earlier()
+    assert config == workdir.load_config(trained)
+    workdir.save_config(tmp_path, config)
+    assert (tmp_path / "config.json").read_text() == (trained / "config.json").read_text()
+
+
+def test_a_run_that_used_an_option_that_is_gone_is_reported(earlier, tmp_path):
+    config = earlier(margin=0.2)  # on which training depended, but no image does
+    with pytest.raises(ValueError, match="another version, whose occupancy.margin is 0.2, but .*; use that version"):
+        workdir.save_config(tmp_path, config)
+    with pytest.raises(ValueError, match="eval.fog is 0.5, but the option no longer exists; give --fog"):
+        earlier(fog=0.5)
+    content = {**config.to_dict(), "occupancy": {**values_of(config.occupancy), "margin": 0.2}}
+    with pytest.raises(ValueError, match="--config.occupancy.margin is 0.2, but the option no longer exists"):
+        read_config(content)
 
 
 @pytest.mark.slow
