@@ -1,69 +1,163 @@
-"""Measures what each part of a training step, and a frame, gain from more CPU cores.
+"""Measures what more CPU cores gain: each part of a training step, whole runs, frames and the set-up.
 
     JAXNERF_SCENES=... python experiments/speed/cores.py --out=DIR [--cores=1,2] [--runs=fox,lego] [--rounds=3]
 
 Each measurement is a process of its own on so many cores, and the numbers of cores take turns, so that a machine that
-gets slower does so for all. Writes DIR/<run>-<cores>-<round>.json and prints a table of medians. What DIR holds is not
-measured again. With --page the table replaces what lies between <!-- cores --> and <!-- end of cores --> in that file.
+gets slower does so for all. Writes DIR/<run>-<kind>-<cores>-<round>.json and prints the tables of medians. What DIR
+holds is not measured again. A run of --seconds on several cores has a run of --gain times the seconds on one core
+beside it; held-out views score both. With --page the tables replace what lies between <!-- cores --> and
+<!-- end of cores --> in that file.
 """
 
+import functools
+import itertools
 import os
 import pathlib
 import statistics
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
 from absl import flags
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 from speed import step_parts
 
+from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.evaluation import evaluate, restore
+from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime import cli
+from jaxnerf.training import auto_config, build
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the measurements.", required=True)
 _CORES = flags.DEFINE_list("cores", ["1", "2"], "Numbers of cores, ascending.")
-_RUNS = flags.DEFINE_list("runs", list(step_parts.RUNS), "Runs of step_parts.py.")
+_RUNS = flags.DEFINE_list("runs", [], "Runs of step_parts.py, such as lego_400; all by default.")
 _ROUNDS = flags.DEFINE_integer("rounds", 3, "Measurements of each run with each number of cores.", lower_bound=1)
-_ONE = flags.DEFINE_string("one", None, "Measures this run here, into the file --out.")
-_WARM_UP, _STEPS = 1000, 64
+_SECONDS = flags.DEFINE_float("seconds", 60, "Of training of a whole run; 0: no whole runs.", lower_bound=0)
+_GAIN = flags.DEFINE_float("gain", 1.75, "How many times as long the fewest cores train.", lower_bound=1)
+_PARTS = flags.DEFINE_bool("parts", True, "Whether the parts of a step are measured, too.")
+_ONE = flags.DEFINE_list("one", None, "kind,run,seconds: measures this here, into the file --out.")
+_WARM_UP, _STEPS, _VIEWS, _FRAMES = 1000, 64, 8, 5
+_ROWS = {
+    "ms_per_step": ("ms a step", "{:.1f}"),
+    "rays_per_second": ("rays a second", "{:,.0f}"),
+    "frame": ("s a frame", "{:.2f}"),
+    "setup": ("s of set-up", "{:.2f}"),
+}
 
 
 def main(argv: list[str]) -> None:
-    """Measures what is missing, then prints the table."""
+    """Measures what is missing, then prints the tables."""
     del argv
     out = pathlib.Path(_OUT.value)
     if _ONE.value:
-        config = common.configuration(*step_parts.RUNS[_ONE.value])
-        common.write_json(out, step_parts.measure(config, warm_up=_WARM_UP, num_steps=_STEPS))
+        kind, name, seconds = _ONE.value
+        common.write_json(out, _parts(name) if kind == "parts" else _whole_run(name, float(seconds)))
         return
-    runs = common.chosen("--runs", _RUNS.value, list(step_parts.RUNS))
-    counts = [int(count) for count in _CORES.value]
+    known = [_short(name) for name in step_parts.RUNS]
+    runs = common.chosen("--runs", _RUNS.value or known, known)
+    counts, kinds = [int(count) for count in _CORES.value], ["run"] * bool(_SECONDS.value) + ["parts"] * _PARTS.value
     for turn in range(_ROUNDS.value):
-        for name in runs:
-            for count in counts:
-                path = _path(out, name, count, turn)
-                if not path.exists():
-                    command = [sys.executable, __file__, f"--one={name}", f"--out={path}"]
-                    with common.few_cores(count):
-                        subprocess.run(command, check=True, env=dict(os.environ))
-    measured = {
-        name: {
-            count: [common.read_json(_path(out, name, count, turn)) for turn in range(_ROUNDS.value)]
-            for count in counts
-        }
-        for name in runs
-    }
+        for kind, name, count in itertools.product(kinds, runs, counts):
+            path = _path(out, name, kind, count, turn)
+            if not path.exists():
+                seconds = _SECONDS.value * (_GAIN.value if count == counts[0] else 1)
+                command = [sys.executable, __file__, f"--one={kind},{name},{seconds}", f"--out={path}"]
+                with common.few_cores(count):
+                    subprocess.run(command, check=True, env=dict(os.environ))
+
+    def read(name, kind):
+        found = ([_path(out, name, kind, count, turn) for turn in range(_ROUNDS.value)] for count in counts)
+        return dict(zip(counts, ([common.read_json(path) for path in paths] for paths in found), strict=True))
+
     lines = [*common.provenance(), ""]
-    for name, by_count in measured.items():
-        lines += [f"{name}:", "", *table(by_count), ""]
+    if "run" in kinds:
+        lines += [*runs_table({name: read(name, "run") for name in runs}), ""]
+    for name in runs if "parts" in kinds else ():
+        lines += [f"{name}, on 1 thread each step:", "", *table(read(name, "parts")), ""]
     common.publish(lines[:-1], "cores")
 
 
-def _path(out, name, count, turn):
-    return out / f"{name.replace(', ', '_').replace(' ', '')}-{count}-{turn}.json"
+def _short(name):
+    """Returns the name of a run of step_parts.py without its unit: lego_400."""
+    return name.removesuffix(" px").replace(", ", "_")
+
+
+def _path(out, name, kind, count, turn):
+    return out / f"{name}-{kind}-{count}-{turn}.json"
+
+
+def _config(name):
+    return common.configuration(*step_parts.RUNS[{_short(each): each for each in step_parts.RUNS}[name]])
+
+
+def _parts(name):
+    return step_parts.measure(_config(name), warm_up=_WARM_UP, num_steps=_STEPS)
+
+
+def _whole_run(name, seconds):
+    """Trains a run for so long and returns what each core gains: of steps, held-out PSNR, a frame and the set-up."""
+    changes = {"train.max_seconds": seconds, "train.max_steps": 10**6, "data.hold_out": _VIEWS}
+    config = common.changed(_config(name), changes)
+    prepare_seconds = min(_prepare(config) for _ in range(2))  # the first compiles
+    with tempfile.TemporaryDirectory() as folder:
+        assert evaluate.train_and_evaluate(config, folder)
+        run = restore.restore_run(folder)
+        step = run.steps()[-1]
+        variables, views = run.variables(step), run.experiment.load_split("held_out")
+        frame = functools.partial(common.mean_psnr, run, variables, views, most=_VIEWS)
+        psnr, pixels = frame(), pixel_grid(*(int(side) for side in views.size[0]))
+        seconds_of = common.times(lambda: render_pixels(run, variables, views, 0, pixels)[0].rgb, _FRAMES)
+    size = run.experiment.config.train.batch_size
+    return {
+        "steps": step,
+        "psnr": psnr,
+        "ms_per_step": 1e3 * seconds / step,
+        "rays_per_second": step * size / seconds,
+        "frame": statistics.median(seconds_of),
+        "setup": prepare_seconds,
+    }
+
+
+def _prepare(config):
+    """Returns the seconds of the set-up with an empty cache of images; compiled programs are in memory."""
+    before = os.environ.get("XDG_CACHE_HOME")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        try:
+            started = time.perf_counter()
+            config, views, _ = auto_config.resolve(config)
+            config, _ = auto_config.resolve_for_device(config)
+            jax.block_until_ready(build.build(config).prepare(views)[1])
+            return time.perf_counter() - started
+        finally:
+            os.environ.pop("XDG_CACHE_HOME") if before is None else os.environ.update(XDG_CACHE_HOME=before)
+
+
+def runs_table(measured: Mapping[str, Mapping[int, Sequence[Mapping[str, Any]]]]) -> list[str]:
+    """Returns the lines of the table of whole runs: {name: {cores: results of _whole_run}}, the least cores first."""
+    least, *more = next(iter(measured.values()))
+    heads = ["run", "", f"{least} core(s)"] + [head for count in more for head in (f"{count} cores", "times faster")]
+    rows = []
+    for name, by_count in measured.items():
+        for key, (label, form) in _ROWS.items():
+            middle = {count: statistics.median(each[key] for each in found) for count, found in by_count.items()}
+            row = [name, label, form.format(middle[least])]
+            for count in more:
+                gain = middle[count] / middle[least] if key == "rays_per_second" else middle[least] / middle[count]
+                row += [form.format(middle[count]), f"{gain:.2f}"]
+            rows.append(row)
+        psnr = {count: statistics.median(each["psnr"] for each in found) for count, found in by_count.items()}
+        longer = f"{psnr[least]:.2f} after {_GAIN.value:g} times the seconds"
+        rows.append(
+            [name, "held-out PSNR, dB", longer, *(cell for count in more for cell in (f"{psnr[count]:.2f}", "-"))]
+        )
+    return common.markdown(heads, rows)
 
 
 def table(by_count: Mapping[int, Sequence[Mapping[str, Any]]]) -> list[str]:
