@@ -5,7 +5,7 @@
 Each measurement is a process of its own on so many cores, and the numbers of cores take turns, so that a machine that
 gets slower does so for all. Writes DIR/<run>-<kind>-<cores>-<round>.json and prints the tables of medians. What DIR
 holds is not measured again. A run of --seconds on several cores has a run of --gain times the seconds on one core
-beside it; held-out views score both. With --page the tables replace what lies between <!-- cores --> and
+beside it; held-out views score both. Frames are those of the run on the fewest cores. With --page the tables replace what lies between <!-- cores --> and
 <!-- end of cores --> in that file.
 """
 
@@ -41,7 +41,7 @@ _ROUNDS = flags.DEFINE_integer("rounds", 3, "Measurements of each run with each 
 _SECONDS = flags.DEFINE_float("seconds", 60, "Of training of a whole run; 0: no whole runs.", lower_bound=0)
 _GAIN = flags.DEFINE_float("gain", 1.75, "How many times as long the fewest cores train.", lower_bound=1)
 _PARTS = flags.DEFINE_bool("parts", True, "Whether the parts of a step are measured, too.")
-_ONE = flags.DEFINE_list("one", None, "kind,run,seconds: measures this here, into the file --out.")
+_ONE = flags.DEFINE_list("one", None, "kind,run,seconds,workdir: measures this here, into the file --out.")
 _WARM_UP, _STEPS, _VIEWS, _FRAMES = 1000, 64, 8, 5
 _ROWS = {
     "ms_per_step": ("ms a step", "{:.1f}"),
@@ -56,18 +56,23 @@ def main(argv: list[str]) -> None:
     del argv
     out = pathlib.Path(_OUT.value)
     if _ONE.value:
-        kind, name, seconds = _ONE.value
-        common.write_json(out, _parts(name) if kind == "parts" else _whole_run(name, float(seconds)))
+        kind, name, seconds, workdir = _ONE.value
+        measure = {"parts": _parts, "run": _whole_run, "frame": _frame}[kind]
+        common.write_json(out, measure(name, float(seconds), workdir))
         return
     known = [_short(name) for name in step_parts.RUNS]
     runs = common.chosen("--runs", _RUNS.value or known, known)
-    counts, kinds = [int(count) for count in _CORES.value], ["run"] * bool(_SECONDS.value) + ["parts"] * _PARTS.value
+    counts, kinds = (
+        [int(count) for count in _CORES.value],
+        ["run", "frame"] * bool(_SECONDS.value) + ["parts"] * _PARTS.value,
+    )
     for turn in range(_ROUNDS.value):
         for kind, name, count in itertools.product(kinds, runs, counts):
             path = _path(out, name, kind, count, turn)
             if not path.exists():
                 seconds = _SECONDS.value * (_GAIN.value if count == counts[0] else 1)
-                command = [sys.executable, __file__, f"--one={kind},{name},{seconds}", f"--out={path}"]
+                workdir = _path(out, name, "run", counts[0] if kind == "frame" else count, turn).with_suffix("")
+                command = [sys.executable, __file__, f"--one={kind},{name},{seconds},{workdir}", f"--out={path}"]
                 with common.few_cores(count):
                     subprocess.run(command, check=True, env=dict(os.environ))
 
@@ -77,7 +82,15 @@ def main(argv: list[str]) -> None:
 
     lines = [*common.provenance(), ""]
     if "run" in kinds:
-        lines += [*runs_table({name: read(name, "run") for name in runs}), ""]
+        found = {name: (read(name, "run"), read(name, "frame")) for name in runs}
+        merged = {
+            name: {
+                count: [each | frame for each, frame in zip(by_count[count], frames[count], strict=True)]
+                for count in counts
+            }
+            for name, (by_count, frames) in found.items()
+        }
+        lines += [*runs_table(merged), ""]
     for name in runs if "parts" in kinds else ():
         lines += [f"{name}, on 1 thread each step:", "", *table(read(name, "parts")), ""]
     common.publish(lines[:-1], "cores")
@@ -96,32 +109,41 @@ def _config(name):
     return common.configuration(*step_parts.RUNS[{_short(each): each for each in step_parts.RUNS}[name]])
 
 
-def _parts(name):
+def _parts(name, seconds, workdir):
+    del seconds, workdir
     return step_parts.measure(_config(name), warm_up=_WARM_UP, num_steps=_STEPS)
 
 
-def _whole_run(name, seconds):
-    """Trains a run for so long and returns what each core gains: of steps, held-out PSNR, a frame and the set-up."""
+def _whole_run(name, seconds, workdir):
+    """Trains a run for so long; returns its steps, the held-out PSNR and the seconds of the set-up."""
     changes = {"train.max_seconds": seconds, "train.max_steps": 10**6, "data.hold_out": _VIEWS}
     config = common.changed(_config(name), changes)
     prepare_seconds = min(_prepare(config) for _ in range(2))  # the first compiles
-    with tempfile.TemporaryDirectory() as folder:
-        assert evaluate.train_and_evaluate(config, folder)
-        run = restore.restore_run(folder)
-        step = run.steps()[-1]
-        variables, views = run.variables(step), run.experiment.load_split("held_out")
-        frame = functools.partial(common.mean_psnr, run, variables, views, most=_VIEWS)
-        psnr, pixels = frame(), pixel_grid(*(int(side) for side in views.size[0]))
-        seconds_of = common.times(lambda: render_pixels(run, variables, views, 0, pixels)[0].rgb, _FRAMES)
-    size = run.experiment.config.train.batch_size
+    if not evaluate.train_and_evaluate(config, workdir):
+        raise KeyboardInterrupt
+    run, variables, views = _restored(workdir)
+    step, rays = run.steps()[-1], run.experiment.config.train.batch_size
     return {
         "steps": step,
-        "psnr": psnr,
+        "psnr": common.mean_psnr(run, variables, views, most=_VIEWS),
         "ms_per_step": 1e3 * seconds / step,
-        "rays_per_second": step * size / seconds,
-        "frame": statistics.median(seconds_of),
+        "rays_per_second": step * rays / seconds,
         "setup": prepare_seconds,
     }
+
+
+def _frame(name, seconds, workdir):
+    """Returns the seconds of a frame of a run."""
+    del name, seconds
+    run, variables, views = _restored(workdir)
+    pixels = pixel_grid(*(int(side) for side in views.size[0]))
+    found = common.times(lambda: render_pixels(run, variables, views, 0, pixels)[0].rgb, _FRAMES)
+    return {"frame": statistics.median(found)}
+
+
+def _restored(workdir):
+    run = restore.restore_run(workdir)
+    return run, run.variables(run.steps()[-1]), run.experiment.load_split("held_out")
 
 
 def _prepare(config):
