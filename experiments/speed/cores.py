@@ -5,11 +5,10 @@
 Each measurement is a process of its own on so many cores, and the numbers of cores take turns, so that a machine that
 gets slower does so for all. Writes DIR/<run>-<kind>-<cores>-<round>.json and prints the tables of medians. What DIR
 holds is not measured again. A run of --seconds on several cores has a run of --gain times the seconds on one core
-beside it; held-out views score both. Frames are those of the run on the fewest cores. With --page the tables replace what lies between <!-- cores --> and
-<!-- end of cores --> in that file.
+beside it; held-out views score both. Frames are those of the run on the fewest cores. With --page the tables replace
+what lies between <!-- cores --> and <!-- end of cores --> in that file.
 """
 
-import functools
 import itertools
 import os
 import pathlib

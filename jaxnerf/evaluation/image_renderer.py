@@ -9,7 +9,7 @@ from jaxnerf.core.occupancy.ray_culling import render_selected
 from jaxnerf.core.rendering import render_image
 from jaxnerf.core.types import Rays, Rendering
 from jaxnerf.runtime import memory, stages
-from jaxnerf.runtime.cores import map_on_cores
+from jaxnerf.runtime.cores import map_on_cores, num_at_once
 
 
 def image_renderer(
@@ -35,7 +35,7 @@ def image_renderer(
                 if (size, key) not in checked:
                     # For the arrays themselves, not only their shapes: the call would compile again for arrays that are
                     # bound to a device.
-                    memory.check(render.lower(variables, rays).compile())
+                    memory.check(render.lower(variables, rays).compile(), num_at_once())
                     memory.release()
                     checked.add((size, key))
                 return render(variables, rays)

@@ -26,10 +26,7 @@ def usable() -> int:
 
 
 def limit_jax() -> None:
-    """Lets the programs of JAX use no more threads than there are usable cores, of which JAX knows control groups not.
-
-    It has an effect before JAX's devices are first used.
-    """
+    """Gives JAX, which sees no control group, a thread for each usable core, before its devices are first used."""
     os.environ.setdefault(JAX_THREADS, str(usable()))
 
 
@@ -49,8 +46,11 @@ def map_on_cores(function: Callable[[Any], Any], items: Iterable[Any], *, compil
     if compiles or count == 1:
         yield from map(function, items if count == 1 else itertools.islice(items, 1))
     if count > 1:
-        with ThreadPoolExecutor(count) as pool:
+        pool = ThreadPoolExecutor(count)
+        try:
             yield from pool.map(lambda item: jax.block_until_ready(function(item)), items)
+        finally:  # Ctrl-C does not wait for calls that run
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _allowed(system="/"):

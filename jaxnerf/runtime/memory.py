@@ -25,11 +25,11 @@ class OutOfMemory(Exception):
         self.fraction = free / needed
 
 
-def check(compiled: Any) -> None:
-    """Raises OutOfMemory if a compiled program's results and temporaries do not fit; its arguments exist already."""
+def check(compiled: Any, count: int = 1) -> None:
+    """Raises OutOfMemory if the results and temporaries of so many calls at once of a compiled program do not fit."""
     needed, free = _needed(compiled), available()
-    if needed is not None and free is not None and needed > free:
-        raise OutOfMemory(needed, free)
+    if needed is not None and free is not None and count * needed > free:
+        raise OutOfMemory(count * needed, free)
 
 
 def _needed(compiled):

@@ -82,3 +82,21 @@ def test_an_error_ends_the_calls_that_follow(monkeypatch):
     with pytest.raises(ValueError, match="item 0"):
         list(cores.map_on_cores(fail, range(10_000)))
     assert len(called) < 10_000
+
+
+def test_an_error_does_not_wait_for_calls_that_run(monkeypatch):
+    monkeypatch.setattr(cores, "usable", lambda: 2)
+    running, go_on, finished = threading.Event(), threading.Event(), []
+
+    def call(item):
+        if item == 0:
+            running.wait(30)
+            raise KeyboardInterrupt
+        running.set()
+        go_on.wait(30)
+        finished.append(item)
+
+    with pytest.raises(KeyboardInterrupt):
+        list(cores.map_on_cores(call, range(2)))
+    assert not finished
+    go_on.set()

@@ -41,6 +41,10 @@ def test_host_and_control_group_limits_are_read(tmp_path):
 def test_program_that_does_not_fit_is_an_error(monkeypatch):
     compiled = jax.jit(lambda x: jnp.outer(x, x)).lower(jnp.ones(500)).compile()
     memory.check(compiled)
+    monkeypatch.setattr(memory, "available", lambda: 1_500_000)
+    memory.check(compiled)
+    with pytest.raises(memory.OutOfMemory, match="needs 2.0 MB, 1.5 MB are free"):
+        memory.check(compiled, 2)
     monkeypatch.setattr(memory, "available", lambda: 500_000)
     with pytest.raises(memory.OutOfMemory, match="needs 1.0 MB, 0.5 MB are free"):  # a million bytes
         memory.check(compiled)
