@@ -90,8 +90,8 @@ def main(argv: list[str]) -> None:
             for name, (by_count, frames) in found.items()
         }
         lines += [*runs_table(merged), ""]
-    for name in runs if "parts" in kinds else ():
-        lines += [f"{name}, on 1 thread each step:", "", *table(read(name, "parts")), ""]
+    if "parts" in kinds:
+        lines += [*parts_table({name: read(name, "parts") for name in runs}), ""]
     common.publish(lines[:-1], "cores")
 
 
@@ -161,42 +161,45 @@ def _prepare(config):
 
 
 def runs_table(measured: Mapping[str, Mapping[int, Sequence[Mapping[str, Any]]]]) -> list[str]:
-    """Returns the lines of the table of whole runs: {name: {cores: results of _whole_run}}, the least cores first."""
-    least, *more = next(iter(measured.values()))
-    heads = ["run", "", f"{least} core(s)"] + [head for count in more for head in (f"{count} cores", "times faster")]
+    """Returns the lines of the table of whole runs: {name: {cores: results}}, the least cores first.
+
+    A cell has the medians for each number of cores, and how many times as fast each is as the least.
+    """
     rows = []
     for name, by_count in measured.items():
-        for key, (label, form) in _ROWS.items():
-            middle = {count: statistics.median(each[key] for each in found) for count, found in by_count.items()}
-            row = [name, label, form.format(middle[least])]
-            for count in more:
-                gain = middle[count] / middle[least] if key == "rays_per_second" else middle[least] / middle[count]
-                row += [form.format(middle[count]), f"{gain:.2f}"]
-            rows.append(row)
-        psnr = {count: statistics.median(each["psnr"] for each in found) for count, found in by_count.items()}
-        longer = f"{psnr[least]:.2f} after {_GAIN.value:g} times the seconds"
-        rows.append(
-            [name, "held-out PSNR, dB", longer, *(cell for count in more for cell in (f"{psnr[count]:.2f}", "-"))]
-        )
-    return common.markdown(heads, rows)
+        row = [name]
+        for key, (_, form) in _ROWS.items():
+            least, *more = (statistics.median(each[key] for each in found) for found in by_count.values())
+            gains = (value / least if key == "rays_per_second" else least / value for value in more)
+            cells = [f"{form.format(value)} ({gain:.2f})" for value, gain in zip(more, gains, strict=True)]
+            row.append(", ".join([form.format(least), *cells]))
+        psnr = (statistics.median(each["psnr"] for each in found) for found in by_count.values())
+        rows.append([*row, ", ".join(f"{value:.2f}" for value in psnr)])
+    heads = [f"{', '.join(map(str, by_count))} cores (times faster)", *(label for label, _ in _ROWS.values())]
+    return common.markdown([*heads, "held-out PSNR, dB"], rows)
 
 
-def table(by_count: Mapping[int, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """Returns the lines of the table of a run: {cores: results of step_parts.measure}, the least cores first."""
-    least, *more = by_count
-    medians = {count: _medians(results) for count, results in by_count.items()}
-    heads = ["ms a step", f"{least} core(s)"]
-    heads += [head for count in more for head in (f"{count} cores", "times faster", "serial")]
+def parts_table(measured: Mapping[str, Mapping[int, Sequence[Mapping[str, Any]]]]) -> list[str]:
+    """Returns the lines of the table of a step's parts: {name: {cores: results of step_parts.measure}}.
+
+    A cell has the ms for each number of cores, and the serial part of the time on the least.
+    """
+    medians = {
+        name: {count: _medians(found) for count, found in by_count.items()} for name, by_count in measured.items()
+    }
+    parts = list(dict.fromkeys(part for by_count in medians.values() for each in by_count.values() for part in each))
     rows = []
-    for part in medians[least]:
-        before = medians[least][part]
-        row = [part, f"{before:.2f}"]
-        for count in more:
-            after = medians[count].get(part, 0.0)
-            gain = before / after if after else 0.0
-            row += [f"{after:.2f}", f"{gain:.2f}", f"{serial_fraction(gain, count / least):.0%}" if gain else "-"]
+    for part in parts:
+        row = [part]
+        for by_count in medians.values():
+            (least, before), *more = ((count, found.get(part, 0.0)) for count, found in by_count.items())
+            cells = [f"{before:.1f}"]
+            for count, after in more:
+                serial = f"{serial_fraction(before / after, count / least):.0%}" if before and after else "-"
+                cells.append(f"{after:.1f} ({serial})")
+            row.append(", ".join(cells))
         rows.append(row)
-    return common.markdown(heads, rows)
+    return common.markdown(["ms a step (serial)", *medians], rows)
 
 
 def serial_fraction(gain: float, cores: float) -> float:
