@@ -85,5 +85,9 @@ def test_the_serial_part_follows_from_the_gain_of_more_cores():
     assert cores.serial_fraction(2.0, 2) == 0.0 and cores.serial_fraction(0.9, 2) == 1.0
     assert cores.serial_fraction(1 / (0.4 + 0.6 / 8), 8) == pytest.approx(0.4)
     results = lambda ms, part: [{"ms": ms, "parts": {"networks": part}}]  # noqa: E731
-    lines = cores.table({1: results(10.0, 8.0), 2: results(6.0, 4.0)})
-    assert lines[2:] == ["| whole step | 10.00 | 6.00 | 1.67 | 20% |", "| networks | 8.00 | 4.00 | 2.00 | 0% |"]
+    lines = cores.parts_table({"lego": {1: results(10.0, 8.0), 2: results(6.0, 4.0)}})
+    assert lines[2:] == ["| whole step | 10.0, 6.0 (20%) |", "| networks | 8.0, 4.0 (0%) |"]
+    run = {"ms_per_step": 10.0, "rays_per_second": 1e5, "frame": 0.5, "setup": 4.0, "psnr": 30.0}
+    faster = {"ms_per_step": 5.0, "rays_per_second": 2e5, "frame": 0.25, "setup": 2.0, "psnr": 29.5}
+    row = "| lego | 10.0, 5.0 (2.00) | 100,000, 200,000 (2.00) | 0.50, 0.25 (2.00) | 4.00, 2.00 (2.00) | 30.00, 29.50 |"
+    assert cores.runs_table({"lego": {1: [run], 2: [faster]}})[2:] == [row]
