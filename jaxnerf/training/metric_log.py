@@ -163,7 +163,7 @@ def header(experiment: Any, views: Views, state: TrainState, compiled: Any) -> l
     options, devices = experiment.config.train, jax.devices()
     processes = f", in {jax.process_count()} processes" if jax.process_count() > 1 else ""
     if devices[0].platform == "cpu":
-        processes = f" on {cores.usable()} cores{processes}"
+        processes = f" on {(count := cores.usable())} core{'s' * (count > 1)}{processes}"
     counts = {name: sum(leaf.size for leaf in jax.tree.leaves(part)) for name, part in state.params.items()}
     parts = ", ".join(f"{name} {count:,}" for name, count in counts.items())
     dtype = jax.tree.leaves(state.params)[0].dtype
