@@ -77,3 +77,12 @@ def all_finite(tree):
 def out_of_memory():
     """Returns the error that JAX raises where a device has no more memory."""
     return jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes.")
+
+
+def control_group(system):
+    """Makes the folder of the control group /pod/job in a system's files, as that of this process; returns it."""
+    group = system / "sys/fs/cgroup/pod/job"
+    group.mkdir(parents=True)
+    (system / "proc/self").mkdir(parents=True)
+    (system / "proc/self/cgroup").write_text("0::/pod/job\n")
+    return group

@@ -65,7 +65,7 @@ def active_region(
         if min_views:
             find_seen = functools.partial(seen_cells, views, schedule, min_views=min_views)
             find_empty = functools.partial(likely_empty_cells, views, schedule, pixel_offset=pixel_offset)
-            # Both at once, as Python traces their programs on a single core.
+            # At once: one computes while Python traces the programs of the other.
             (seen, free), empty = cores.map_on_cores(lambda find: find(), (find_seen, find_empty))
             valid &= seen & ~free
             empty &= valid

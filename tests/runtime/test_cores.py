@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from helpers import control_group
 from jaxnerf.runtime import cores
 
 
@@ -31,10 +32,7 @@ def test_the_least_limit_counts(six_cores, monkeypatch):
 
 def test_control_groups_of_containers_are_read(tmp_path):
     assert cores._allowed(tmp_path) == []  # not Linux
-    group = tmp_path / "sys/fs/cgroup/pod/job"
-    group.mkdir(parents=True)
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/cgroup").write_text("0::/pod/job\n")
+    group = control_group(tmp_path)
     assert cores._allowed(tmp_path) == []
     (group / "cpu.max").write_text("max 100000\n")
     (group.parent / "cpu.max").write_text("250000 100000\n")

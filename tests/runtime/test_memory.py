@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import assert_same, out_of_memory, random_rays
+from helpers import assert_same, control_group, out_of_memory, random_rays
 from jaxnerf.evaluation import metrics
 from jaxnerf.runtime import devices, memory
 from jaxnerf.training import compiled_step, loop
@@ -24,11 +24,8 @@ pytestmark = pytest.mark.usefixtures("unoptimized")
 
 def test_host_and_control_group_limits_are_read(tmp_path):
     assert memory._host_available(tmp_path) == []  # not Linux
-    group = tmp_path / "sys/fs/cgroup/pod/job"
-    group.mkdir(parents=True)
-    (tmp_path / "proc/self").mkdir(parents=True)
+    group = control_group(tmp_path)
     (tmp_path / "proc/meminfo").write_text("MemTotal: 90 kB\nMemAvailable:    50 kB\n")
-    (tmp_path / "proc/self/cgroup").write_text("0::/pod/job\n")
     assert memory._host_available(tmp_path) == [51_200]
     for folder, limit in ((group, "max"), (group.parent, "9000")):
         (folder / "memory.max").write_text(f"{limit}\n")
