@@ -37,6 +37,7 @@ ALLOWED = {
 # Where the method hands over to a tool, in a lazy import.
 HANDS_OVER = {
     ("jaxnerf.train", "tools.viewer"),
+    ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
