@@ -39,6 +39,7 @@ HANDS_OVER = {
     ("jaxnerf.train", "tools.viewer"),
     ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
+    ("jaxnerf.data.synthetic", "tools.embedded_scene"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
     ("jaxnerf.extend", "tools.uncertainty"),
