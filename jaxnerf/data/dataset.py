@@ -16,8 +16,8 @@ from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 from jaxnerf.data.scene import BACKGROUNDS
 from jaxnerf.data.shared_views import found_by_split
+from jaxnerf.data.synthetic import FINISHES
 from jaxnerf.data.view_selection import select_views, selection
-from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO, Changes, Options, between, declarations, infer, is_auto, option, replaced, values_of
 from jaxnerf.registry import READERS, needs_folder
 
@@ -59,7 +59,7 @@ class DataOptions(Options):
     finish: str = option(
         "usual",
         "surfaces of the embedded scene; `matt` ones do not depend on the view direction",
-        choices=tuple(sorted(still_life.FINISHES)),
+        choices=FINISHES,
     )
     near: float = option(
         AUTO,
