@@ -57,6 +57,6 @@ __all__ = [
     # estimators of uncertainty
     "Estimate", "UncertaintySource",
     # options
-    "Options", "option", "Ablation", "Changes", "at_least", "between", "POSITIVE", "FRACTION", "BELOW_ONE", "infer", "Facts",
-    "Device",
+    "Options", "option", "Ablation", "Changes", "at_least", "between", "POSITIVE", "FRACTION", "BELOW_ONE", "infer",
+    "Facts", "Device",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Tests of the program jaxnerf-needs: verdicts, the race with invented trials, resuming, files, and a plug-in's part."""
+"""Tests of jaxnerf-needs: verdicts, the race with invented trials, resuming, files, and a plug-in's part."""
 
 import dataclasses
 import json
