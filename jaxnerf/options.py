@@ -376,7 +376,7 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
         raise ValueError(f"--{prefix}{missing[0]} is missing; restore the config, or set it")
     if unknown:
         raise ValueError(unknown_field(prefix, unknown[0], known))
-    return kind(**{name: read_value(*known[name], values[name], f"{prefix}{name}") for name in known})
+    return kind(**{name: read_value(*known[name], values[name], f"--{prefix}{name}") for name in known})
 
 
 def unknown_field(prefix: str, name: str, known: Iterable[str]) -> str:
@@ -385,12 +385,12 @@ def unknown_field(prefix: str, name: str, known: Iterable[str]) -> str:
     return f"--{prefix}{name} is no field, {meant}expected one of {sorted(known)}"
 
 
-def read_value(declared: Option, kind: Any, value: Any, flag: str) -> Any:
-    """Returns the value of one option, with tuples in place of lists; ValueError, with its flag, where it is none."""
+def read_value(declared: Option, kind: Any, value: Any, name: str) -> Any:
+    """Returns the value of one option, with tuples in place of lists; ValueError, with its name, where it is none."""
     value = as_tuples(value)
 
     def refuse(expected):
-        raise ValueError(f"--{flag} is {short_repr(value)}, expected {expected}; correct it")
+        raise ValueError(f"{name} is {short_repr(value)}, expected {expected}; correct it")
 
     if is_auto(value) and (declared.auto or AUTO in declared.choices):
         return value
@@ -455,5 +455,5 @@ def _numbers(value):
 
 
 def as_tuples(value: Any) -> Any:
-    """Returns a value with tuples in place of lists, which JSON and flags have."""
-    return tuple(map(as_tuples, value)) if isinstance(value, tuple | list) else value
+    """Returns a value with tuples in place of lists, which JSON and flags have, and of ranges."""
+    return tuple(map(as_tuples, value)) if isinstance(value, tuple | list | range) else value
