@@ -78,10 +78,9 @@ def find_needs(request: Request, out: str | os.PathLike) -> Outcome:
             folder,
             request.settings,
             variants,
-            trainer.run,
-            full=(full.run, full_variants),
+            trainer,
+            full=(full, full_variants),
             check=functools.partial(_check_trained, held_out),
-            forget=trainer.forget,
             say=_say,
             started=max(seconds() - started, 0),
         )

@@ -108,9 +108,6 @@ class Outcome(NamedTuple):
     spent: float
 
 
-Runner = Callable[..., tuple[Result, Sequence[np.ndarray]]]
-
-
 class Study:
     """A study in a folder, which holds a file for each trial that is done, so that it resumes."""
 
@@ -119,11 +116,10 @@ class Study:
         folder: pathlib.Path,
         settings: Settings,
         variants: Sequence[Variant],
-        run: Runner,
+        trainer: Any,
         *,
-        full: tuple[Runner, Mapping[str, Variant]] | None = None,
+        full: tuple[Any, Mapping[str, Variant]] | None = None,
         check: Callable[[Result], None] = lambda result: None,
-        forget: Callable[[Mapping[str, Any]], None] = lambda values: None,
         say: Callable[[str], None] = print,
         started: float = 0.0,
     ):
@@ -133,17 +129,15 @@ class Study:
             folder: exists; what it holds of an earlier start is used.
             settings: of the study.
             variants: those to be tried first in front.
-            run: (values, seed, seconds, steps=0, pose=False) -> Result and the images of the held-out views; see
-                `Trainer.run`.
-            full: `run` with images that are not shrunk, and the variants there, by slug; None: as the others.
+            trainer: with the functions `run` and `forget` of a `Trainer`.
+            full: a trainer with images that are not shrunk, and the variants there, by slug; None: as the others.
             check: called with the first result of the complete model; raises a ValueError if it does not suffice.
-            forget: (values) frees what a variant that is decided keeps.
             say: prints a line.
             started: seconds that the program has taken so far.
         """
         self.folder, self.settings, self.say = folder, settings, say
-        self._run, self._forget, self._check = run, forget, check
-        self._run_full, self._full = full or (run, {each.slug: each for each in variants})
+        self._trainer, self._check = trainer, check
+        self._full_trainer, self._full = full or (trainer, {each.slug: each for each in variants})
         self._all, self._started = list(variants), started
         self.by_slug = {each.slug: each for each in [complete(), *variants]}
         self._done: dict[tuple[str, int, float], Result] = {}
@@ -164,7 +158,7 @@ class Study:
 
     def _make_plan(self):
         settings = self.settings
-        result, _ = self._run({}, 0, _LEAST_SECONDS)
+        result, _ = self._trainer.run({}, 0, _LEAST_SECONDS)
         compiling, scoring = result.compile_seconds, max(result.spent - result.compile_seconds - result.seconds, 0)
         count, length = planned(settings, len(self._all), compiling, scoring)
         steps = max(round(result.steps * length / result.seconds), 1) if settings.equal == "steps" else 0
@@ -206,7 +200,7 @@ class Study:
         content = read_json(path, _REMEDY)
         if "failed" in content:
             self.failed[variant.slug] = content["failed"]
-            self._forget(variant.values)
+            self._trainer.forget(variant.values)
             return None
         self._done[key] = Result(**content)
         if variant.slug == COMPLETE and not full:
@@ -217,8 +211,8 @@ class Study:
         steps = 0 if full else round(self.plan.steps * length / self.plan.length)
         pose = variant.aligned == "pose" or (variant.slug == COMPLETE and self._pose)
         try:
-            run = self._run_full if full else self._run
-            result, images = run(variant.values, seed, length, steps=steps, pose=pose)
+            trainer = self._full_trainer if full else self._trainer
+            result, images = trainer.run(variant.values, seed, length, steps=steps, pose=pose)
         except ValueError as error:
             if variant.slug == COMPLETE:
                 raise
@@ -296,7 +290,7 @@ class Study:
             if is_open:
                 found.append(slug)
             elif done.get(slug, 0) > 1:
-                self._forget(self.by_slug[slug].values)
+                self._trainer.forget(self.by_slug[slug].values)
         if any(slug not in known for slug in found):
             return found  # in the order of the plan
         return sorted(found, key=lambda slug: abs(known[slug].mean - self.settings.margin))

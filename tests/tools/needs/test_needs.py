@@ -35,7 +35,10 @@ class Trials:
         self.effects, self.noise, self.compiling, self.stop_after = effects, noise, compiling, stop_after
         self.calls, self.compiled = [], set()
 
-    def __call__(self, values, seed, length, *, steps=0, pose=False):
+    def forget(self, values):
+        pass
+
+    def run(self, values, seed, length, *, steps=0, pose=False):
         if len(self.calls) >= self.stop_after:
             raise KeyboardInterrupt
         self.calls.append((tuple(sorted(values)), seed, length))
