@@ -153,8 +153,15 @@ class Study:
 
     @property
     def spent(self) -> float:
-        """Seconds that all trials so far have taken, in this start and in earlier ones."""
-        return self.plan.spent + sum(each.spent for each in self._done.values())
+        """Seconds that all trials so far have taken, in this start and in earlier ones.
+
+        What a later start compiles again is not counted, so that a study that was stopped decides as one that was not.
+        """
+        total, compiled = self.plan.spent, {COMPLETE}
+        for (name, _, _), each in self._done.items():
+            total += each.spent - (each.compile_seconds if name in compiled else 0)
+            compiled.add(name)
+        return total
 
     def _make_plan(self):
         settings = self.settings
@@ -281,16 +288,15 @@ class Study:
 
     def _open(self, done):
         """Returns the slugs of variants whose verdict is open, those nearest to a verdict first."""
-        known = self.effects()
-        waiting = [slug for slug in self.plan.tried if slug not in self.failed]
-        found = []
-        for slug in waiting:
-            looked = done.get(slug, 0) in racing.LOOKS or done.get(slug, 0) == 1
-            is_open = slug not in known or not looked or known[slug].verdict(self.settings.margin) == OPEN
-            if is_open:
-                found.append(slug)
-            elif done.get(slug, 0) > 1:
+        known, found = self.effects(), []
+        for slug in self.plan.tried:
+            if slug in self.failed:
+                continue
+            looked = slug in known and done[slug] in racing.LOOKS
+            if looked and known[slug].verdict(self.settings.margin) != OPEN:
                 self._trainer.forget(self.by_slug[slug].values)
+            else:
+                found.append(slug)
         if any(slug not in known for slug in found):
             return found  # in the order of the plan
         return sorted(found, key=lambda slug: abs(known[slug].mean - self.settings.margin))
