@@ -1,5 +1,6 @@
 """Trials: a model trained for some seconds and scored on views that are held out of training."""
 
+import dataclasses
 import math
 import pathlib
 import time
@@ -87,10 +88,11 @@ class Trainer:
         config: of the complete model, not resolved, with held-out views.
         views: of the split "train".
         pacer: of the machine's speed; None: seconds are those of the clock.
+        split: whose views are scored.
     """
 
-    def __init__(self, config: RunConfig, views: Views, pacer: Pacer | None = None):
-        self.config, self.views, self.pacer = config, views, pacer
+    def __init__(self, config: RunConfig, views: Views, pacer: Pacer | None = None, *, split: str = "held_out"):
+        self.config, self.views, self.pacer, self.split = config, views, pacer, split
         self._compiled: dict[str, _Compiled] = {}
         self._compiling: dict[str, float] = {}  # seconds that no result has reported yet
         self._held_out: dict[str, Views] = {}
@@ -159,7 +161,7 @@ class Trainer:
     def _views_held_out(self, experiment) -> Views:
         key = repr((experiment.config.data, "image_index" in experiment.model.needs))
         if key not in self._held_out:
-            self._held_out[key] = experiment.load_split("held_out", max_views=_MOST_VIEWS)
+            self._held_out[key] = experiment.load_split(self.split, max_views=_MOST_VIEWS)
         return self._held_out[key]
 
 
@@ -217,7 +219,7 @@ class _Compiled:
         if steps:
             data = _of_steps(data, steps)
         config = replaced(self._experiment.config, seed=seed)
-        reinitialize = make_reinitializer(self._experiment._replace(config=config), "this dataset")
+        reinitialize = make_reinitializer(dataclasses.replace(self._experiment, config=config), "this dataset")
         clock, done, metrics = PacedClock(seconds, pacer), 0, None
         pace = Pace(options, clock, data)
         take = step.of(1)
