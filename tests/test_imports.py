@@ -36,6 +36,7 @@ ALLOWED = {
 }
 # Where the method hands over to a tool, in a lazy import.
 HANDS_OVER = {
+    ("jaxnerf.train", "tools.options_page"),
     ("jaxnerf.train", "tools.viewer"),
     ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),

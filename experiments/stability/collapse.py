@@ -110,7 +110,7 @@ class Study:
             allowed: train.max_reinits.
         """
         config = common.changed(self._experiment.config, {"seed": seed, "train.max_reinits": allowed})
-        experiment = self._experiment._replace(config=config)
+        experiment = dataclasses.replace(self._experiment, config=config)
         reinitialize = dead_networks.make_reinitializer(experiment, f"seed {seed}")
         state = create_state(experiment.model, experiment.optimizer, seed)
         data = self._step.data._replace(seed=np.uint32(seed))

@@ -486,8 +486,6 @@ def test_errors_of_the_json_file(dataset, change, message):
 
 
 def test_errors_of_the_files(dataset):
-    with pytest.raises(ValueError, match="folder is None"):
-        read_capture(None)
     folder = dataset(lambda content: content.pop("cx"))
     read_capture(folder)  # the size is stated, so no image is read
     folder = dataset(lambda content: content.pop("cx") and content.pop("w"))
