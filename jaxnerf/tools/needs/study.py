@@ -257,9 +257,7 @@ class Study:
 
     def _contribution(self, variant, base, other):
         """Returns what a variant's part contributes to each view, dB."""
-        kind = variant.aligned or ("colors" if self.aligned else "")
-        name = f"psnr_{kind}" if kind else "psnr"
-        gained = np.subtract(getattr(other, name), getattr(base, name))
+        gained = np.subtract(*(self._scores(each, variant.aligned) for each in (other, base)))
         return gained if variant.adds else -gained
 
     def differences(self, variant: Variant) -> Float[np.ndarray, "S V"]:
@@ -299,7 +297,7 @@ class Study:
                 found.append(slug)
         if any(slug not in known for slug in found):
             return found  # in the order of the plan
-        return sorted(found, key=lambda slug: abs(known[slug].mean - self.settings.margin))
+        return sorted(found, key=lambda slug: -abs(known[slug].mean - self.settings.margin))
 
     def _find_lean(self):
         """Returns the variants that the lean model combines, its effect, what was refused, and the longest length.
@@ -309,7 +307,7 @@ class Study:
         """
         known, margin = self.effects(), self.settings.margin
         wanted = [slug for slug, each in known.items() if _improves(self.by_slug[slug], each.verdict(margin))]
-        chosen = _one_each([self._full.get(slug, self.by_slug[slug]) for slug in wanted])
+        chosen = _one_each([self._full[slug] for slug in wanted if slug in self._full])
         smaller = [each for each in chosen if each.change != LESS]
         length, refused = self._longest(), []
         base = self.trial(complete(), 0, length, full=True)
@@ -321,9 +319,8 @@ class Study:
             if other is None:
                 continue
             found = self._contribution(lean, base, other)[None]
-            effect = racing.effects({**{slug: self.differences(self.by_slug[slug]) for slug in known}, LEAN: found})[
-                LEAN
-            ]
+            others = {slug: self.differences(self.by_slug[slug]) for slug in known}
+            effect = racing.effects({**others, LEAN: found})[LEAN]
             if effect.mean <= margin:
                 return each, effect, refused, length
             refused.append((each, effect))
@@ -340,15 +337,16 @@ class Study:
 
     def _curve(self, chosen, longest):
         models = {COMPLETE: complete(), **({LEAN: combined(chosen)} if chosen else {})}
-        curve, last = {}, {}
+        curve, last, aligned = {}, {}, combined(chosen).aligned
         for name, variant in models.items():
             points = [self.trial(variant, 0, fraction * longest, full=True) for fraction in CURVE]
-            curve[name] = [(each.seconds, float(np.mean(self._scores(each)))) for each in points]
+            curve[name] = [(each.seconds, float(np.mean(self._scores(each, aligned)))) for each in points]
             last[name] = points[-1]
         return curve, last
 
-    def _scores(self, result):
-        return result.psnr_colors if self.aligned else result.psnr
+    def _scores(self, result, aligned):
+        """Returns the scores of the views, dB; aligned: see `Ablation`."""
+        return getattr(result, "_".join(["psnr", *([aligned or "colors"] if aligned or self.aligned else [])]))
 
     def _outcome(self, lean, effect, refused, longest):
         known, rows = self.effects(), []
@@ -403,7 +401,7 @@ def combined(variants: Sequence[Variant]) -> Variant:
     values = {key: value for each in variants for key, value in each.values.items()}
     before = {key: value for each in variants for key, value in each.before.items()}
     names = "_".join(sorted(each.slug for each in variants))
-    aligned = "pose" if any(each.aligned == "pose" for each in variants) else ""
+    aligned = max((each.aligned for each in variants), default="")  # a fitted pose also needs the other's
     return Variant(
         f"{LEAN}: {names}" if len(names) < 100 else f"{LEAN}: {len(variants)} changes", "", values, before, aligned
     )
