@@ -38,6 +38,7 @@ ALLOWED = {
 HANDS_OVER = {
     ("jaxnerf.train", "tools.options_page"),
     ("jaxnerf.train", "tools.viewer"),
+    ("jaxnerf.eval", "tools.alignment"),
     ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
     ("jaxnerf.data.synthetic", "tools.embedded_scene"),
