@@ -36,8 +36,11 @@ ALLOWED = {
 }
 # Where the method hands over to a tool, in a lazy import.
 HANDS_OVER = {
+    ("jaxnerf.train", "tools.options_page"),
     ("jaxnerf.train", "tools.viewer"),
+    ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
+    ("jaxnerf.data.synthetic", "tools.embedded_scene"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
     ("jaxnerf.extend", "tools.uncertainty"),

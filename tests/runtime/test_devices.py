@@ -1,5 +1,6 @@
 """jit on one device, sharded jit and pmap on four: the same run."""
 
+import dataclasses
 import functools
 import re
 
@@ -179,7 +180,7 @@ def test_seed_does_not_change_the_program():
     for seed in (0, 1):
         config = smoke_config()
         config.seed = seed
-        experiment = build(config)._replace(model=toy_model())
+        experiment = dataclasses.replace(build(config), model=toy_model())
         _, data = experiment.prepare(experiment.load_split("train"))
         state = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, 0))  # noqa: B023
         step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, LOSSES)

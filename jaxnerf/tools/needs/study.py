@@ -1,0 +1,394 @@
+"""Finds what a scene needs: trials of the complete model and of its variants, until the budget is spent."""
+
+import json
+import math
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxnerf.runtime.atomic_files import partial_file, read_json, write_text
+from jaxnerf.tools.needs import racing
+from jaxnerf.tools.needs.racing import NEEDED, NOT_NEEDED, OPEN, Effect
+from jaxnerf.tools.needs.trial import Result
+from jaxnerf.tools.needs.variants import COMPLETE, LESS, MORE, WITHOUT, Variant, complete
+
+LEAN = "lean"
+CURVE = (1 / 9, 1 / 3, 1.0, 3.0)  # lengths of the runs of the curve, over that of a trial
+_USED = 0.85  # of the budget, that the plan of two seeds and the lean model fills
+_LEAST_SECONDS, _TRIALS_OF_BUDGET = 1.0, 100  # a trial is at least a hundredth of the budget
+_ALIGNED_GAIN = 0.5  # dB that fitted colours gain, from which on all scores have them
+_REMEDY = "remove the folder, or give another --out"
+
+
+class Settings(NamedTuple):
+    """What a study is asked for.
+
+    Attributes:
+        budget: seconds of everything.
+        margin: dB that a needed part contributes at least.
+        equal: "seconds" or "steps", what paired runs have in common.
+        length: seconds of a trial; 0: as the budget allows.
+    """
+
+    budget: float
+    margin: float
+    equal: str = "seconds"
+    length: float = 0.0
+
+
+class Plan(NamedTuple):
+    """What is tried.
+
+    Attributes:
+        length: seconds of training of a trial.
+        steps: of a trial where steps are equal; 0: seconds are.
+        compiling: seconds until a variant can be trained and rendered.
+        tried: the slugs of the variants, those tried first in front.
+        spent: seconds before the first trial.
+    """
+
+    length: float
+    steps: int
+    compiling: float
+    tried: list[str]
+    spent: float
+
+
+class Row(NamedTuple):
+    """A variant in the table.
+
+    Attributes:
+        variant: that was tried.
+        effect: of its part; None: it was not tried, or could not be built.
+        verdict: "needed", "not needed" or "cannot tell".
+        note: why it was not tried; "" otherwise.
+        results: of its trials, by seed.
+    """
+
+    variant: Variant
+    effect: Effect | None
+    verdict: str
+    note: str
+    results: dict[int, Result]
+
+
+class Outcome(NamedTuple):
+    """What a study found.
+
+    Attributes:
+        plan: Plan.
+        rows: of all variants, in the order in which they were tried.
+        complete: the trials of the complete model, by seed.
+        lean: the variants that the lean model combines.
+        lean_effect: what the lean model loses, with the seeds of its trials; None: it is the complete model.
+        lean_results: by seed.
+        curve: {"complete" or "lean": [(seconds, dB)]}.
+        aligned: whether all scores have fitted colours.
+        spent: seconds.
+    """
+
+    plan: Plan
+    rows: list[Row]
+    complete: dict[int, Result]
+    lean: list[Variant]
+    lean_effect: Effect | None
+    lean_results: dict[int, Result]
+    curve: dict[str, list[tuple[float, float]]]
+    aligned: bool
+    spent: float
+
+
+Runner = Callable[..., tuple[Result, Sequence[np.ndarray]]]
+
+
+class Study:
+    """A study in a folder, which holds a file for each trial that is done, so that it resumes."""
+
+    def __init__(
+        self,
+        folder: pathlib.Path,
+        settings: Settings,
+        variants: Sequence[Variant],
+        run: Runner,
+        *,
+        forget: Callable[[Mapping[str, Any]], None] = lambda values: None,
+        say: Callable[[str], None] = print,
+    ):
+        """Begins or continues a study.
+
+        Args:
+            folder: exists; what it holds of an earlier start is used.
+            settings: of the study.
+            variants: those to be tried first in front.
+            run: (values, seed, seconds, steps=0, pose=False) -> Result and the images of the held-out views; see
+                `Trainer.run`.
+            forget: (values) frees what a variant that is decided keeps.
+            say: prints a line.
+        """
+        self.folder, self.settings, self.say = folder, settings, say
+        self._run, self._forget = run, forget
+        self._all = list(variants)
+        self.by_slug = {each.slug: each for each in [complete(), *variants]}
+        self._done: dict[tuple[str, int, float], Result] = {}
+        self.failed: dict[str, str] = {}
+        self._pose = any(each.aligned == "pose" for each in variants)
+        (folder / "trials").mkdir(exist_ok=True)
+
+    def search(self) -> Outcome:
+        """Runs all trials that are not done; returns what they say."""
+        self.plan = self._read_plan() or self._make_plan()
+        self._race()
+        lean, effect = self._find_lean()
+        curve = self._curve(lean)
+        return self._outcome(lean, effect, curve)
+
+    @property
+    def spent(self) -> float:
+        """Seconds that all trials so far have taken, in this start and in earlier ones."""
+        return self.plan.spent + sum(each.spent for each in self._done.values())
+
+    def _make_plan(self):
+        settings = self.settings
+        result, _ = self._run({}, 0, _LEAST_SECONDS)
+        compiling, scoring = result.compile_seconds, max(result.spent - result.compile_seconds - result.seconds, 0)
+        count, length = planned(settings, len(self._all), compiling, scoring)
+        tried, steps = [each.slug for each in self._all[:count]], 0
+        if settings.equal == "steps":
+            steps = max(round(result.steps * length / result.seconds), 1)
+        plan = Plan(length, steps, compiling + scoring, tried, result.spent)
+        write_text(self.folder / "plan.json", json.dumps(plan._asdict(), indent=1) + "\n")
+        return plan
+
+    def _read_plan(self):
+        path = self.folder / "plan.json"
+        return Plan(**read_json(path, _REMEDY)) if path.exists() else None
+
+    def trial(self, variant: Variant, seed: int, length: float) -> Result | None:
+        """Returns the result of a trial, which is run unless it is done; None if the variant fails."""
+        if variant.slug in self.failed:
+            return None
+        key = variant.slug, seed, length
+        if key in self._done:
+            return self._done[key]
+        name = f"{variant.slug}-{seed}-{length:.4g}"
+        path = self.folder / "trials" / f"{name}.json"
+        if not path.exists():
+            self._run_trial(variant, seed, length, path)
+        content = read_json(path, _REMEDY)
+        if "failed" in content:
+            self.failed[variant.slug] = content["failed"]
+            self._forget(variant.values)
+            return None
+        self._done[key] = Result(**content)
+        return self._done[key]
+
+    def _run_trial(self, variant, seed, length, path):
+        steps = round(self.plan.steps * length / self.plan.length)
+        pose = variant.aligned == "pose" or (variant.slug == COMPLETE and self._pose)
+        try:
+            result, images = self._run(variant.values, seed, length, steps=steps, pose=pose)
+        except ValueError as error:
+            if variant.slug == COMPLETE:
+                raise
+            self.say(f"{variant.name:32} cannot be tried: {error}")
+            write_text(path, json.dumps({"failed": str(error)}) + "\n")
+            return
+        if seed == 0 and length == self.plan.length:
+            with partial_file(path.with_suffix(".npz"), ".tmp.npz") as partial:
+                np.savez_compressed(partial, *images)
+        write_text(path, json.dumps(result._asdict()) + "\n")
+        self._say_trial(variant, seed, length, result)
+
+    def _say_trial(self, variant, seed, length, result):
+        base = self._done.get((COMPLETE, seed, length))
+        beside = ""
+        if base is not None and variant.slug != COMPLETE:
+            beside = f" {float(np.mean(self._contribution(variant, base, result))):+6.2f} dB"
+        self.say(
+            f"{self.spent + result.spent:6.0f} s  {variant.name:32} seed {seed}  {np.mean(result.psnr):6.2f} dB"
+            f"{beside or ' ' * 10}  {result.steps:,} steps in {result.seconds:.1f} s, compiled in "
+            f"{result.compile_seconds:.1f} s"
+        )
+
+    def results(self, variant: Variant) -> dict[int, Result]:
+        """Returns the trials of a variant of the usual length, by seed."""
+        found = {key[1]: each for key, each in self._done.items() if key[::2] == (variant.slug, self.plan.length)}
+        return dict(sorted(found.items()))
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the images' exposures differ so much that all scores need fitted colours."""
+        found = self.results(complete()).values()
+        gains = [np.mean(each.psnr_colors) - np.mean(each.psnr) for each in found]
+        return bool(gains) and float(np.mean(gains)) > _ALIGNED_GAIN
+
+    def _contribution(self, variant, base, other):
+        """Returns what a variant's part contributes to each view, dB."""
+        kind = variant.aligned or ("colors" if self.aligned else "")
+        name = f"psnr_{kind}" if kind else "psnr"
+        gained = np.subtract(getattr(other, name), getattr(base, name))
+        return gained if variant.adds else -gained
+
+    def differences(self, variant: Variant) -> Float[np.ndarray, "S V"]:
+        """Returns what the part of a variant contributes, dB [seeds, views]."""
+        base, found = self.results(complete()), self.results(variant)
+        return np.stack([self._contribution(variant, base[seed], found[seed]) for seed in found if seed in base])
+
+    def effects(self) -> dict[str, Effect]:
+        """Returns the effects of the variants that have been tried, by slug."""
+        tried = [self.by_slug[slug] for slug in self.plan.tried if self.results(self.by_slug[slug])]
+        return racing.effects({each.slug: self.differences(each) for each in tried})
+
+    def _race(self):
+        """Runs trials while a verdict is open and the budget lasts."""
+        while True:
+            done = {slug: len(self.results(each)) for slug, each in self.by_slug.items()}
+            following = racing.next_trial(done, self._open(done), COMPLETE)
+            if following is None:
+                return
+            slug, seed = following
+            compiles = 0.0 if done.get(slug) else self.plan.compiling
+            cost = self.plan.length + compiles + (self.plan.length if slug == COMPLETE else 0)
+            if done.get(COMPLETE, 0) > 1 and self.spent + cost + self._reserve() > self.settings.budget:
+                return
+            self.trial(self.by_slug[slug], seed, self.plan.length)
+
+    def _open(self, done):
+        """Returns the slugs of variants whose verdict is open, those nearest to a verdict first."""
+        known = self.effects()
+        waiting = [slug for slug in self.plan.tried if slug not in self.failed]
+        found = []
+        for slug in waiting:
+            looked = done.get(slug, 0) in racing.LOOKS or done.get(slug, 0) == 1
+            is_open = slug not in known or not looked or known[slug].verdict(self.settings.margin) == OPEN
+            if is_open:
+                found.append(slug)
+            elif done.get(slug, 0) > 1:
+                self._forget(self.by_slug[slug].values)
+        if any(slug not in known for slug in found):
+            return found  # in the order of the plan
+        return sorted(found, key=lambda slug: abs(known[slug].mean - self.settings.margin))
+
+    def _reserve(self):
+        """Returns the seconds that the lean model and the curve need."""
+        return self.plan.compiling + self.plan.length * (2 + 2 * (sum(CURVE) - 1))
+
+    def _find_lean(self):
+        """Returns the variants that the lean model combines, and what it loses."""
+        known, margin = self.effects(), self.settings.margin
+        wanted = [slug for slug, each in known.items() if _improves(self.by_slug[slug], each.verdict(margin))]
+        chosen = _one_each([self.by_slug[slug] for slug in sorted(wanted, key=lambda slug: self._gain(slug, known))])
+        while chosen:
+            lean = combined(chosen)
+            seeds = [seed for seed in list(self.results(complete()))[:2] if self.trial(lean, seed, self.plan.length)]
+            if seeds:
+                found = self.differences(lean)
+                effect = racing.effects({**self._all_differences(), lean.slug: found})[lean.slug]
+                if effect.mean <= margin and self._holds(lean):
+                    return chosen, effect
+            self._forget(lean.values)
+            chosen = chosen[: len(chosen) // 2]
+            if self.spent + self.plan.compiling + 2 * self.plan.length > self.settings.budget:
+                break
+        return [], None
+
+    def _all_differences(self):
+        return {slug: self.differences(self.by_slug[slug]) for slug in self.effects()}
+
+    def _holds(self, lean):
+        """Returns whether the lean model loses no more than the margin in the longest runs of the curve, too."""
+        length = self.plan.length * CURVE[-1]
+        base, other = (self.trial(each, 0, length) for each in (complete(), lean))
+        return other is not None and float(np.mean(self._contribution(lean, base, other))) <= self.settings.margin
+
+    def _gain(self, slug, known):
+        """Returns what a change to the lean model loses, dB; less is better."""
+        return -known[slug].mean if self.by_slug[slug].adds else known[slug].mean
+
+    def _curve(self, chosen):
+        models = {COMPLETE: complete(), **({LEAN: combined(chosen)} if chosen else {})}
+        curve = {}
+        for name, variant in models.items():
+            points = [(length, self.trial(variant, 0, length)) for length in np.multiply(CURVE, self.plan.length)]
+            curve[name] = [(result.seconds, float(np.mean(self._scores(result)))) for _, result in points if result]
+        return curve
+
+    def _scores(self, result):
+        return result.psnr_colors if self.aligned else result.psnr
+
+    def _outcome(self, lean, effect, curve):
+        known, rows = self.effects(), []
+        for variant in self._all:
+            found = known.get(variant.slug)
+            note = self.failed.get(variant.slug, "" if found else "not tried within this budget")
+            verdict = found.verdict(self.settings.margin) if found and not note else OPEN
+            rows.append(Row(variant, found, verdict, note, self.results(variant)))
+        results = self.results(combined(lean)) if lean else {}
+        return Outcome(
+            self.plan, rows, self.results(complete()), lean, effect, results, curve, self.aligned, self.spent
+        )
+
+
+def planned(settings: Settings, count: int, compiling: float, scoring: float) -> tuple[int, float]:
+    """Returns how many variants are tried, and the seconds of a trial.
+
+    Two seeds of each, the lean model and the curve fit into most of the budget. With more variants than fit, the last
+    ones are not tried.
+
+    Args:
+        settings: with the budget.
+        count: of all variants.
+        compiling: seconds of a variant's first trial that are not training.
+        scoring: of every trial.
+
+    Raises:
+        ValueError: if the budget does not suffice for one pair.
+    """
+    most = _USED * settings.budget
+    least = settings.length or max(_LEAST_SECONDS, settings.budget / _TRIALS_OF_BUDGET)
+    curve = 2 + 2 * (sum(CURVE) - 1)
+
+    def fixed(number):
+        return (number + 2) * compiling + (2 * number + 2 + 9) * scoring
+
+    def trials(number):
+        return 2 * (number + 1) + curve
+
+    fitting = [number for number in range(1, count + 1) if fixed(number) + trials(number) * least <= most]
+    if not fitting:
+        needed = (fixed(1) + trials(1) * least) / _USED
+        raise ValueError(
+            f"--budget is {settings.budget:.0f} s, expected at least {math.ceil(needed)} s for one pair of trials: "
+            f"compiling takes {compiling:.0f} s a model; give more, or images of fewer pixels by --config.data.factor"
+        )
+    number = fitting[-1]
+    return number, settings.length or (most - fixed(number)) / trials(number)
+
+
+def combined(variants: Sequence[Variant]) -> Variant:
+    """Returns the variant that makes all changes of some."""
+    values = {key: value for each in variants for key, value in each.values.items()}
+    before = {key: value for each in variants for key, value in each.before.items()}
+    names = "_".join(sorted(each.slug for each in variants))
+    aligned = "pose" if any(each.aligned == "pose" for each in variants) else ""
+    return Variant(
+        f"{LEAN}: {names}" if len(names) < 100 else f"{LEAN}: {len(variants)} changes", "", values, before, aligned
+    )
+
+
+def _improves(variant, verdict):
+    """Returns whether the lean model makes a variant's change."""
+    return verdict == (NEEDED if variant.adds else NOT_NEEDED)
+
+
+def _one_each(variants):
+    """Returns the variants without second changes of a part; removing it wins."""
+    best = {}
+    for each in variants:
+        other = best.get(each.part)
+        if other is None or (each.change == WITHOUT and other.change == LESS):
+            best[each.part] = each
+    return [each for each in variants if best[each.part] is each and each.change in (WITHOUT, LESS, MORE)]
