@@ -23,10 +23,10 @@ from PIL import Image
 from jaxnerf.core.cameras import pixel_grid, rays_from_pixels
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.types import Camera
-from jaxnerf.data import synthetic
 from jaxnerf.data.images.image_files import average_tiles, to_straight
 from jaxnerf.data.view_selection import held_out
 from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.tools.embedded_scene import render
 from test_scenes import analytic
 
 NUM_TRAIN, NUM_TEST, HOLD_OUT = 64, 4, 8
@@ -202,7 +202,7 @@ def _image(known, pose, size):
     if known.finish == "fog":
         pixels = _fog(jax.tree.map(lambda leaf: leaf[0], camera))
     else:
-        pixels = synthetic.render_views(camera, known.finish)
+        pixels = render.render_views(camera, known.finish)
     if known.behind != "alpha":
         values = pixels / 65535
         behind = _sky(camera) if known.behind == "sky" else 0.0
@@ -227,7 +227,7 @@ def _exact_fog(rays):
 
 def _sky(camera):
     """Returns the colours [H * W, 3] of the sphere along the rays of a camera [1] inside it."""
-    rays = synthetic.scene_rays(camera)
+    rays = render.scene_rays(camera)
     along = (rays.origins * rays.viewdirs).sum(axis=-1, keepdims=True)
     way = -along + np.sqrt(along**2 - (rays.origins**2).sum(axis=-1, keepdims=True) + _SKY**2)
     x, y, z = ((rays.origins + way * rays.viewdirs) / _SKY).T

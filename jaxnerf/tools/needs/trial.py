@@ -1,5 +1,6 @@
 """Trials: a model trained for some seconds and scored on views that are held out of training."""
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -94,10 +95,11 @@ class Trainer:
     Attributes:
         config: of the complete model, not resolved, with held-out views.
         views: of the split "train".
+        split: whose views are scored.
     """
 
-    def __init__(self, config: RunConfig, views: Views):
-        self.config, self.views = config, views
+    def __init__(self, config: RunConfig, views: Views, *, split: str = "held_out"):
+        self.config, self.views, self.split = config, views, split
         self._compiled: dict[str, _Compiled] = {}
         self._held_out: dict[str, Views] = {}
 
@@ -156,7 +158,7 @@ class Trainer:
     def _views_held_out(self, experiment) -> Views:
         key = repr((experiment.config.data, "image_index" in experiment.model.needs))
         if key not in self._held_out:
-            self._held_out[key] = experiment.load_split("held_out", max_views=_MOST_VIEWS)
+            self._held_out[key] = experiment.load_split(self.split, max_views=_MOST_VIEWS)
         return self._held_out[key]
 
 
@@ -203,7 +205,7 @@ class _Compiled:
         if steps:
             data = _of_steps(data, steps)
         config = replaced(self._experiment.config, seed=seed)
-        reinitialize = make_reinitializer(self._experiment._replace(config=config), "this dataset")
+        reinitialize = make_reinitializer(dataclasses.replace(self._experiment, config=config), "this dataset")
         clock, done, metrics = _Clock(), 0, None
         pace = Pace(options, clock, data)
         take = step.of(1)
