@@ -22,6 +22,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.evaluation.output_images import to_8_bits
 from jaxnerf.runtime.atomic_files import partial_file, write_text
 from jaxnerf.tools.needs.study import LEAN, Outcome, Row, Settings
+from jaxnerf.tools.needs.trial import stride
 from jaxnerf.tools.needs.variants import COMPLETE
 from jaxnerf.training.config import RunConfig
 
@@ -125,10 +126,9 @@ def _all_rows(outcome):
     for row in outcome.rows:
         yield cells(row)
     if outcome.lean:
-        effect = outcome.lean_effect
-        interval = f"{-effect.upper:+.2f} to {-effect.lower:+.2f}" if math.isfinite(effect.lower) else "unknown"
-        numbers = measured(list(outcome.lean_results.values()))
-        yield _model_cells(LEAN, f"{-effect.mean:+.2f} beside complete", outcome.lean_results, interval)
+        for name, result in outcome.longest.items():
+            scored = f"after {result.seconds:.0f} s, images not shrunk: {outcome.curve[name][-1][1]:.2f} dB"
+            yield _model_cells(name, scored, {0: result}, "")
 
 
 def _model_cells(name, change, results, interval):
@@ -217,8 +217,13 @@ def results(outcome: Outcome, settings: Settings) -> dict[str, Any]:
         "lean": {
             "parts": [each.name for each in outcome.lean],
             "effect": lean_effect,
-            **(measured(list(outcome.lean_results.values())) if outcome.lean_results else {}),
+            **(measured([outcome.longest[LEAN]]) if outcome.lean else {}),
         },
+        "refused": [
+            {"parts": [each.name for each in parts], "effect": _finite(effect._asdict())}
+            for parts, effect in outcome.refused
+        ],
+        "complete_in_longest": measured([outcome.longest[COMPLETE]]),
         "curve": outcome.curve,
         "aligned_colors": outcome.aligned,
         "spent": outcome.spent,
@@ -253,21 +258,28 @@ def config_file(asked: RunConfig, lean: RunConfig, outcome: Outcome) -> str:
 
 def _lean_lines(outcome):
     """Returns lines about the lean model."""
-    if not outcome.lean:
-        return ["lean          the complete model: nothing was shown to be dispensable, or to pay"]
-    names = "; ".join(each.name for each in outcome.lean)
-    effect = outcome.lean_effect
-    complete, lean = (measured(list(each.values())) for each in (outcome.complete, outcome.lean_results))
-    saved = [
-        f"{title} {100 * (lean[name] / complete[name] - 1):+.0f} %"
-        for name, title in (
-            ("ms_per_step", "time of a step"),
-            ("parameters", "parameters"),
-            ("memory", "memory"),
-            ("frame_seconds", "time of a frame"),
-        )
+    seconds = outcome.longest[COMPLETE].seconds
+    lines = [
+        f"refused       {'; '.join(each.name for each in parts)}: together they lose {effect.mean:.2f} dB after "
+        f"{seconds:.0f} s with images that are not shrunk"
+        for parts, effect in outcome.refused
     ]
-    return [f"lean          {names}: {-effect.mean:+.2f} dB beside the complete model, {', '.join(saved)}"]
+    if not outcome.lean:
+        return [*lines, "lean          the complete model: nothing was shown to be dispensable, or to pay"]
+    complete, lean = (measured([outcome.longest[name]]) for name in (COMPLETE, LEAN))
+    titles = {
+        "ms_per_step": "time of a step",
+        "parameters": "parameters",
+        "memory": "memory",
+        "frame_seconds": "time of a frame",
+    }
+    saved = [f"{title} {100 * (lean[name] / complete[name] - 1):+.0f} %" for name, title in titles.items()]
+    names = "; ".join(each.name for each in outcome.lean)
+    return [
+        *lines,
+        f"lean          {names}: {-outcome.lean_effect.mean:+.2f} dB beside the complete model after {seconds:.0f} s, "
+        f"{', '.join(saved)}",
+    ]
 
 
 def _plot(folder, outcome):
@@ -301,7 +313,7 @@ def _images(folder, outcome, held_out):
             continue
         errors = [float(np.mean((np.float32(a) - np.float32(b)) ** 2)) for a, b in zip(base, other, strict=True)]
         index = int(np.argmax(errors))
-        every = -(-int(held_out.size[index][0]) // base[index].shape[0])
+        every = stride(held_out, index)
         truth = to_8_bits(held_out.image(index))[::every, ::every]
         strip = np.concatenate([truth, base[index], other[index]], axis=1)
         name = held_out.names[index] if held_out.names else str(index)
@@ -346,7 +358,7 @@ def _page(outcome, settings, asked, plot, images):
         f"<h1>What {dataset} needs</h1>",
         f"<p>{html.escape(explanation(outcome, settings))}</p>",
         f"<table><tr>{heads}</tr>{body}</table>",
-        f"<h2>The lean model</h2><p>{html.escape(' '.join(_lean_lines(outcome))[14:])}. <code>lean.py</code> beside "
+        f"<h2>The lean model</h2><p>{html.escape('. '.join(_lean_lines(outcome)))}. <code>lean.py</code> beside "
         "this page is its config, of the original length.</p>",
         "<h2>What each second buys</h2>",
         _embedded(plot.read_bytes()) if plot else "",

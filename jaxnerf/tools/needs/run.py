@@ -1,11 +1,13 @@
 """Finds what the scene of a dataset needs, from the dataset to the files of the result."""
 
+import functools
 import json
 import math
 import os
 import pathlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from jaxnerf.core.views import Views
@@ -14,8 +16,8 @@ from jaxnerf.registry import needs_folder
 from jaxnerf.runtime.atomic_files import read_json, write_text
 from jaxnerf.tools.needs import page
 from jaxnerf.tools.needs.study import Outcome, Settings, Study
-from jaxnerf.tools.needs.trial import Trainer
-from jaxnerf.tools.needs.variants import Variant, facts_of, find_variants
+from jaxnerf.tools.needs.trial import Trainer, seconds
+from jaxnerf.tools.needs.variants import facts_of, find_variants
 from jaxnerf.training import auto_config
 from jaxnerf.training.config import Config, RunConfig, changed, read_config
 from jaxnerf.training.workdir import workdir_lock
@@ -53,38 +55,50 @@ def find_needs(request: Request, out: str | os.PathLike) -> Outcome:
         ValueError: if the dataset has too few views, does not train, or the budget is too small; if the folder holds a
             study of something else.
     """
-    asked = read_config(request.config)
-    config, views, full = _with_held_out(asked)
+    started, asked = seconds(), read_config(request.config)
+    config, views, resolved = _with_held_out(asked)
+    full = Trainer(config, views)
+    full_variants = {each.slug: each for each in find_variants(resolved.config, facts_of(*resolved[:2]))}
     factor = request.shrink or shrink_factor(views, request.settings.budget)
-    config, views = _shrunk(config, views, factor)
-    trainer = Trainer(config, views)
+    trainer = full
+    if factor > 1:
+        trainer = Trainer(*_shrunk(config, factor))
+        resolved = trainer.resolved({})
     held_out = trainer.held_out()
     _check_images(held_out, config)
-    resolved = trainer.resolved({})
-    variants = _chosen(find_variants(resolved.config, facts_of(resolved.config, resolved.views)), request.parts)
+    variants = _chosen(find_variants(resolved.config, facts_of(*resolved[:2])), request.parts)
     folder = pathlib.Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     with workdir_lock(folder):
         _check_origin(folder, request, resolved.config)
-        print(
-            f"images        {len(views.size)} for training, {len(held_out.size)} held out, "
-            f"{views.size[0][1]} x {views.size[0][0]} px{f', shrunk by {factor}' if factor > 1 else ''}"
+        if jax.default_backend() == "cpu":  # other programs seldom use an accelerator
+            trainer.pacer = full.pacer = trainer.make_pacer(folder / "pace.json")
+        _say(_images_line(trainer.views, held_out, factor))
+        study = Study(
+            folder,
+            request.settings,
+            variants,
+            trainer,
+            full=(full, full_variants),
+            check=functools.partial(_check_trained, held_out),
+            say=_say,
+            started=max(seconds() - started, 0),
         )
-        study = Study(folder, request.settings, variants, trainer.run, forget=trainer.forget, say=_say)
         outcome = study.search()
-        _check_trained(outcome, held_out, views)
-        full_variants = {each.slug: each for each in find_variants(full.config, facts_of(full.config, full.views))}
-        lean = changed(asked, _values([full_variants.get(each.slug, each) for each in outcome.lean]))
+        lean = changed(asked, {key: value for each in outcome.lean for key, value in each.values.items()})
         page.write(folder, outcome, request.settings, asked, lean, held_out)
     return outcome
 
 
+def _images_line(views, held_out, factor):
+    sides = sorted({f"{width} x {height} px" for height, width in views.size.tolist()})
+    shrunk = f", shrunk by {factor}; the curve is of those that are not" if factor > 1 else ""
+    sizes = " and ".join(sides[:3]) + (f" and {len(sides) - 3} other sizes" if len(sides) > 3 else "")
+    return f"images        {len(views.size)} for training, {len(held_out.size)} held out, {sizes}{shrunk}"
+
+
 def _say(line):
     print(line, flush=True)
-
-
-def _values(variants: list[Variant]) -> dict[str, Any]:
-    return {key: value for each in variants for key, value in each.values.items()}
 
 
 def _with_held_out(config: RunConfig):
@@ -95,8 +109,8 @@ def _with_held_out(config: RunConfig):
         count = len((views or dataset.load_split(data, "train")).size)
         if count < _LEAST_VIEWS:
             raise ValueError(
-                f"{config.data.dir or config.data.format}: has {count} training views, expected at least "
-                f"{_LEAST_VIEWS}, as some are held out to judge the others by; add images"
+                f"{config.data.dir or config.data.format}: has {count} training view{'s' * (count != 1)}, expected at "
+                f"least {_LEAST_VIEWS}, as some are held out to judge the others by; add images"
             )
         config = changed(config, {"data.hold_out": min(max(count // 4, 2), 8)})
     full = auto_config.resolve(config)
@@ -115,9 +129,8 @@ def shrink_factor(views: Views, budget: float) -> int:
     return max(min(factor, int(side // _LEAST_SIDE)), 1)
 
 
-def _shrunk(config, views, factor):
-    if factor == 1:
-        return config, views
+def _shrunk(config, factor):
+    """Returns the config with images that are shrunk by a further factor, and its Views."""
     if needs_folder(config.data.format):
         data, _, _ = dataset.resolve(config.data)
         config = changed(config, {"data.factor": data.factor * factor})
@@ -138,17 +151,16 @@ def _check_images(held_out, config):
         )
 
 
-def _check_trained(outcome, held_out, views):
-    """Raises a ValueError if the complete model is no better than one colour."""
+def _check_trained(held_out, result):
+    """Raises a ValueError if the complete model is no better than the best colour for each image."""
     errors = []
     for index in range(len(held_out.size)):
         image = np.asarray(held_out.image(index)).reshape(-1, 3)
         errors.append(-10 * math.log10(max(float(image.var(axis=0).mean()), 1e-10)))
-    found = np.mean([np.mean(each.psnr) for each in outcome.complete.values()])
-    if found < np.mean(errors) + _LEAST_GAIN:
+    if np.mean(result.psnr) < np.mean(errors) + _LEAST_GAIN:
         raise ValueError(
-            f"the complete model has {found:.1f} dB after {outcome.plan.length:.1f} s, and one colour "
-            f"{np.mean(errors):.1f} dB: it does not train, so no part can be judged; check the dataset with "
+            f"the complete model has {np.mean(result.psnr):.1f} dB after {result.seconds:.1f} s, and one colour for "
+            f"each image {np.mean(errors):.1f} dB: it does not train, so no part can be judged; check the dataset with "
             "jaxnerf-check, or give a larger --budget and another --out"
         )
 

@@ -1,5 +1,6 @@
 """Finds what a scene needs: trials of the complete model and of its variants, until the budget is spent."""
 
+import contextlib
 import json
 import math
 import pathlib
@@ -16,10 +17,12 @@ from jaxnerf.tools.needs.trial import Result
 from jaxnerf.tools.needs.variants import COMPLETE, LESS, MORE, WITHOUT, Variant, complete
 
 LEAN = "lean"
-CURVE = (1 / 9, 1 / 3, 1.0, 3.0)  # lengths of the runs of the curve, over that of a trial
-_USED = 0.85  # of the budget, that the plan of two seeds and the lean model fills
+CURVE = (1 / 27, 1 / 9, 1 / 3, 1.0)  # lengths of the runs of the curve, over the longest one
+_TWO_SEEDS, _ALL_SEEDS = 0.68, 0.75  # of the budget, that two seeds of each variant fill, and all seeds at most
 _LEAST_SECONDS, _TRIALS_OF_BUDGET = 1.0, 100  # a trial is at least a hundredth of the budget
 _ALIGNED_GAIN = 0.5  # dB that fitted colours gain, from which on all scores have them
+_PACED = 1.2  # seconds of a trial that measures the machine's speed, over its own
+_FULL = "full_"  # before the names of trials whose images are not shrunk
 _REMEDY = "remove the folder, or give another --out"
 
 
@@ -46,6 +49,7 @@ class Plan(NamedTuple):
         length: seconds of training of a trial.
         steps: of a trial where steps are equal; 0: seconds are.
         compiling: seconds until a variant can be trained and rendered.
+        scoring: seconds of a trial that are neither that nor training.
         tried: the slugs of the variants, those tried first in front.
         spent: seconds before the first trial.
     """
@@ -53,6 +57,7 @@ class Plan(NamedTuple):
     length: float
     steps: int
     compiling: float
+    scoring: float
     tried: list[str]
     spent: float
 
@@ -83,9 +88,10 @@ class Outcome(NamedTuple):
         rows: of all variants, in the order in which they were tried.
         complete: the trials of the complete model, by seed.
         lean: the variants that the lean model combines.
-        lean_effect: what the lean model loses, with the seeds of its trials; None: it is the complete model.
-        lean_results: by seed.
-        curve: {"complete" or "lean": [(seconds, dB)]}.
+        lean_effect: what it loses in the longest run of the curve; None: it is the complete model.
+        refused: combinations that lose more than the margin there, with their effect.
+        longest: the results of the longest run, of "complete" and "lean".
+        curve: {"complete" or "lean": [(seconds, dB)]}, of images that are not shrunk.
         aligned: whether all scores have fitted colours.
         spent: seconds.
     """
@@ -95,13 +101,11 @@ class Outcome(NamedTuple):
     complete: dict[int, Result]
     lean: list[Variant]
     lean_effect: Effect | None
-    lean_results: dict[int, Result]
+    refused: list[tuple[list[Variant], Effect]]
+    longest: dict[str, Result]
     curve: dict[str, list[tuple[float, float]]]
     aligned: bool
     spent: float
-
-
-Runner = Callable[..., tuple[Result, Sequence[np.ndarray]]]
 
 
 class Study:
@@ -112,10 +116,12 @@ class Study:
         folder: pathlib.Path,
         settings: Settings,
         variants: Sequence[Variant],
-        run: Runner,
+        trainer: Any,
         *,
-        forget: Callable[[Mapping[str, Any]], None] = lambda values: None,
+        full: tuple[Any, Mapping[str, Variant]] | None = None,
+        check: Callable[[Result], None] = lambda result: None,
         say: Callable[[str], None] = print,
+        started: float = 0.0,
     ):
         """Begins or continues a study.
 
@@ -123,14 +129,16 @@ class Study:
             folder: exists; what it holds of an earlier start is used.
             settings: of the study.
             variants: those to be tried first in front.
-            run: (values, seed, seconds, steps=0, pose=False) -> Result and the images of the held-out views; see
-                `Trainer.run`.
-            forget: (values) frees what a variant that is decided keeps.
+            trainer: with the functions `run` and `forget` of a `Trainer`.
+            full: a trainer with images that are not shrunk, and the variants there, by slug; None: as the others.
+            check: called with the first result of the complete model; raises a ValueError if it does not suffice.
             say: prints a line.
+            started: seconds that the program has taken so far.
         """
         self.folder, self.settings, self.say = folder, settings, say
-        self._run, self._forget = run, forget
-        self._all = list(variants)
+        self._trainer, self._check = trainer, check
+        self._full_trainer, self._full = full or (trainer, {each.slug: each for each in variants})
+        self._all, self._started = list(variants), started
         self.by_slug = {each.slug: each for each in [complete(), *variants]}
         self._done: dict[tuple[str, int, float], Result] = {}
         self.failed: dict[str, str] = {}
@@ -141,9 +149,7 @@ class Study:
         """Runs all trials that are not done; returns what they say."""
         self.plan = self._read_plan() or self._make_plan()
         self._race()
-        lean, effect = self._find_lean()
-        curve = self._curve(lean)
-        return self._outcome(lean, effect, curve)
+        return self._outcome(*self._find_lean())
 
     @property
     def spent(self) -> float:
@@ -152,58 +158,75 @@ class Study:
 
     def _make_plan(self):
         settings = self.settings
-        result, _ = self._run({}, 0, _LEAST_SECONDS)
+        result, _ = self._trainer.run({}, 0, _LEAST_SECONDS)
         compiling, scoring = result.compile_seconds, max(result.spent - result.compile_seconds - result.seconds, 0)
         count, length = planned(settings, len(self._all), compiling, scoring)
-        tried, steps = [each.slug for each in self._all[:count]], 0
-        if settings.equal == "steps":
-            steps = max(round(result.steps * length / result.seconds), 1)
-        plan = Plan(length, steps, compiling + scoring, tried, result.spent)
+        steps = max(round(result.steps * length / result.seconds), 1) if settings.equal == "steps" else 0
+        tried = [each.slug for each in self._all[:count]]
+        plan = Plan(length, steps, compiling, scoring, tried, self._started + result.spent)
         write_text(self.folder / "plan.json", json.dumps(plan._asdict(), indent=1) + "\n")
         return plan
 
     def _read_plan(self):
         path = self.folder / "plan.json"
-        return Plan(**read_json(path, _REMEDY)) if path.exists() else None
+        if not path.exists():
+            return None
+        plan = Plan(**read_json(path, _REMEDY))
+        # A larger budget than before tries more.
+        settings = self.settings._replace(length=plan.length)
+        count = len(plan.tried)
+        with contextlib.suppress(ValueError):
+            count = max(count, planned(settings, len(self._all), plan.compiling, plan.scoring)[0])
+        return plan._replace(tried=[each.slug for each in self._all[:count]])
 
-    def trial(self, variant: Variant, seed: int, length: float) -> Result | None:
-        """Returns the result of a trial, which is run unless it is done; None if the variant fails."""
+    def trial(self, variant: Variant, seed: int, length: float, *, full: bool = False) -> Result | None:
+        """Returns the result of a trial, which is run unless it is done; None if the variant fails.
+
+        Args:
+            variant: that is trained.
+            seed: of the run.
+            length: seconds of training.
+            full: whether images are not shrunk, and time is what runs have in common.
+        """
         if variant.slug in self.failed:
             return None
-        key = variant.slug, seed, length
+        key = f"{_FULL}{variant.slug}" if full else variant.slug, seed, length
         if key in self._done:
             return self._done[key]
-        name = f"{variant.slug}-{seed}-{length:.4g}"
+        name = f"{key[0]}-{seed}-{length:.4g}"
         path = self.folder / "trials" / f"{name}.json"
         if not path.exists():
-            self._run_trial(variant, seed, length, path)
+            self._run_trial(variant, seed, length, path, full)
         content = read_json(path, _REMEDY)
         if "failed" in content:
             self.failed[variant.slug] = content["failed"]
-            self._forget(variant.values)
+            self._trainer.forget(variant.values)
             return None
         self._done[key] = Result(**content)
+        if variant.slug == COMPLETE and not full:
+            self._check(self._done[key])
         return self._done[key]
 
-    def _run_trial(self, variant, seed, length, path):
-        steps = round(self.plan.steps * length / self.plan.length)
+    def _run_trial(self, variant, seed, length, path, full):
+        steps = 0 if full else round(self.plan.steps * length / self.plan.length)
         pose = variant.aligned == "pose" or (variant.slug == COMPLETE and self._pose)
         try:
-            result, images = self._run(variant.values, seed, length, steps=steps, pose=pose)
+            trainer = self._full_trainer if full else self._trainer
+            result, images = trainer.run(variant.values, seed, length, steps=steps, pose=pose)
         except ValueError as error:
             if variant.slug == COMPLETE:
                 raise
             self.say(f"{variant.name:32} cannot be tried: {error}")
             write_text(path, json.dumps({"failed": str(error)}) + "\n")
             return
-        if seed == 0 and length == self.plan.length:
+        if seed == 0 and length == self.plan.length and not full:
             with partial_file(path.with_suffix(".npz"), ".tmp.npz") as partial:
                 np.savez_compressed(partial, *images)
         write_text(path, json.dumps(result._asdict()) + "\n")
-        self._say_trial(variant, seed, length, result)
+        self._say_trial(variant, (f"{_FULL}{COMPLETE}" if full else COMPLETE, seed, length), result)
 
-    def _say_trial(self, variant, seed, length, result):
-        base = self._done.get((COMPLETE, seed, length))
+    def _say_trial(self, variant, key, result):
+        base, seed = self._done.get(key), key[1]
         beside = ""
         if base is not None and variant.slug != COMPLETE:
             beside = f" {float(np.mean(self._contribution(variant, base, result))):+6.2f} dB"
@@ -251,8 +274,8 @@ class Study:
                 return
             slug, seed = following
             compiles = 0.0 if done.get(slug) else self.plan.compiling
-            cost = self.plan.length + compiles + (self.plan.length if slug == COMPLETE else 0)
-            if done.get(COMPLETE, 0) > 1 and self.spent + cost + self._reserve() > self.settings.budget:
+            cost = (_PACED * self.plan.length + self.plan.scoring) * (2 if slug == COMPLETE else 1) + compiles
+            if self.spent + cost > _ALL_SEEDS * self.settings.budget:
                 return
             self.trial(self.by_slug[slug], seed, self.plan.length)
 
@@ -267,76 +290,78 @@ class Study:
             if is_open:
                 found.append(slug)
             elif done.get(slug, 0) > 1:
-                self._forget(self.by_slug[slug].values)
+                self._trainer.forget(self.by_slug[slug].values)
         if any(slug not in known for slug in found):
             return found  # in the order of the plan
         return sorted(found, key=lambda slug: abs(known[slug].mean - self.settings.margin))
 
-    def _reserve(self):
-        """Returns the seconds that the lean model and the curve need."""
-        return self.plan.compiling + self.plan.length * (2 + 2 * (sum(CURVE) - 1))
-
     def _find_lean(self):
-        """Returns the variants that the lean model combines, and what it loses."""
+        """Returns the variants that the lean model combines, its effect, what was refused, and the longest length.
+
+        Images are as large as the run's own here, and the longest runs take what is left of the budget, as what short
+        runs of small images do without may be missed later.
+        """
         known, margin = self.effects(), self.settings.margin
         wanted = [slug for slug, each in known.items() if _improves(self.by_slug[slug], each.verdict(margin))]
-        chosen = _one_each([self.by_slug[slug] for slug in sorted(wanted, key=lambda slug: self._gain(slug, known))])
-        while chosen:
-            lean = combined(chosen)
-            seeds = [seed for seed in list(self.results(complete()))[:2] if self.trial(lean, seed, self.plan.length)]
-            if seeds:
-                found = self.differences(lean)
-                effect = racing.effects({**self._all_differences(), lean.slug: found})[lean.slug]
-                if effect.mean <= margin and self._holds(lean):
-                    return chosen, effect
-            self._forget(lean.values)
-            chosen = chosen[: len(chosen) // 2]
-            if self.spent + self.plan.compiling + 2 * self.plan.length > self.settings.budget:
+        chosen = _one_each([self._full.get(slug, self.by_slug[slug]) for slug in wanted])
+        smaller = [each for each in chosen if each.change != LESS]
+        length, refused = self._longest(), []
+        base = self.trial(complete(), 0, length, full=True)
+        for each in [chosen, smaller] if len(smaller) < len(chosen) else [chosen]:
+            lean = combined(each)
+            if not each or (refused and self.spent + self.plan.compiling + length > self.settings.budget):
                 break
-        return [], None
+            other = self.trial(lean, 0, length, full=True)
+            if other is None:
+                continue
+            found = self._contribution(lean, base, other)[None]
+            effect = racing.effects({**{slug: self.differences(self.by_slug[slug]) for slug in known}, LEAN: found})[
+                LEAN
+            ]
+            if effect.mean <= margin:
+                return each, effect, refused, length
+            refused.append((each, effect))
+        return [], None, refused, length
 
-    def _all_differences(self):
-        return {slug: self.differences(self.by_slug[slug]) for slug in self.effects()}
+    def _longest(self):
+        """Returns the seconds of the longest runs of the curve, which take what is left of the budget."""
+        path = self.folder / "curve.json"
+        if not path.exists():
+            left = self.settings.budget - self.spent - 3 * self.plan.compiling
+            length = max(left / _PACED / (3 + 2 * (sum(CURVE) - 1)), self.plan.length, _LEAST_SECONDS)
+            write_text(path, json.dumps({"length": length}) + "\n")
+        return float(read_json(path, _REMEDY)["length"])
 
-    def _holds(self, lean):
-        """Returns whether the lean model loses no more than the margin in the longest runs of the curve, too."""
-        length = self.plan.length * CURVE[-1]
-        base, other = (self.trial(each, 0, length) for each in (complete(), lean))
-        return other is not None and float(np.mean(self._contribution(lean, base, other))) <= self.settings.margin
-
-    def _gain(self, slug, known):
-        """Returns what a change to the lean model loses, dB; less is better."""
-        return -known[slug].mean if self.by_slug[slug].adds else known[slug].mean
-
-    def _curve(self, chosen):
+    def _curve(self, chosen, longest):
         models = {COMPLETE: complete(), **({LEAN: combined(chosen)} if chosen else {})}
-        curve = {}
+        curve, last = {}, {}
         for name, variant in models.items():
-            points = [(length, self.trial(variant, 0, length)) for length in np.multiply(CURVE, self.plan.length)]
-            curve[name] = [(result.seconds, float(np.mean(self._scores(result)))) for _, result in points if result]
-        return curve
+            points = [self.trial(variant, 0, fraction * longest, full=True) for fraction in CURVE]
+            curve[name] = [(each.seconds, float(np.mean(self._scores(each)))) for each in points]
+            last[name] = points[-1]
+        return curve, last
 
     def _scores(self, result):
         return result.psnr_colors if self.aligned else result.psnr
 
-    def _outcome(self, lean, effect, curve):
+    def _outcome(self, lean, effect, refused, longest):
         known, rows = self.effects(), []
+        curve, last = self._curve(lean, longest)
         for variant in self._all:
             found = known.get(variant.slug)
             note = self.failed.get(variant.slug, "" if found else "not tried within this budget")
             verdict = found.verdict(self.settings.margin) if found and not note else OPEN
             rows.append(Row(variant, found, verdict, note, self.results(variant)))
-        results = self.results(combined(lean)) if lean else {}
+        aligned = self.aligned
         return Outcome(
-            self.plan, rows, self.results(complete()), lean, effect, results, curve, self.aligned, self.spent
+            self.plan, rows, self.results(complete()), lean, effect, refused, last, curve, aligned, self.spent
         )
 
 
 def planned(settings: Settings, count: int, compiling: float, scoring: float) -> tuple[int, float]:
     """Returns how many variants are tried, and the seconds of a trial.
 
-    Two seeds of each, the lean model and the curve fit into most of the budget. With more variants than fit, the last
-    ones are not tried.
+    Two seeds of each fit into a good part of the budget. With more variants than fit, the last ones are not tried.
 
     Args:
         settings: with the budget.
@@ -347,22 +372,21 @@ def planned(settings: Settings, count: int, compiling: float, scoring: float) ->
     Raises:
         ValueError: if the budget does not suffice for one pair.
     """
-    most = _USED * settings.budget
+    most = _TWO_SEEDS * settings.budget
     least = settings.length or max(_LEAST_SECONDS, settings.budget / _TRIALS_OF_BUDGET)
-    curve = 2 + 2 * (sum(CURVE) - 1)
 
     def fixed(number):
-        return (number + 2) * compiling + (2 * number + 2 + 9) * scoring
+        return (number + 1) * compiling + 2 * (number + 1) * scoring
 
     def trials(number):
-        return 2 * (number + 1) + curve
+        return _PACED * 2 * (number + 1)
 
     fitting = [number for number in range(1, count + 1) if fixed(number) + trials(number) * least <= most]
     if not fitting:
-        needed = (fixed(1) + trials(1) * least) / _USED
+        needed = (fixed(1) + trials(1) * (settings.length or _LEAST_SECONDS)) / _TWO_SEEDS
         raise ValueError(
-            f"--budget is {settings.budget:.0f} s, expected at least {math.ceil(needed)} s for one pair of trials: "
-            f"compiling takes {compiling:.0f} s a model; give more, or images of fewer pixels by --config.data.factor"
+            f"--budget is {settings.budget:.0f} s, expected at least {math.ceil(needed)} s for one pair of trials, as "
+            f"compiling takes {compiling:.0f} s a model"
         )
     number = fitting[-1]
     return number, settings.length or (most - fixed(number)) / trials(number)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import pathlib
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from jaxnerf.evaluation.output_images import to_8_bits
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.options import replaced
 from jaxnerf.runtime import cores
+from jaxnerf.tools.needs.pacing import PacedClock, Pacer
 from jaxnerf.tools.needs.view_poses import aligned_views
 from jaxnerf.training import auto_config, build
 from jaxnerf.training.compiled_step import CompiledStep, compile_training
@@ -40,8 +42,8 @@ _CHECK_EVERY = 8  # steps between readings of the clock
 def seconds() -> float:
     """Returns the time of a clock that trials are measured with.
 
-    On one CPU core it counts the CPU time of this process, so that other processes count little. On several cores and
-    on accelerators it is the time that passes.
+    On one CPU core it is the CPU time of this process, so that other processes count little, see also `pacing`. On
+    several cores and on accelerators it is the time that passes.
     """
     return time.process_time() if counts_cpu_time() else time.perf_counter()
 
@@ -79,28 +81,20 @@ class Result(NamedTuple):
     memory: float
 
 
-class _Clock:
-    """The seconds of training, as `pace.Clock` has them, of the clock of trials."""
-
-    def __init__(self):
-        self._started = seconds()
-
-    def seconds(self):
-        return seconds() - self._started
-
-
 class Trainer:
     """Trains and scores variants of a run on one dataset.
 
     Attributes:
         config: of the complete model, not resolved, with held-out views.
         views: of the split "train".
+        pacer: of the machine's speed; None: seconds are those of the clock.
         split: whose views are scored.
     """
 
-    def __init__(self, config: RunConfig, views: Views, *, split: str = "held_out"):
-        self.config, self.views, self.split = config, views, split
+    def __init__(self, config: RunConfig, views: Views, pacer: Pacer | None = None, *, split: str = "held_out"):
+        self.config, self.views, self.pacer, self.split = config, views, pacer, split
         self._compiled: dict[str, _Compiled] = {}
+        self._compiling: dict[str, float] = {}  # seconds that no result has reported yet
         self._held_out: dict[str, Views] = {}
 
     def resolved(self, values: Mapping[str, Any]) -> auto_config.Resolved:
@@ -125,30 +119,39 @@ class Trainer:
         Raises:
             ValueError: if the variant cannot be built, or does not train.
         """
-        began, compiled_before = seconds(), 0.0
-        key = repr(sorted(values.items()))
-        compiled = self._compiled.get(key)
-        if compiled is None:
-            config, views, _ = self.resolved(values)
-            compiled = self._compiled[key] = _Compiled(config, views, self._views_held_out)
-            compiled_before = compiled.compile_seconds
-        state, done, took = compiled.train(seed, length, steps)
+        compiled = self._of(values)
+        compiling = self._compiling.pop(_key(values), 0.0)
+        began = seconds() - compiling
+        state, done, took = compiled.train(seed, length, steps, self.pacer)
         scores, images, frame = compiled.score(state, pose)
         result = Result(
             **scores,
             steps=done,
             seconds=took,
             spent=seconds() - began,
-            compile_seconds=compiled_before,
+            compile_seconds=compiling,
             frame_seconds=frame,
             parameters=compiled.parameters,
             memory=compiled.memory,
         )
         return result, images
 
+    def make_pacer(self, file: pathlib.Path) -> Pacer:
+        """Makes the pacer that takes steps of the complete model; file: see `Pacer`."""
+        return Pacer(self._of({}).taker(), seconds, file)
+
+    def _of(self, values):
+        key = _key(values)
+        if key not in self._compiled:
+            began = seconds()
+            config, views, _ = self.resolved(values)
+            self._compiled[key] = _Compiled(config, views, self._views_held_out)
+            self._compiling[key] = seconds() - began
+        return self._compiled[key]
+
     def forget(self, values: Mapping[str, Any]) -> None:
         """Frees the compiled program of a variant."""
-        self._compiled.pop(repr(sorted(values.items())), None)
+        self._compiled.pop(_key(values), None)
 
     def held_out(self) -> Views:
         """Returns the held-out views of the complete model that are scored."""
@@ -173,7 +176,6 @@ class _Compiled:
     """A variant's compiled program of training, and its renderer."""
 
     def __init__(self, config: RunConfig, views: Views, held_out: Callable[[Any], Views]):
-        began = seconds()
         # The length of a trial is no part of what is resolved: the complete run's length says what is inferred.
         train = replaced(
             config.train, max_steps=UNLIMITED_STEPS, lr_steps=UNLIMITED_STEPS, max_seconds=1e6, max_reinits=3
@@ -192,11 +194,23 @@ class _Compiled:
         cull = model.cull and jax.jit(lambda variables, rays: model.cull(variables[1], rays))
         self._run = _Run(experiment, image_renderer(part, config.eval.chunk, cull))
         create = jax.jit(lambda seed, cells: create_state(model, experiment.optimizer, seed, cells))
-        self._create = lambda seed: jax.block_until_ready(create(seed, self._cells))
-        self._view((image_params(state), state.grid), self._held_out, 0)
-        self.compile_seconds = seconds() - began
+        shardings = jax.tree.map(lambda leaf: leaf.sharding, state)
+        self._create = lambda seed: jax.block_until_ready(jax.device_put(create(seed, self._cells), shardings))
+        self._view(_on_one_device((image_params(state), state.grid)), self._held_out, 0)
 
-    def train(self, seed: int, length: float, steps: int) -> tuple[Any, int, float]:
+    def taker(self) -> Callable[[int], None]:
+        """Returns a function that takes so many steps of a run of its own."""
+        state, take, data = self._create(0), self._step.of(1), self._step.data
+
+        def steps(count):
+            nonlocal state
+            for _ in range(count):
+                state, _ = take(state, data)
+            jax.block_until_ready(state)
+
+        return steps
+
+    def train(self, seed: int, length: float, steps: int, pacer: Pacer | None) -> tuple[Any, int, float]:
         """Returns the state after training, its steps and seconds."""
         options = self._experiment.config.train
         options = replaced(options, max_seconds=0.0 if steps else length, lr_steps=steps or UNLIMITED_STEPS)
@@ -206,7 +220,7 @@ class _Compiled:
             data = _of_steps(data, steps)
         config = replaced(self._experiment.config, seed=seed)
         reinitialize = make_reinitializer(dataclasses.replace(self._experiment, config=config), "this dataset")
-        clock, done, metrics = _Clock(), 0, None
+        clock, done, metrics = PacedClock(seconds, pacer), 0, None
         pace = Pace(options, clock, data)
         take = step.of(1)
         while (done < steps) if steps else (clock.seconds() < length):
@@ -215,6 +229,7 @@ class _Compiled:
             state, metrics = reinitialize(done, state, metrics)
             if done % _CHECK_EVERY == 0:
                 jax.block_until_ready(metrics)
+                clock.probe()
         jax.block_until_ready(state)
         if metrics is not None and int(metrics["nonfinite_in_a_row"]) >= _MOST_NONFINITE:
             raise ValueError(f"the gradient of {int(metrics['nonfinite_in_a_row'])} steps in a row is not finite")
@@ -222,7 +237,7 @@ class _Compiled:
 
     def score(self, state: Any, pose: bool) -> tuple[dict[str, Any], list[np.ndarray], float]:
         """Returns the scores by name, the images, and the seconds of a frame."""
-        variables, views = (image_params(state), state.grid), self._held_out
+        variables, views = _on_one_device((image_params(state), state.grid)), self._held_out
         cameras = self._experiment.cameras
         if cameras is not None:
             views = cameras.refined_views(state.params, views, "held_out")
@@ -253,17 +268,29 @@ class _Compiled:
     def _view(self, variables, views, index):
         """Returns the colours [H, W, 3] of every n-th row and column of a view, and n."""
         height, width = (int(side) for side in views.size[index])
-        every = math.ceil(math.sqrt(height * width / _MOST_PIXELS))
+        every = stride(views, index)
         pixels = pixel_grid(height, width, offset=self._experiment.config.data.pixel_offset)[::every, ::every]
         return np.asarray(render_pixels(self._run, variables, views, index, pixels)[0].rgb), every
 
     def _truth(self, index, every=None):
         views = self._held_out
-        if every is None:
-            every = math.ceil(math.sqrt(float(np.prod(views.size[index])) / _MOST_PIXELS))
+        every = every or stride(views, index)
         mask = pixel_mask(views, index)
         mask = None if mask is None else np.asarray(mask)[::every, ::every]
         return np.asarray(views.image(index))[::every, ::every], mask
+
+
+def _on_one_device(tree):
+    return jax.device_put(tree, jax.local_devices()[0])
+
+
+def _key(values):
+    return repr(sorted(values.items()))
+
+
+def stride(views: Views, index: int) -> int:
+    """Returns n, of whose rows and columns of a view every n-th is scored."""
+    return math.ceil(math.sqrt(float(np.prod(views.size[index])) / _MOST_PIXELS))
 
 
 def _of_steps(data, steps):

@@ -13,7 +13,7 @@ from jaxnerf.configs import capture, lego_fast, smoke
 from jaxnerf.extend import Ablation, Field, Options, option
 from jaxnerf.options import Facts
 from jaxnerf.registry import FIELDS, LOSSES
-from jaxnerf.tools.needs import page, racing, study
+from jaxnerf.tools.needs import pacing, page, racing, study
 from jaxnerf.tools.needs.study import Settings, Study
 from jaxnerf.tools.needs.trial import Result
 from jaxnerf.tools.needs.variants import Variant, find_variants
@@ -35,7 +35,10 @@ class Trials:
         self.effects, self.noise, self.compiling, self.stop_after = effects, noise, compiling, stop_after
         self.calls, self.compiled = [], set()
 
-    def __call__(self, values, seed, length, *, steps=0, pose=False):
+    def forget(self, values):
+        pass
+
+    def run(self, values, seed, length, *, steps=0, pose=False):
         if len(self.calls) >= self.stop_after:
             raise KeyboardInterrupt
         self.calls.append((tuple(sorted(values)), seed, length))
@@ -98,7 +101,7 @@ def test_verdicts_are_those_of_the_true_effects(tmp_path):
     assert seeds["levels"] == racing.LOOKS[-1] > seeds["hull"], "the budget goes where the verdict is open"
     assert outcome.spent <= 2000 and len(lines) > 12
     assert {each.part for each in outcome.lean} == {"encoding", "poses"}
-    assert outcome.lean_effect.mean == pytest.approx(-1.1, abs=0.1)
+    assert outcome.lean_effect.mean == pytest.approx(-1.1, abs=0.1) and not outcome.refused
 
 
 def test_the_budget_is_kept_and_what_is_not_tried_is_named(tmp_path):
@@ -252,3 +255,35 @@ def test_files_of_the_result(tmp_path):
     config = namespace["get_config"]()
     assert read_config(config).to_dict() == lean.to_dict()
     config.hash_grid.width = 32  # a field that was "auto" keeps its type
+
+
+class FakeMachine:
+    """A clock, and a machine that becomes slower after some time."""
+
+    def __init__(self, slower_from, factor):
+        self.now, self.slower_from, self.factor = 0.0, slower_from, factor
+
+    def clock(self):
+        return self.now
+
+    def take(self, count, cost=0.01):
+        self.now += count * cost * (self.factor if self.now > self.slower_from else 1.0)
+
+
+def test_a_slower_machine_does_not_change_the_steps_of_a_trial(tmp_path):
+    machine = FakeMachine(slower_from=8.0, factor=1.7)
+    pacer = pacing.Pacer(machine.take, machine.clock, tmp_path / "pace.json")
+    assert pacer.nominal == pytest.approx(0.01)
+
+    def steps_in(length):
+        clock, done = pacing.PacedClock(machine.clock, pacer), 0
+        while clock.seconds() < length:
+            machine.take(1, cost=0.02)
+            clock.probe()
+            done += 1
+        return done
+
+    assert steps_in(5.0) == pytest.approx(250, rel=0.02)
+    assert steps_in(5.0) == pytest.approx(250, rel=0.04)
+    again = pacing.Pacer(machine.take, machine.clock, tmp_path / "pace.json")
+    assert again.nominal == pacer.nominal, "a resumed study keeps the nominal speed"
