@@ -38,13 +38,22 @@ def main(argv: list[str]) -> None:
         folder = out / scene
         needs[scene] = run_program(scene, folder / "needs", _BUDGET.value, f"--config={_CONFIG.value}")
         scores[scene] = score(scene, folder)
-        common.publish([*parts_table(needs), "", *lean_table(needs, scores), "", *common.provenance()], "six")
+        tables = parts_table(needs, _BUDGET.value), lean_table(needs, scores, _SECONDS.value), common.provenance()
+        common.publish([line for table in tables for line in (*table, "")][:-1], "six")
+            [
+                *parts_table(needs, _BUDGET.value),
+                "",
+                *lean_table(needs, scores, _SECONDS.value),
+                "",
+                *common.provenance(),
+            ],
+            "six",
+        )
 
 
 def score(scene: str, folder: pathlib.Path) -> dict[str, dict[str, float]]:
     """Returns what the complete and the lean model reach on the test views, by model."""
     from jaxnerf.tools.needs.trial import Trainer
-
     from jaxnerf.training import auto_config
 
     path = folder / "test_views.json"
@@ -70,7 +79,7 @@ def config_of(path: pathlib.Path) -> Any:
     return module.get_config()
 
 
-def parts_table(needs: Mapping[str, dict[str, Any]]) -> list[str]:
+def parts_table(needs: Mapping[str, dict[str, Any]], budget: str) -> list[str]:
     """Returns the lines of the table of verdicts: a row a part and change, a column a scene."""
     rows = {}
     for scene, results in needs.items():
@@ -79,7 +88,7 @@ def parts_table(needs: Mapping[str, dict[str, Any]]) -> list[str]:
     body = [(name, *(cells.get(scene, "") for scene in needs)) for name, cells in rows.items()]
     trials = [f"{scene} {results['plan']['length']:.0f} s" for scene, results in needs.items()]
     complete = [f"{results['complete']['psnr']:.2f} dB" for results in needs.values()]
-    about = f"A budget of {_BUDGET.value} a scene; a trial trains for: {', '.join(trials)}."
+    about = f"A budget of {budget} a scene; a trial trains for: {', '.join(trials)}."
     return [about, "", *common.markdown(("part, change", *needs), [("complete model", *complete), *body])]
 
 
@@ -92,7 +101,7 @@ def cell(row: Mapping[str, Any]) -> str:
     return words.get(row["verdict"], f"{mean} ?")
 
 
-def lean_table(needs: Mapping[str, dict[str, Any]], scores: Mapping[str, dict[str, Any]]) -> list[str]:
+def lean_table(needs: Mapping[str, dict[str, Any]], scores: Mapping[str, dict[str, Any]], seconds: float) -> list[str]:
     """Returns the lines of the table of lean models, with the mean difference."""
     rows, gains = [], []
     for scene, found in scores.items():
@@ -107,7 +116,7 @@ def lean_table(needs: Mapping[str, dict[str, Any]], scores: Mapping[str, dict[st
         rows.append((scene, f"{complete['psnr']:.2f}", f"{lean['psnr']:.2f}", f"{gains[-1]:+.2f}", *pairs, changes))
     heads = ("scene", "complete, dB", "lean, dB", "gain", "million parameters", "MB", "s a frame", "changed")
     mean = f"{sum(gains) / len(gains):+.2f} dB"
-    about = f"Test views after {_SECONDS.value:.0f} s each, complete and lean; the mean gain is {mean}."
+    about = f"Test views after {seconds:.0f} s each, complete and lean; the mean gain is {mean}."
     return [about, "", *common.markdown(heads, rows)]
 
 
