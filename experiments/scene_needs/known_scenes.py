@@ -1,7 +1,7 @@
 """Captures whose needs are known before anything is trained, because each is made with or without one thing.
 
 A capture is a folder with transforms.json and images of 64 training views and 4 test views. Most show the embedded
-still life, whose surfaces are matt unless a scene says otherwise; the fog is a Gaussian cloud. SCENES states for each
+still life with matt surfaces; the fog is a Gaussian cloud. SCENES states for each
 which parts of the model it needs, and why that follows from its construction.
 
 All images have noise as a sensor's. No model can predict it, so errors far below it count for nothing, and whether a
@@ -47,6 +47,7 @@ class Known(NamedTuple):
         about: what is special about it, in a few words.
         verdicts: {part: (NEEDED or NOT_NEEDED, reason)}; a part that is off in the complete model is needed if it pays.
         finish: of the still life's surfaces; "fog": the cloud in its place.
+        tint: of all colours by the direction: a channel is multiplied by 1 - tint (1 + one of its components).
         sizes: sides of the images, px; view i has the side i modulo their number.
         rays: along each side of a pixel, whose colour is their mean.
         behind: "alpha": transparent; "black"; "sky": a textured sphere.
@@ -58,6 +59,7 @@ class Known(NamedTuple):
     about: str
     verdicts: dict[str, tuple[str, str]]
     finish: str = "matt"
+    tint: float = 0.0
     sizes: tuple[int, ...] = (48,)
     rays: int = 1
     behind: str = "alpha"
@@ -82,10 +84,10 @@ SCENES = {
         | _POINTS,
         noise=0.05,
     ),
-    "shiny": Known(
-        "highlights on half of the bodies",
-        {_VIEWS: (NEEDED, "highlights move over surfaces that stay")} | _SAME_EXPOSURE | _EXACT_POSES,
-        finish="shiny",
+    "iridescent": Known(
+        "colours that change with the direction",
+        {_VIEWS: (NEEDED, "the same surface has another colour from another side")} | _EXACT_POSES,
+        tint=0.3,
     ),
     "exposed": Known(
         "exposures that vary by half a stop",
@@ -203,6 +205,9 @@ def _image(known, pose, size):
         pixels = _fog(jax.tree.map(lambda leaf: leaf[0], camera))
     else:
         pixels = render.render_views(camera, known.finish)
+    if known.tint:  # exact, as all samples of a ray have its direction
+        tint = 1 - known.tint * (1 + render.scene_rays(camera).viewdirs)
+        pixels = np.concatenate([np.uint16(np.rint(pixels[:, :3] * tint)), pixels[:, 3:]], axis=-1)
     if known.behind != "alpha":
         values = pixels / 65535
         behind = _sky(camera) if known.behind == "sky" else 0.0

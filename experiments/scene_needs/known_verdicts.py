@@ -1,6 +1,6 @@
 """Checks the verdicts of jaxnerf-needs on captures whose needs are known before: see known_scenes.py.
 
-    taskset -c 0 python experiments/scene_needs/known_verdicts.py --out=DIR [--only=matt,shiny]
+    taskset -c 0 python experiments/scene_needs/known_verdicts.py --out=DIR [--only=matt,turned]
         [--seconds_a_change=40] [--page=docs/results/scene_needs.md]
 
 Runs the program on each capture, with the parts whose verdict is known, and prints a table of those verdicts, what the

@@ -40,15 +40,6 @@ def main(argv: list[str]) -> None:
         scores[scene] = score(scene, folder)
         tables = parts_table(needs, _BUDGET.value), lean_table(needs, scores, _SECONDS.value), common.provenance()
         common.publish([line for table in tables for line in (*table, "")][:-1], "six")
-            [
-                *parts_table(needs, _BUDGET.value),
-                "",
-                *lean_table(needs, scores, _SECONDS.value),
-                "",
-                *common.provenance(),
-            ],
-            "six",
-        )
 
 
 def score(scene: str, folder: pathlib.Path) -> dict[str, dict[str, float]]:
