@@ -41,7 +41,12 @@ class Effect(NamedTuple):
     views: int
 
     def verdict(self, margin: float) -> str:
-        """Returns whether the part is needed: whether it contributes at least the margin, dB."""
+        """Returns whether the part is needed: whether it contributes at least the margin, dB.
+
+        One seed decides nothing, as training may have failed with it.
+        """
+        if self.seeds < LOOKS[0]:
+            return OPEN
         if self.lower >= margin:
             return NEEDED
         return NOT_NEEDED if self.upper < margin else OPEN

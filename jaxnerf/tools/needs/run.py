@@ -22,6 +22,7 @@ from jaxnerf.training import auto_config
 from jaxnerf.training.config import Config, RunConfig, changed, read_config
 from jaxnerf.training.workdir import workdir_lock
 
+_ORIGIN, _REMEDY = "study.json", "remove the folder, or give another --out"
 _LEAST_VIEWS = 6
 _LEAST_SIDE = 50  # px of a trial's images
 _PIXELS_PER_SECOND = 800  # of training images, for each second of the budget
@@ -59,7 +60,7 @@ def find_needs(request: Request, out: str | os.PathLike) -> Outcome:
     config, views, resolved = _with_held_out(asked)
     full = Trainer(config, views)
     full_variants = {each.slug: each for each in find_variants(resolved.config, facts_of(*resolved[:2]))}
-    factor = request.shrink or shrink_factor(views, request.settings.budget)
+    factor = request.shrink or _kept_factor(pathlib.Path(out)) or shrink_factor(views, request.settings.budget)
     trainer = full
     if factor > 1:
         trainer = Trainer(*_shrunk(config, factor))
@@ -70,7 +71,7 @@ def find_needs(request: Request, out: str | os.PathLike) -> Outcome:
     folder = pathlib.Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     with workdir_lock(folder):
-        _check_origin(folder, request, resolved.config)
+        _check_origin(folder, request, resolved.config, factor)
         if jax.default_backend() == "cpu":  # other programs seldom use an accelerator
             trainer.pacer = full.pacer = trainer.make_pacer(folder / "pace.json")
         _say(_images_line(trainer.views, held_out, factor))
@@ -157,7 +158,7 @@ def _check_trained(held_out, result):
     for index in range(len(held_out.size)):
         image = np.asarray(held_out.image(index)).reshape(-1, 3)
         errors.append(-10 * math.log10(max(float(image.var(axis=0).mean()), 1e-10)))
-    if np.mean(result.psnr) < np.mean(errors) + _LEAST_GAIN:
+    if np.mean(result.psnr_colors) < np.mean(errors) + _LEAST_GAIN:
         raise ValueError(
             f"the complete model has {np.mean(result.psnr):.1f} dB after {result.seconds:.1f} s, and one colour for "
             f"each image {np.mean(errors):.1f} dB: it does not train, so no part can be judged; check the dataset with "
@@ -173,18 +174,24 @@ def _chosen(variants, parts):
     return [each for each in variants if not parts or each.part in parts]
 
 
-def _check_origin(folder, request, config):
+def _kept_factor(folder):
+    """Returns the factor by which the study in a folder shrinks images; 0 if there is none."""
+    path = folder / _ORIGIN
+    return int(read_json(path, _REMEDY).get("shrink", 0)) if path.exists() else 0
+
+
+def _check_origin(folder, request, config, factor):
     """Raises a ValueError if the folder holds trials of something else; writes what they are of."""
     plain = json.loads(changed(config, {"data.dir": ""}).to_json())
     settings = request.settings._replace(budget=0.0)._asdict()
-    origin = json.loads(json.dumps({"config": plain, "settings": settings, "parts": request.parts}))
-    path = folder / "study.json"
+    origin = json.loads(json.dumps({"config": plain, "settings": settings, "parts": request.parts, "shrink": factor}))
+    path = folder / _ORIGIN
     if not path.exists():
         if any(child.name != "running" for child in folder.iterdir()):
             raise ValueError(f"{folder}: holds other files, expected a new folder or one of this program; give another")
         write_text(path, json.dumps(origin, indent=1) + "\n")
         return
-    found = read_json(path, "remove the folder, or give another --out")
+    found = read_json(path, _REMEDY)
     if found != origin:
         differing = next(key for key in origin if found.get(key) != origin[key])
         raise ValueError(f"{folder}: holds a study with other {differing}; give another --out, or the old flags")

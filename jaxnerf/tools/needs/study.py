@@ -153,8 +153,15 @@ class Study:
 
     @property
     def spent(self) -> float:
-        """Seconds that all trials so far have taken, in this start and in earlier ones."""
-        return self.plan.spent + sum(each.spent for each in self._done.values())
+        """Seconds that all trials so far have taken, in this start and in earlier ones.
+
+        What a later start compiles again is not counted, so that a study that was stopped decides as one that was not.
+        """
+        total, compiled = self.plan.spent, {COMPLETE}
+        for (name, _, _), each in self._done.items():
+            total += each.spent - (each.compile_seconds if name in compiled else 0)
+            compiled.add(name)
+        return total
 
     def _make_plan(self):
         settings = self.settings
@@ -250,9 +257,7 @@ class Study:
 
     def _contribution(self, variant, base, other):
         """Returns what a variant's part contributes to each view, dB."""
-        kind = variant.aligned or ("colors" if self.aligned else "")
-        name = f"psnr_{kind}" if kind else "psnr"
-        gained = np.subtract(getattr(other, name), getattr(base, name))
+        gained = np.subtract(*(self._scores(each, variant.aligned) for each in (other, base)))
         return gained if variant.adds else -gained
 
     def differences(self, variant: Variant) -> Float[np.ndarray, "S V"]:
@@ -281,19 +286,18 @@ class Study:
 
     def _open(self, done):
         """Returns the slugs of variants whose verdict is open, those nearest to a verdict first."""
-        known = self.effects()
-        waiting = [slug for slug in self.plan.tried if slug not in self.failed]
-        found = []
-        for slug in waiting:
-            looked = done.get(slug, 0) in racing.LOOKS or done.get(slug, 0) == 1
-            is_open = slug not in known or not looked or known[slug].verdict(self.settings.margin) == OPEN
-            if is_open:
-                found.append(slug)
-            elif done.get(slug, 0) > 1:
+        known, found = self.effects(), []
+        for slug in self.plan.tried:
+            if slug in self.failed:
+                continue
+            looked = slug in known and done[slug] in racing.LOOKS
+            if looked and known[slug].verdict(self.settings.margin) != OPEN:
                 self._trainer.forget(self.by_slug[slug].values)
+            else:
+                found.append(slug)
         if any(slug not in known for slug in found):
             return found  # in the order of the plan
-        return sorted(found, key=lambda slug: abs(known[slug].mean - self.settings.margin))
+        return sorted(found, key=lambda slug: -abs(known[slug].mean - self.settings.margin))
 
     def _find_lean(self):
         """Returns the variants that the lean model combines, its effect, what was refused, and the longest length.
@@ -303,7 +307,7 @@ class Study:
         """
         known, margin = self.effects(), self.settings.margin
         wanted = [slug for slug, each in known.items() if _improves(self.by_slug[slug], each.verdict(margin))]
-        chosen = _one_each([self._full.get(slug, self.by_slug[slug]) for slug in wanted])
+        chosen = _one_each([self._full[slug] for slug in wanted if slug in self._full])
         smaller = [each for each in chosen if each.change != LESS]
         length, refused = self._longest(), []
         base = self.trial(complete(), 0, length, full=True)
@@ -315,9 +319,8 @@ class Study:
             if other is None:
                 continue
             found = self._contribution(lean, base, other)[None]
-            effect = racing.effects({**{slug: self.differences(self.by_slug[slug]) for slug in known}, LEAN: found})[
-                LEAN
-            ]
+            others = {slug: self.differences(self.by_slug[slug]) for slug in known}
+            effect = racing.effects({**others, LEAN: found})[LEAN]
             if effect.mean <= margin:
                 return each, effect, refused, length
             refused.append((each, effect))
@@ -334,15 +337,16 @@ class Study:
 
     def _curve(self, chosen, longest):
         models = {COMPLETE: complete(), **({LEAN: combined(chosen)} if chosen else {})}
-        curve, last = {}, {}
+        curve, last, aligned = {}, {}, combined(chosen).aligned
         for name, variant in models.items():
             points = [self.trial(variant, 0, fraction * longest, full=True) for fraction in CURVE]
-            curve[name] = [(each.seconds, float(np.mean(self._scores(each)))) for each in points]
+            curve[name] = [(each.seconds, float(np.mean(self._scores(each, aligned)))) for each in points]
             last[name] = points[-1]
         return curve, last
 
-    def _scores(self, result):
-        return result.psnr_colors if self.aligned else result.psnr
+    def _scores(self, result, aligned):
+        """Returns the scores of the views, dB; aligned: see `Ablation`."""
+        return getattr(result, "_".join(["psnr", *([aligned or "colors"] if aligned or self.aligned else [])]))
 
     def _outcome(self, lean, effect, refused, longest):
         known, rows = self.effects(), []
@@ -397,7 +401,7 @@ def combined(variants: Sequence[Variant]) -> Variant:
     values = {key: value for each in variants for key, value in each.values.items()}
     before = {key: value for each in variants for key, value in each.before.items()}
     names = "_".join(sorted(each.slug for each in variants))
-    aligned = "pose" if any(each.aligned == "pose" for each in variants) else ""
+    aligned = max((each.aligned for each in variants), default="")  # a fitted pose also needs the other's
     return Variant(
         f"{LEAN}: {names}" if len(names) < 100 else f"{LEAN}: {len(variants)} changes", "", values, before, aligned
     )

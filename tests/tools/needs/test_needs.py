@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import captures
 import jaxnerf
 from jaxnerf.configs import capture, lego_fast, smoke
 from jaxnerf.extend import Ablation, Field, Options, option
@@ -156,8 +157,10 @@ def test_intervals_hold_their_level():
 def test_one_seed_alone_says_nothing():
     (only,) = racing.effects({"a": np.full((1, 8), 3.0)}).values()
     assert only.verdict(0.1) == "cannot tell" and only.lower == -math.inf
-    # With the seeds of others it does.
+    # The seeds of others give it an interval, but training may have failed with this one.
     found = racing.effects({"a": np.full((1, 8), 3.0), "b": np.array([[0.1] * 8, [0.2] * 8])})
+    assert 0.5 < found["a"].lower < 3 and found["a"].verdict(0.1) == "cannot tell"
+    found = racing.effects({"a": np.full((2, 8), 3.0), "b": np.array([[0.1] * 8, [0.2] * 8])})
     assert found["a"].verdict(0.1) == "needed"
 
 
@@ -287,3 +290,18 @@ def test_a_slower_machine_does_not_change_the_steps_of_a_trial(tmp_path):
     assert steps_in(5.0) == pytest.approx(250, rel=0.04)
     again = pacing.Pacer(machine.take, machine.clock, tmp_path / "pace.json")
     assert again.nominal == pacer.nominal, "a resumed study keeps the nominal speed"
+
+
+def test_the_page_holds_everything(tmp_path, capsys):
+    folder = tmp_path / "a"
+    outcome, _ = run_study(folder, Trials(EFFECTS))
+    held_out = captures.black_views(captures.orbit(VIEWS, height=4, width=6))
+    asked = read_config(lego_fast.get_config())
+    page.write(folder, outcome, Settings(2000.0, 0.1), asked, asked, held_out)
+    text = (folder / "page.html").read_text()
+    assert text.count("data:image/png") == 1 + len(VARIANTS), "the curve, and each part"
+    assert all(part in text for part in EFFECTS) and "http" not in text
+    names = {path.name for path in folder.iterdir()}
+    assert {"page.html", "lean.py", "curve.csv", "curve.png", "results.json"} <= names
+    printed = capsys.readouterr().out
+    assert "needed, and not there" in printed and "lean " in printed and "*" in printed

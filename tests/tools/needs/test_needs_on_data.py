@@ -58,7 +58,7 @@ def test_a_dataset_that_does_not_train():
     result = Result(scores, scores, None, 10, 1.0, 1.0, 0.0, 0.1, 1, 1.0)
     with pytest.raises(ValueError, match="it does not train"):
         run._check_trained(held_out, result)
-    run._check_trained(held_out, result._replace(psnr=[30.0, 30.0]))
+    run._check_trained(held_out, result._replace(psnr_colors=[30.0, 30.0]))
 
 
 class _Images:
