@@ -1,7 +1,7 @@
 """Checks the verdicts of jaxnerf-needs on captures whose needs are known before: see known_scenes.py.
 
     taskset -c 0 python experiments/scene_needs/known_verdicts.py --out=DIR [--only=matt,turned]
-        [--seconds_a_change=40] [--page=docs/results/scene_needs.md]
+        [--seconds_a_change=60] [--trial=5] [--page=docs/results/scene_needs.md]
 
 Runs the program on each capture, with the parts whose verdict is known, and prints a table of those verdicts, what the
 program found, and whether it is right. A verdict that the program leaves open is neither right nor wrong. What DIR
@@ -23,13 +23,14 @@ from jaxnerf.runtime import cli
 
 OPEN = "cannot tell"
 # For images of 48 px; the table of `capture` is as large as those of 400 px need, and slow.
-SMALL = ("--config=capture", "--config.hash_grid.table_size=16384", "--config.train.cpu_batch_size=512")
+SMALL = ("--config=capture", "--config.hash_grid.table_size=16384", "--config.train.cpu_batch_size=512", "--nolean")
 HEADS = ("capture", "part, change", "known", "because", "contributes, dB", "found", "")
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the captures and of all trials.", required=True)
 _ONLY = flags.DEFINE_list("only", list(known_scenes.SCENES), "Captures.")
+_TRIAL = flags.DEFINE_float("trial", 5.0, "Seconds of training of each trial.")
 _SECONDS = flags.DEFINE_float(
-    "seconds_a_change", 40.0, "Budget of the program: for the complete model and each change."
+    "seconds_a_change", 60.0, "Budget of the program: for the complete model and each change."
 )
 
 
@@ -67,7 +68,9 @@ def main(argv: list[str]) -> None:
         capture = known_scenes.write(known, out / "captures" / name)
         parts = dict.fromkeys(change.rpartition(",")[0] for change in known.verdicts)
         budget = f"{_SECONDS.value * (1 + len(known.verdicts)):.0f}s"
-        results = run_program(capture, out / "needs" / name, budget, *SMALL, f"--parts={','.join(parts)}")
+        results = run_program(
+            capture, out / "needs" / name, budget, *SMALL, f"--seconds={_TRIAL.value}", f"--parts={','.join(parts)}"
+        )
         verdicts += compared(name, known, results)
     common.publish([*table(verdicts), "", *common.provenance()], "known")
 
