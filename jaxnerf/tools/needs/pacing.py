@@ -6,6 +6,7 @@ how much slower than at first these were.
 """
 
 import pathlib
+import statistics
 from collections.abc import Callable
 
 from jaxnerf.runtime.atomic_files import read_json, write_text
@@ -35,7 +36,7 @@ class Pacer:
             self.nominal = float(read_json(file, "remove the folder, or give another --out")["seconds_per_step"])
             return
         self.nominal = self._seconds(2)
-        self.nominal = min(self._seconds(self._count) for _ in range(_FIRST_PROBES))
+        self.nominal = statistics.median(self._seconds(self._count) for _ in range(_FIRST_PROBES))
         if file is not None:
             write_text(file, f'{{"seconds_per_step": {self.nominal!r}}}\n')
 
