@@ -1,7 +1,7 @@
 """Checks the verdicts of jaxnerf-needs on captures whose needs are known before: see known_scenes.py.
 
     taskset -c 0 python experiments/scene_needs/known_verdicts.py --out=DIR [--only=matt,turned]
-        [--seconds_a_change=60] [--trial=5] [--page=docs/results/scene_needs.md]
+        [--seconds_a_change=120] [--trial=5] [--page=docs/results/scene_needs.md]
 
 Runs the program on each capture, with the parts whose verdict is known, and prints a table of those verdicts, what the
 program found, and whether it is right. A verdict that the program leaves open is neither right nor wrong. What DIR
@@ -30,7 +30,7 @@ _OUT = flags.DEFINE_string("out", None, "Folder of the captures and of all trial
 _ONLY = flags.DEFINE_list("only", list(known_scenes.SCENES), "Captures.")
 _TRIAL = flags.DEFINE_float("trial", 5.0, "Seconds of training of each trial.")
 _SECONDS = flags.DEFINE_float(
-    "seconds_a_change", 60.0, "Budget of the program: for the complete model and each change."
+    "seconds_a_change", 120.0, "Budget of the program: for the complete model and each change."
 )
 
 
