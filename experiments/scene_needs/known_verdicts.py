@@ -72,7 +72,7 @@ def main(argv: list[str]) -> None:
             capture, out / "needs" / name, budget, *SMALL, f"--seconds={_TRIAL.value}", f"--parts={','.join(parts)}"
         )
         verdicts += compared(name, known, results)
-    common.publish([*table(verdicts), "", *common.provenance()], "known")
+        common.publish([*table(verdicts), "", *common.provenance()], "known")
 
 
 def compared(name: str, known: known_scenes.Known, results: dict[str, Any]) -> list[Verdict]:
