@@ -26,8 +26,7 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.training.camera_parameters import CameraParameters
 from jaxnerf.training.config import Config, RunConfig, part_sections, read_config
 from jaxnerf.training.optimizer import make_optimizer
-from jaxnerf.training.pixel_rays import PixelRays
-from jaxnerf.training.step import ProgressData, StepLoss, TrainData
+from jaxnerf.training.step import PixelRays, ProgressData, StepLoss, TrainData
 
 # The optional fields that datasets provide.
 _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIELDS)
