@@ -54,6 +54,11 @@ class Verdict(NamedTuple):
     effect: dict[str, float] | None
 
     @property
+    def title(self) -> str:
+        """Returns the capture's name, with what is special about it."""
+        return f"{self.scene}: {known_scenes.SCENES[self.scene].about}"
+
+    @property
     def grade(self) -> str:
         """Returns "right", "open" or "WRONG"."""
         return "open" if self.found == OPEN else "right" if self.found == self.known else "WRONG"
@@ -98,11 +103,10 @@ def table(verdicts: list[Verdict]) -> list[str]:
         f"{grades.count('right')} of {len(grades)} right, {grades.count('open')} open, {grades.count('WRONG')} wrong"
     )
     rows = [
-        (each.scene, each.change, each.known, each.reason, interval(each.effect), each.found, each.grade)
+        (each.title, each.change, each.known, each.reason, interval(each.effect), each.found, each.grade)
         for each in verdicts
     ]
-    abouts = [f"{name}: {known.about}" for name, known in known_scenes.SCENES.items()]
-    return [f"{counts}. {'; '.join(abouts)}.", "", *common.markdown(HEADS, rows)]
+    return [f"{counts}.", "", *common.markdown(HEADS, rows)]
 
 
 def interval(effect: dict[str, float] | None) -> str:

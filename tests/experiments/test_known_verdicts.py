@@ -89,7 +89,7 @@ def test_a_wrong_verdict_is_counted_and_an_open_one_is_open():
     assert grades.pop("exposures, more") == "WRONG" and grades.pop("refined poses, more") == "open"
     assert set(grades.values()) == {"right"}
     lines = known_verdicts.table(found)
-    assert lines[0].startswith(f"{len(found) - 2} of {len(found)} right, 1 open, 1 wrong.")
+    assert lines[0] == f"{len(found) - 2} of {len(found)} right, 1 open, 1 wrong."
     assert sum("+0.50" in line for line in lines) == len(found)
 
 
