@@ -226,6 +226,7 @@ def build_cameras(config: RunConfig, needs: tuple[str, ...] = ()) -> CameraParam
         refine=options.refine,
         view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc, needs=needs),
         background=dataset.background_of(config.data),
+        refine_focal=options.refine_focal,
     )
 
 
@@ -362,7 +363,7 @@ def _prepare(config, model, extras, views):
             views,
             model.grid_schedule,
             # What is empty in one image of a scene that moves may hold matter in others.
-            use_alpha=bounded_by_alpha(config.scene, views, ndc=config.data.ndc),
+            use_alpha=bounded_by_alpha(config.scene, views, ndc=config.data.ndc, refined=config.cameras.refine),
             # Nor does it where a lens sees beside it: its view is not that of a frustum.
             min_views=0 if views.time is not None or sees_sideways(views) else model.grid_schedule.min_views,
             ndc=config.data.ndc,
