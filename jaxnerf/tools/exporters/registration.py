@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from jaxnerf.options import Options
 from jaxnerf.registry import Registry, checked_options
 from jaxnerf.tools.exporters.options import (
+    CamerasOptions,
     ExportOptions,
     MeshOptions,
     PointsOptions,
@@ -46,7 +47,7 @@ EXPORTERS = Registry(
         "depth": Exporter(_on_demand("depth", "export_depth"), options=ExportOptions),
         "splats": Exporter(_on_demand("splats", "export_splats"), options=SplatsOptions),
         "cameras": Exporter(
-            _on_demand("cameras", "export_cameras"), _on_demand("cameras", "check_refined"), Options, True
+            _on_demand("cameras", "export_cameras"), _on_demand("cameras", "check_refined"), CamerasOptions, True
         ),
         "web": Exporter(_on_demand("web", "export_web"), _on_demand("web", "network_of"), WebOptions),
     },

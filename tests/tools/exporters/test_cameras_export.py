@@ -17,9 +17,9 @@ from jaxnerf.data import dataset
 from jaxnerf.data.geometry.world import poses_in_file
 from jaxnerf.data.readers.base import read_capture
 from jaxnerf.evaluation.restore import TrainedRun
-from jaxnerf.options import Options
 from jaxnerf.tools.exporters import cameras as exporter
 from jaxnerf.tools.exporters.base import ExportSource
+from jaxnerf.tools.exporters.options import CamerasOptions
 from jaxnerf.training.config import RunConfig, changed
 
 ZOOM = 1.02
@@ -51,10 +51,11 @@ def make_source(folder, format):
     change = jnp.float32([0.01, -0.02, 0.005, 0.003, 0.002, -0.004, np.log(ZOOM)])
     refined = jax.tree.map(np.asarray, jax.vmap(functools.partial(moved, change=change))(views.cameras))
     lines = []
-    experiment = SimpleNamespace(config=config, load_split=lambda split, images: views)
+    experiment = SimpleNamespace(config=config, load_split=lambda split, images, given=views: given)
     run = run_of(experiment)
     exporter.check_refined(run)
-    return ExportSource(run, 1, None, dataclasses.replace(views, cameras=refined), Options(), lines.append), lines
+    views = dataclasses.replace(views, cameras=refined)
+    return ExportSource(run, 1, None, views, CamerasOptions(), lines.append), lines
 
 
 @pytest.mark.parametrize("format, lens", [("colmap", "opencv"), ("transforms", "fisheye"), ("colmap", "pinhole")])
