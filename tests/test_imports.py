@@ -38,6 +38,7 @@ ALLOWED = {
 HANDS_OVER = {
     ("jaxnerf.train", "tools.viewer"),
     ("jaxnerf.eval", "tools.quality_search"),
+    ("jaxnerf.report", "tools.curve"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
     ("jaxnerf.extend", "tools.uncertainty"),

@@ -219,7 +219,7 @@ def half_depths(
     """
     behind = behind + before
     positive = jnp.where(depth > 0, depth, 1)
-    fraction = 1 - divide(clamp(behind - math.log(2), 0, positive), positive)
+    fraction = divide(clamp(math.log(2) - (behind - depth), 0, positive), positive)
     fraction = fraction if rule == "points" else fraction - 0.5
     place = t + fraction * jnp.where(jnp.isinf(delta), 0, delta)
     return jnp.where((behind < math.log(2)) | (depth <= 0), jnp.inf, place)
