@@ -43,7 +43,7 @@ _SHARD = flags.DEFINE_string(
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
-    from jaxnerf.evaluation import evaluate, external
+    from jaxnerf.evaluation import evaluate
     from jaxnerf.runtime import shards
 
     shard = shards.parse(_SHARD.value)
@@ -52,8 +52,10 @@ def main(argv):
     workdir, split, overwrite = _RUN.workdir.value, _SPLIT.value, _OVERWRITE.value
     restore = functools.partial(_RUN.restore, _CONFIG.value)
     if _PREDICTIONS.value:
-        folder = _PREDICTIONS.value
-        results = external.score_folder(folder, config=_reference_config(), split=split, overwrite=overwrite)
+        from jaxnerf.tools.predictions.score_folder import reference_config, score_folder
+
+        config = reference_config(_CONFIG.value, workdir, _RUN.data_dir.value)
+        results = score_folder(_PREDICTIONS.value, config=config, split=split, overwrite=overwrite)
     elif _WATCH.value:
         evaluate.watch(workdir, restore, poll_seconds=_POLL.value, split=split)
         return
@@ -99,22 +101,6 @@ def _check_flags(is_sharded):
                 raise ValueError(f"--{name} does not use --{other}; drop one of them")
     if is_sharded and _ERROR_BUDGET.value is not None:
         raise ValueError("--error_budget measures times, so shards would choose different settings; drop --shard")
-
-
-def _reference_config():
-    """Returns the config whose dataset --predictions are compared with; None without one."""
-    from jaxnerf.evaluation.restore import dataset_at
-    from jaxnerf.training.config import read_config
-    from jaxnerf.training.workdir import load_config
-
-    if _CONFIG.value is None and not _RUN.workdir.value:
-        if not _RUN.data_dir.value:
-            return None
-        from jaxnerf.configs import default
-
-        return read_config(cli.use_data(default.get_config(), _RUN.data_dir.value))
-    config = load_config(_RUN.workdir.value) if _CONFIG.value is None else read_config(_CONFIG.value)
-    return dataset_at(config, _RUN.data_dir.value)
 
 
 def run():

@@ -17,6 +17,7 @@ from jaxnerf.options import (
     BELOW_ONE,
     FRACTION,
     POSITIVE,
+    Ablation,
     Changes,
     Device,
     Facts,
@@ -56,6 +57,6 @@ __all__ = [
     # estimators of uncertainty
     "Estimate", "UncertaintySource",
     # options
-    "Options", "option", "Changes", "at_least", "between", "POSITIVE", "FRACTION", "BELOW_ONE", "infer", "Facts",
-    "Device",
+    "Options", "option", "Ablation", "Changes", "at_least", "between", "POSITIVE", "FRACTION", "BELOW_ONE", "infer",
+    "Facts", "Device",
 ]  # fmt: skip

@@ -71,6 +71,39 @@ BELOW_ONE = Range("at least 0 and below 1", lambda value: 0 <= value < 1)
 DTYPES = ("float32", "bfloat16", "float16", "float64")
 
 
+class Ablation(NamedTuple):
+    """What removing, reducing or adding a part of the method means for an option, for `jaxnerf-needs`.
+
+    Each change is the option's new value, or a function (value, Options, Facts) of the resolved value, the options
+    that it belongs to and the dataset, which returns the new value. None: there is no such change. Options of a run
+    that name the same part change together.
+
+    Attributes:
+        part: in words, such as "view dependence".
+        without: removes it.
+        less: about halves it.
+        more: adds it, or about doubles it.
+        aligned: what of the scored views is fitted to the scene first, as they have no trained parameters: "colors",
+            "pose", or nothing.
+    """
+
+    part: str
+    without: Any = None
+    less: Any = None
+    more: Any = None
+    aligned: str = ""
+
+
+def half(value: int, *_: Any) -> int | None:
+    """Returns half of a number of an `Ablation`; None where that is less than 8."""
+    return value // 2 if value >= 16 else None
+
+
+def double(value: float, *_: Any) -> float:
+    """Returns twice the value of an option, for `Ablation`."""
+    return 2 * value
+
+
 class Option(NamedTuple):
     """What an option declares beside its name, type and default; see `option`."""
 
@@ -83,6 +116,7 @@ class Option(NamedTuple):
     check: Callable[[Any], str | None] | None
     protocol: bool
     max_int: int
+    ablations: tuple[Ablation, ...]
 
 
 def option(
@@ -97,6 +131,7 @@ def option(
     check: Callable[[Any], str | None] | None = None,
     protocol: bool = False,
     max_int: int = MAX_INT,
+    ablations: tuple[Ablation, ...] = (),
 ) -> Any:
     """Declares a field of a class of options.
 
@@ -113,8 +148,9 @@ def option(
         check: value -> what is expected in place of it, or None where the value is right. For tuples.
         protocol: whether an evaluation records the value, as it determines which images are compared.
         max_int: the largest whole number.
+        ablations: of the parts of the method that the option belongs to.
     """
-    declared = Option(help, unit, range, tuple(choices), auto, changes, check, protocol, max_int)
+    declared = Option(help, unit, range, tuple(choices), auto, changes, check, protocol, max_int, ablations)
     return dataclasses.field(default=default, metadata={"option": declared})
 
 
@@ -340,7 +376,7 @@ def read(kind: type[_Part], values: Mapping[str, Any], prefix: str) -> _Part:
         raise ValueError(f"--{prefix}{missing[0]} is missing; restore the config, or set it")
     if unknown:
         raise ValueError(unknown_field(prefix, unknown[0], known))
-    return kind(**{name: read_value(*known[name], values[name], f"{prefix}{name}") for name in known})
+    return kind(**{name: read_value(*known[name], values[name], f"--{prefix}{name}") for name in known})
 
 
 def unknown_field(prefix: str, name: str, known: Iterable[str]) -> str:
@@ -349,12 +385,12 @@ def unknown_field(prefix: str, name: str, known: Iterable[str]) -> str:
     return f"--{prefix}{name} is no field, {meant}expected one of {sorted(known)}"
 
 
-def read_value(declared: Option, kind: Any, value: Any, flag: str) -> Any:
-    """Returns the value of one option, with tuples in place of lists; ValueError, with its flag, where it is none."""
+def read_value(declared: Option, kind: Any, value: Any, name: str) -> Any:
+    """Returns the value of one option, with tuples in place of lists; ValueError, with its name, where it is none."""
     value = as_tuples(value)
 
     def refuse(expected):
-        raise ValueError(f"--{flag} is {short_repr(value)}, expected {expected}; correct it")
+        raise ValueError(f"{name} is {short_repr(value)}, expected {expected}; correct it")
 
     if is_auto(value) and (declared.auto or AUTO in declared.choices):
         return value
@@ -419,5 +455,5 @@ def _numbers(value):
 
 
 def as_tuples(value: Any) -> Any:
-    """Returns a value with tuples in place of lists, which JSON and flags have."""
-    return tuple(map(as_tuples, value)) if isinstance(value, tuple | list) else value
+    """Returns a value with tuples in place of lists, which JSON and flags have, and of ranges."""
+    return tuple(map(as_tuples, value)) if isinstance(value, tuple | list | range) else value

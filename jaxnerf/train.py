@@ -15,7 +15,7 @@ from jaxnerf.runtime import cli
 
 
 def _describe_options():
-    from jaxnerf.training.reference import options_page
+    from jaxnerf.tools.options_page.markdown import options_page
 
     return options_page()
 

@@ -21,11 +21,11 @@ from jaxnerf.core import cameras, rendering
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.types import Camera, Rays
 from jaxnerf.core.views import Views
-from jaxnerf.data import synthetic
 from jaxnerf.data.geometry import bounds
 from jaxnerf.data.images.load_images import load_capture
 from jaxnerf.data.readers import blender
 from jaxnerf.fields import still_life
+from jaxnerf.tools.embedded_scene import render
 
 WHITE = (1.0, 1.0, 1.0)
 SKY = 30.0  # radius of the textured sphere around an unbounded dataset, world units
@@ -351,7 +351,7 @@ def surface_points(shots, *, count=200, seed=0, sharp=0.06):
     for index in range(len(shots)):
         shot = shots[index]
         stack = jax.tree.map(lambda leaf: leaf[None], shot.camera)
-        rays, height = synthetic.scene_rays(stack), shot.camera.height
+        rays, height = render.scene_rays(stack), shot.camera.height
         opaque = np.flatnonzero((rays.far > rays.near) & (shot.pixels[..., 3].ravel() > 0.99 * 65535))
         chosen = rng.choice(opaque, min(-(-count // len(shots)), len(opaque)), replace=False)
         rays = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], rays)
@@ -395,9 +395,9 @@ def _rendered(stack, sky):
 @functools.lru_cache(maxsize=64)
 def _render_once(leaves, structure, sky):
     stack = structure.unflatten([np.frombuffer(data, np.float32).reshape(shape) for shape, data in leaves])
-    pixels = synthetic.render_views(stack)
+    pixels = render.render_views(stack)
     if sky:
-        rays = synthetic.scene_rays(stack)
+        rays = render.scene_rays(stack)
         color = sky_color(rays.origins, rays.viewdirs)
         values = np.concatenate([over(pixels, color), np.ones((len(pixels), 1))], axis=-1)
         pixels = np.rint(values * 65535).astype(np.uint16)

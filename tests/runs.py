@@ -78,6 +78,7 @@ TOOLS = {
     "check": "capture_check",
     "convert": "interop",
     "export": "exporters",
+    "needs": "needs",
     "view": "viewer",
 }
 

@@ -29,6 +29,7 @@ RANKS = {
 ALLOWED = {
     ("models", "fields"),
     ("tools.capture_check", "tools.next_images"),
+    ("tools.needs", "tools.curve"),
     ("tools.viewer", "tools.exporters"),
     ("tools.viewer", "tools.next_images"),
     ("tools.viewer", "tools.uncertainty"),
@@ -36,9 +37,12 @@ ALLOWED = {
 }
 # Where the method hands over to a tool, in a lazy import.
 HANDS_OVER = {
+    ("jaxnerf.train", "tools.options_page"),
     ("jaxnerf.train", "tools.viewer"),
+    ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
     ("jaxnerf.report", "tools.curve"),
+    ("jaxnerf.data.synthetic", "tools.embedded_scene"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
     ("jaxnerf.extend", "tools.uncertainty"),

@@ -1,5 +1,6 @@
 """Trains a toy in one of several processes, which test_processes.py starts: python tests/two_hosts.py FOLDER."""
 
+import dataclasses
 import functools
 import pathlib
 import sys
@@ -48,7 +49,8 @@ def toy_experiment():
         initial_passes=0,
     )
     cells = np.arange(0, 64, 2, dtype=np.int32)
-    return experiment._replace(
+    return dataclasses.replace(
+        experiment,
         model=plain._replace(render=render, grid_schedule=schedule),
         draw=lambda step, positions, data: toy_draw(step, positions, (rays, jnp.array([-1]))),
         prepare=lambda views: (None, TrainData(np.uint32(0), views, None, cells)),

@@ -4,15 +4,18 @@
         [--scenes=lego,embedded] [--steps=6000 | --minutes=2] [--seeds=0,1,2] \
         [--only="no hierarchy,5 octaves"] [--page=FILE.md]
 
-Trains and scores configs/ablation.py and, for as many steps, its variants without one part; then times their steps
-in turn. Writes DIR/ablation.json, DIR/pictures.png and, with the extra `experiments`, DIR/ablation.png, and prints
-the tables. The same command resumes what was interrupted; other seeds, scenes or variants are added. With --page
-the tables replace what lies between <!-- ablation --> and <!-- end of ablation --> in that file.
+Trains and scores the paper's model, scaled down (see `configuration`), and, for as many steps, its variants without
+one part; then times their steps in turn. Writes DIR/ablation.json, DIR/pictures.png and, with the extra `experiments`,
+DIR/ablation.png, and prints the tables. The same command resumes what was interrupted; other seeds, scenes or variants
+are added. With --page the tables replace what lies between <!-- ablation --> and <!-- end of ablation --> in that file.
 """
 
 import pathlib
 import statistics
 import sys
+import types
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,6 +25,7 @@ from PIL import Image, ImageDraw
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
+from jaxnerf.configs import lego_small
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.runtime import cli
@@ -35,13 +39,32 @@ SCENES = {
 _OUT = flags.DEFINE_string("out", None, "Folder of the runs and the measurements.", required=True)
 _SCENES = flags.DEFINE_list("scenes", list(SCENES), f"Scenes to train on, of {tuple(SCENES)}.")
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "Folder of lego; it is expected in $JAXNERF_SCENES otherwise.")
-_STEPS = flags.DEFINE_integer("steps", 0, "Steps of every run; 0: those of configs/ablation.py.", lower_bound=0)
+_STEPS = flags.DEFINE_integer("steps", 0, "Steps of every run; 0: those of `configuration`.", lower_bound=0)
 _MINUTES = flags.DEFINE_float("minutes", 0.0, "Instead of --steps: as many as the complete model takes in this time.")
 _SEEDS = flags.DEFINE_list("seeds", ["0", "1", "2"], "Seeds; every variant is trained with each.")
 _ONLY = flags.DEFINE_list("only", None, "Names of the variants to train; all when not given.")
 _ROUNDS, _TIMED_STEPS = 7, 8  # of timings of all variants in turn; steps timed together
 _SIDE, _LABEL, _COLUMNS = 150, 16, 6  # px of an image, px of the text above it, images in a row
 _VIEW = "002"  # of the test views
+
+
+def configuration(overrides: Mapping[str, Any] = types.MappingProxyType({}), *, seed: int = 0):
+    """Returns the config of lego at 100 x 100: the paper's model scaled down in proportion, with some fields changed.
+
+    The two networks have equal sizes: half the paper's depth and a fifth of its width. Pixels are eight times as
+    large, so the model has an eighth of the samples (their distance in pixels stays the same) and three octaves less.
+    Softplus and the learning rate are those of `lego_small`. Adam updates all parameters, as in the paper.
+    """
+    config = lego_small.get_config()
+    for network in (config.coarse, config.fine):
+        network.depth, network.width, network.skip_layer, network.view_width = 4, 48, 2, 24
+        network.num_freqs, network.num_view_freqs, network.use_viewdirs = 7, 4, True
+    config.sampling.num_coarse, config.sampling.num_fine = 8, 16
+    config.sampling.rule = "segments"
+    train = config.train
+    train.max_steps, train.lr_steps, train.max_seconds = 1000, 1000, 0.0
+    train.save_every, train.muon = 250, 0.0
+    return common.changed(config, {**overrides, "seed": seed})
 
 
 def variants(config, num_views: int) -> dict[str, dict]:
@@ -80,7 +103,7 @@ def main(argv: list[str]) -> None:
     """Trains what is missing, then reports everything that is there."""
     del argv
     out = pathlib.Path(_OUT.value)
-    known = list(variants(common.configuration("ablation"), 4))
+    known = list(variants(configuration(), 4))
     names = common.chosen("--only", _ONLY.value or known, known)
     common.chosen("--scenes", _SCENES.value, list(SCENES))
     seeds = sorted(common.seeds_of("--seeds", _SEEDS.value))
@@ -98,27 +121,27 @@ def main(argv: list[str]) -> None:
 def _measure(scene, kept, save, out, names, seeds):
     """Trains the variants of a scene, one seed after the other; returns whether all were completed."""
     fields = SCENES[scene] | ({"data.dir": _DATA_DIR.value} if _DATA_DIR.value and scene == "lego" else {})
-    base = common.configuration("ablation", fields)
+    base = configuration(fields)
     num_views = len(common.load_split(base, "train").offset)
     changes = variants(base, num_views)
     steps = _steps(kept, base)
     about = kept.setdefault("scenes", {}).setdefault(scene, {"views": num_views, "runs": {}})
 
-    def configuration(name, seed):
+    def config_of(name, seed):
         budget = {"train.max_steps": steps, "train.lr_steps": steps}
-        return common.configuration("ablation", {**fields, **budget, **changes[name]}, seed=seed)
+        return configuration({**fields, **budget, **changes[name]}, seed=seed)
 
     for seed in seeds:
         for name in names:
             print(f"{scene}, seed {seed}: {name}", file=sys.stderr, flush=True)
-            results = common.run(configuration(name, seed), _workdir(out, scene, name, seed))
+            results = common.run(config_of(name, seed), _workdir(out, scene, name, seed))
             if results is None:
                 return False
             kept_of = ("psnr", "ssim", "training_seconds", "seconds_per_frame", "parameters", "views")
             about["runs"].setdefault(name, {})[str(seed)] = {key: results[key] for key in kept_of}
             save()
     # Times are relative to the complete model, so it is always among them; the scene makes no difference.
-    _measure_cost(kept, {name: configuration(name, 0) for name in {*names, COMPLETE}})
+    _measure_cost(kept, {name: config_of(name, 0) for name in {*names, COMPLETE}})
     save()
     return True
 

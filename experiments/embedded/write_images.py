@@ -2,7 +2,7 @@
 
     python experiments/embedded/write_images.py
 
-Run it after a change of the scene or of its renderer; tests/data/test_synthetic.py finds that it is needed. It takes
+Run it after a change of the scene or of its renderer; tests/tools/embedded_scene finds that it is needed. It takes
 about a minute on one core.
 """
 
@@ -10,6 +10,7 @@ import numpy as np
 from absl import app
 
 from jaxnerf.data import synthetic
+from jaxnerf.tools.embedded_scene.render import render_views
 
 
 def main(argv: list[str]) -> None:
@@ -18,7 +19,7 @@ def main(argv: list[str]) -> None:
     splits = {}
     for split in ("train", "test"):
         stack = synthetic._cameras(split, synthetic.SHIPPED_SIZE)
-        pixels = synthetic.render_views(stack, synthetic.SHIPPED_FINISH)
+        pixels = render_views(stack)
         splits[split] = compressible(pixels.reshape(-1, synthetic.SHIPPED_SIZE, synthetic.SHIPPED_SIZE, 4))
     np.savez_compressed(synthetic.SHIPPED, **splits)
     print(f"{synthetic.SHIPPED}: {synthetic.SHIPPED.stat().st_size / 1e6:.1f} MB")

@@ -3,8 +3,10 @@
 import collections
 import functools
 import math
+import os
 import pathlib
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -295,6 +297,24 @@ def _trained(config, folder, split=None):
         "steps": row["step"],
         "rays": row["rays"],
     }
+
+
+def cpu_cores(context: Context) -> dict[str, Any]:
+    """Trains and renders fox on this machine's CPU, with 1, 2, 4 and more of its cores, by the study of speed/cores.py.
+
+    The measurements are processes of their own, as this one has JAX on the device.
+    """
+    usable = len(os.sched_getaffinity(0))
+    counts = [count for count in (1, 2, 4, 8, 16) if count <= usable][: 2 if context.tiny else None]
+    out = context.folder / "cpu_cores"
+    command = [sys.executable, str(common.ROOT / "experiments" / "speed" / "cores.py"), f"--out={out}", "--noparts"]
+    command += [f"--cores={','.join(map(str, counts))}", "--runs=fox_200", "--rounds=1", "--gain=1"]
+    command += [f"--seconds={1 if context.tiny else 10}", f"--tiny={context.tiny}"]
+    done = subprocess.run(command, env={**os.environ, "JAX_PLATFORMS": "cpu"}, capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(f"{' '.join(command)}: {(done.stderr.splitlines() or ['no output'])[-1]}")
+    found = {count: [out / f"fox_200-{kind}-{count}-0.json" for kind in ("run", "frame")] for count in counts}
+    return {"rows": [{"cores": count, **common.read_json(a), **common.read_json(b)} for count, (a, b) in found.items()]}
 
 
 def frame(context: Context) -> dict[str, Any]:

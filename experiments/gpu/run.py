@@ -62,6 +62,7 @@ PIECES = {
     "fern": Piece(functools.partial(pieces.scene, name="fern"), 3.5, "Fern at full size, 120 s"),
     "can": Piece(functools.partial(pieces.scene, name="can"), 3.5, "Can at full size, 120 s"),
     "memory": Piece(pieces.memory_use, 2, "Memory against batch and chunk"),
+    "cpu_cores": Piece(pieces.cpu_cores, 3, "More cores: fox on the CPU of the machine, 10 s"),
 }
 
 _MINUTES = flags.DEFINE_float("minutes", 9.0, "The time of this call; what does not fit waits for the next one.")

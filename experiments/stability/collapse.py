@@ -34,6 +34,7 @@ from jaxnerf import Views, pixel_grid, psnr
 from jaxnerf.data import synthetic
 from jaxnerf.fields import hash_grid
 from jaxnerf.runtime import cli
+from jaxnerf.tools.embedded_scene.render import render_views
 from jaxnerf.training import auto_config, build, dead_networks
 from jaxnerf.training.state import create_state
 
@@ -109,7 +110,7 @@ class Study:
             allowed: train.max_reinits.
         """
         config = common.changed(self._experiment.config, {"seed": seed, "train.max_reinits": allowed})
-        experiment = self._experiment._replace(config=config)
+        experiment = dataclasses.replace(self._experiment, config=config)
         reinitialize = dead_networks.make_reinitializer(experiment, f"seed {seed}")
         state = create_state(experiment.model, experiment.optimizer, seed)
         data = self._step.data._replace(seed=np.uint32(seed))
@@ -184,7 +185,7 @@ def painted_views(size: int, background: str) -> Views:
     """Returns views of the still life, [P, 3] uint8, in front of a painted background; cameras have a distance of 1."""
     views = synthetic.load_synthetic(size=size)
     stack = dataclasses.replace(views.cameras, focal=views.cameras.focal / np.float32(_FIELD_OF_VIEW))
-    rgba = synthetic.render_views(stack, num_segments=128) / 65535
+    rgba = render_views(stack, num_segments=128) / 65535
     behind = BACKGROUNDS[background]
     rgb = behind + _CONTRAST * rgba[:, 3:] * (rgba[:, :3] - behind)
     to_world = np.array(stack.to_world)

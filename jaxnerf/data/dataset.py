@@ -16,9 +16,9 @@ from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
 from jaxnerf.data.scene import BACKGROUNDS
 from jaxnerf.data.shared_views import found_by_split
+from jaxnerf.data.synthetic import FINISHES
 from jaxnerf.data.view_selection import select_views, selection
-from jaxnerf.fields import still_life
-from jaxnerf.options import AUTO, Changes, Options, between, declarations, infer, is_auto, option, replaced, values_of
+from jaxnerf.options import AUTO, Changes, Options, between, declarations, infer, is_auto, option, read_value, replaced
 from jaxnerf.registry import READERS, needs_folder
 
 WORLDS = {
@@ -59,7 +59,7 @@ class DataOptions(Options):
     finish: str = option(
         "usual",
         "surfaces of the embedded scene; `matt` ones do not depend on the view direction",
-        choices=tuple(sorted(still_life.FINISHES)),
+        choices=FINISHES,
     )
     near: float = option(
         AUTO,
@@ -131,9 +131,13 @@ def load_dataset(dir: str | os.PathLike, *, split: str = "train", **options: Any
         ValueError: names the file, what was found, what is expected and what to do.
     """
     inferred = DataOptions(format=AUTO, background=AUTO, world=AUTO, ndc=AUTO)  # type: ignore[arg-type]
-    known = values_of(inferred)
+    known = declarations(DataOptions)
     if unknown := sorted(set(options) - set(known)):
         raise ValueError(f"load_dataset: {unknown[0]} is no option, expected one of {', '.join(known)}; correct it")
+    plain = {
+        name: value.tolist() if isinstance(value, np.generic | np.ndarray) else value for name, value in options.items()
+    }
+    options = {name: read_value(*known[name], value, f"load_dataset: {name}") for name, value in plain.items()}
     return load_split(replaced(inferred, **{"dir": str(dir)} | options), split)
 
 
@@ -382,8 +386,6 @@ def dataset_folder(name: str) -> pathlib.Path:
 
 def background_of(data: DataOptions) -> tuple[float, float, float] | None:
     """Returns the colour behind alpha, or None where alpha is dropped."""
-    if data.background not in BACKGROUNDS:
-        raise ValueError(f"data.background is {data.background!r}, expected one of {sorted(BACKGROUNDS)}; correct it")
     return BACKGROUNDS[data.background]
 
 

@@ -9,7 +9,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt, mean_color
 from jaxnerf.data.geometry import visual_hull
 from jaxnerf.data.ray_batches import view_rays
-from jaxnerf.options import AUTO, Box, Options, infer, is_auto, numbers, option, replaced
+from jaxnerf.options import AUTO, Ablation, Box, Options, infer, is_auto, numbers, option, replaced
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 # Space is not contracted as far as the cameras, so that cells near them are small: large ones fill with fog. But the
@@ -24,6 +24,11 @@ def _wrong_color(color):
     return None if right else "red, green and blue in [0, 1], or () for black"
 
 
+def _contraction(value, options, facts):
+    """Returns True where contracted space could hold more than the box; see `Ablation`."""
+    return None if facts.ndc or facts.has_alpha else True
+
+
 @dataclasses.dataclass(frozen=True)
 class SceneOptions(Options):
     """The options of the scene: where it is, and what is behind it."""
@@ -32,9 +37,17 @@ class SceneOptions(Options):
         True,
         "whether alpha bounds the scene: its box, and the cells of an occupancy grid, of which those outside the "
         "visual hull of the alpha channels are empty from the start",
+        ablations=(
+            Ablation(
+                "visual hull", without=lambda value, options, facts: False if facts.has_alpha else None, more=True
+            ),
+        ),
     )
     contracted: bool = option(
-        AUTO, "whether the box holds all of space; positions outside its inner half are then contracted", auto=True
+        AUTO,
+        "whether the box holds all of space; positions outside its inner half are then contracted",
+        auto=True,
+        ablations=(Ablation("contraction of space", without=False, more=_contraction),),
     )
     lower: tuple[float, ...] = option(AUTO, "a corner of the box", unit="world units", auto=True, check=numbers(3))
     upper: tuple[float, ...] = option(
@@ -46,6 +59,7 @@ class SceneOptions(Options):
         "auto: the mean of the training images where space is contracted and empty cells are skipped, otherwise black.",
         auto=True,
         check=_wrong_color,
+        ablations=(Ablation("colour behind the scene", without=()),),
     )
 
     @property

@@ -1,5 +1,6 @@
 """Restores a trained run as functions for other code."""
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -71,7 +72,7 @@ def _restore(workdir, config, data_dir, settings, *, crop):
     config, _ = auto_config.resolve_for_device(config, training=False)
     experiment = build.render_parts(config)
     read = functools.partial(_load_split, workdir, config, bool(data_dir), experiment.load_split)
-    experiment = experiment._replace(load_split=read)
+    experiment = dataclasses.replace(experiment, load_split=read)
     checkpoints = Checkpoints(workdir)
     model, bake = experiment.model, None
     if config.eval.bake_occupancy and model.grid_schedule is None:

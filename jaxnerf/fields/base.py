@@ -15,12 +15,19 @@ from jaxnerf.core import contraction
 from jaxnerf.core.loops import is_cpu
 from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import SceneFn, Vector
-from jaxnerf.options import Facts
+from jaxnerf.options import Ablation, Facts, double, half
 
 _LEAST_SPREAD = 4.0  # of footprints: those of a hand-held capture differ by up to 1.7, those of four scales by 8
 _CACHE_ROW = 512  # float32 numbers, 2 KiB
 _FEW_RAYS = 16  # with fewer rays, padding by a whole ray costs too much
 _MORE_SAMPLES = 32  # padding of each ray, if there are few
+
+# Parts of the method that several fields have.
+VIEW_PART = Ablation("view dependence", without=False, more=True)
+WIDTH_PART = Ablation("width of the networks", less=half, more=double)
+PREFILTER_PART = Ablation(
+    "footprints of pixels", without=False, more=lambda value, options, facts: None if facts.ndc else True
+)
 
 
 class Field(NamedTuple):

@@ -16,9 +16,9 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
 from jaxnerf.core.types import Vector
-from jaxnerf.fields.base import Dense, Field, apply_network, infer_prefilter
+from jaxnerf.fields.base import PREFILTER_PART, VIEW_PART, WIDTH_PART, Dense, Field, apply_network, infer_prefilter
 from jaxnerf.fields.hash_interpolation import TableLevel, interpolate, stored, transposed_product
-from jaxnerf.options import Box, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
+from jaxnerf.options import Ablation, Box, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
 
 _glorot = linen.initializers.glorot_uniform()
@@ -48,6 +48,18 @@ _FINE_DEPTH, _DEPTH = 3, 2
 _CPU_WIDTH, _ACCELERATOR_WIDTH, _ACCELERATOR_ROWS = 64, 128, 4
 
 
+_LEVELS_PART = Ablation(
+    "levels",
+    less=lambda levels, *_: levels[:-1] or None,
+    more=lambda levels, *_: (*levels, 2 * levels[-1]) if len(levels) < _MAX_LEVELS and levels[-1] < 2**19 else None,
+)
+_ROWS_PART = Ablation(  # a level with fewer vertices has no more rows than these
+    "rows of the table",
+    less=lambda rows, options, _: rows // 2 if 1 < rows < 2 * options.resolutions[-1] ** 3 else None,
+    more=lambda rows, options, _: 2 * rows if rows < options.resolutions[-1] ** 3 else None,
+)
+
+
 def _wrong_levels(levels):
     right = 0 < len(levels) <= _MAX_LEVELS and all(isinstance(each, int) and 2 <= each <= 2**20 for each in levels)
     return None if right else f"1 to {_MAX_LEVELS} whole numbers, each from 2 to 2^20"
@@ -58,7 +70,11 @@ class HashGridOptions(Options):
     """The options of the hash grid."""
 
     resolutions: tuple[int, ...] = option(
-        "auto", "vertices along the longest side, one number per level", auto=True, check=_wrong_levels
+        "auto",
+        "vertices along the longest side, one number per level",
+        auto=True,
+        check=_wrong_levels,
+        ablations=(_LEVELS_PART,),
     )
     features_per_level: int = option(4, "features of a vertex", range=at_least(1))
     table_size: int = option(
@@ -67,28 +83,38 @@ class HashGridOptions(Options):
         "image's side; four times as many on an accelerator",
         range=at_least(1),
         auto=True,
+        ablations=(_ROWS_PART,),
     )
     width: int = option(
         64,
         "outputs of a hidden layer of the density network; auto: 64 on a CPU, 128 on an accelerator",
         range=at_least(1),
         auto=True,
+        ablations=(WIDTH_PART,),
     )
     view_depth: int = option(
         2,
         "hidden layers of the colour network; auto: 3 on a CPU where the occupancy grid has fine cells, else 2",
         range=between(0, _MAX_LAYERS),
         auto=True,
+        ablations=(
+            Ablation("depth of the networks", less=lambda n, *_: n // 2 if n else None, more=lambda n, *_: n + 1),
+        ),
     )
     view_width: int = option(
-        128, "outputs of a hidden layer of the colour network; auto: as `width`", range=at_least(1), auto=True
+        128,
+        "outputs of a hidden layer of the colour network; auto: as `width`",
+        range=at_least(1),
+        auto=True,
+        ablations=(WIDTH_PART,),
     )
-    use_viewdirs: bool = option(True, "whether colour depends on the direction")
+    use_viewdirs: bool = option(True, "whether colour depends on the direction", ablations=(VIEW_PART,))
     prefilter: bool = option(
         "auto",
         "Whether the features of cells that are smaller than a pixel's footprint are damped (arXiv:2304.06706, Eq. 6). "
         "auto: where the footprints of the training images differ by 4 or more.",
         auto=True,
+        ablations=(PREFILTER_PART,),
     )
     compute_dtype: str = option(
         "auto",

@@ -12,8 +12,30 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.encoding import encode_planes, frustum_variance, planes_of
 from jaxnerf.core.sampling import ONE_KEY, normal, typed_key
-from jaxnerf.fields.base import Affine, Dense, Field, apply_network, infer_prefilter
-from jaxnerf.options import DTYPES, Box, Device, Facts, Options, at_least, between, infer, is_auto, option
+from jaxnerf.fields.base import (
+    PREFILTER_PART,
+    VIEW_PART,
+    WIDTH_PART,
+    Affine,
+    Dense,
+    Field,
+    apply_network,
+    infer_prefilter,
+)
+from jaxnerf.options import (
+    DTYPES,
+    Ablation,
+    Box,
+    Device,
+    Facts,
+    Options,
+    at_least,
+    between,
+    double,
+    infer,
+    is_auto,
+    option,
+)
 from jaxnerf.registry import Part
 
 _MAX_LAYERS = 64  # JAX compiles each layer on its own; hundreds of them take hours
@@ -30,23 +52,41 @@ class MlpOptions(Options):
 
     needs_box = False
 
-    depth: int = option(8, "layers before the density", range=between(1, _MAX_LAYERS))
-    width: int = option(256, "outputs of a layer", range=at_least(1))
+    depth: int = option(
+        8,
+        "layers before the density",
+        range=between(1, _MAX_LAYERS),
+        ablations=(Ablation("depth of the networks", less=lambda n, *_: n // 2 or None, more=double),),
+    )
+    width: int = option(256, "outputs of a layer", range=at_least(1), ablations=(WIDTH_PART,))
     skip_layer: int = option(
         4, "index of the layer after which the encoded position is concatenated again", range=at_least(0)
     )
-    view_width: int = option(128, "outputs of the layer that takes the direction", range=at_least(1))
-    num_freqs: int = option(10, "octaves of the position's encoding", range=between(0, _MAX_OCTAVES), auto=True)
+    view_width: int = option(
+        128, "outputs of the layer that takes the direction", range=at_least(1), ablations=(WIDTH_PART,)
+    )
+    num_freqs: int = option(
+        10,
+        "octaves of the position's encoding",
+        range=between(0, _MAX_OCTAVES),
+        auto=True,
+        ablations=(Ablation("octaves", less=lambda n, *_: n - 2 if n > 2 else None, more=lambda n, *_: n + 2),),
+    )
     num_view_freqs: int = option(4, "octaves of the direction's encoding", range=between(0, _MAX_OCTAVES))
-    encode: bool = option(True, "whether position and direction have a positional encoding")
+    encode: bool = option(
+        True,
+        "whether position and direction have a positional encoding",
+        ablations=(Ablation("positional encoding", without=False, more=True),),
+    )
     prefilter: bool = option(
         False,
         "Whether the position's encoding is its mean over the part of the pixel's cone around a sample (integrated "
         "positional encoding, arXiv:2103.13415), taken to be no shorter than the pixel is wide there. The network also "
         "reads what the mean leaves of each octave. auto: as for `hash_grid.prefilter`.",
         auto=True,
+        ablations=(PREFILTER_PART,),
     )
-    use_viewdirs: bool = option(True, "whether colour depends on the direction")
+    use_viewdirs: bool = option(True, "whether colour depends on the direction", ablations=(VIEW_PART,))
     density_activation: str = option("relu", "activation of the density", choices=tuple(sorted(DENSITY_ACTIVATIONS)))
     density_bias: float = option(0.0, "added to the density before its activation")
     compute_dtype: str = option(

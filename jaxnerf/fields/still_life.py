@@ -1,8 +1,7 @@
 """The embedded scene: a still life in closed form, inside the box +-1.2.
 
 A striped pillar, a banded ring, a block of blue glass and a polished ball stand on a checked plinth. A lamp, a
-dark core in amber glass, floats above them. Only the ball's colour depends on the direction; with the finish "matt"
-no colour does, with "shiny" those of the pillar, the ring and the lamp's core do, too.
+dark core in amber glass, floats above them. Only the ball's colour depends on the direction.
 
 A body is a signed distance d (negative inside), a peak density and a colour. Its density is
 peak * sigmoid(-d / width), thin enough for a crisp outline and smooth enough for a quadrature to converge.
@@ -21,10 +20,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.types import check_shapes
 from jaxnerf.fields import portable_math
 
-_POLISH, _SHEEN = 24, 6  # exponents of highlights: small and wide ones
 WIDTH = 0.015  # world units, over which a body's density falls at its outline
-FINISHES = {"usual": ("ball",), "matt": (), "shiny": ("ball", "pillar", "ring", "lamp core")}  # what has highlights
-
 
 Positions = Float[ArrayLike, "*batch samples 3"]
 Directions = Float[ArrayLike, "*batch #samples 3"]
@@ -35,14 +31,12 @@ class Body(NamedTuple):
     """A body of the still life.
 
     Attributes:
-        name: of the body.
         peak: density inside, 1 / world unit.
         lower, upper: [3] corners of a box that contains it.
         distance: (x, y, z) -> signed distance [...] from its outline, or a lower bound outside.
-        colour: (x, y, z, direction) -> three channels [...]; direction is None without a highlight.
+        colour: (x, y, z, direction) -> three channels [...]; direction is None without highlights.
     """
 
-    name: str
     peak: float
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
@@ -65,11 +59,6 @@ def still_life(x: Positions, viewdirs: Directions) -> Output:
         density [..., S] in 1 / world unit, at most 50 in a single body; rgb [..., S, 3] in [0, 1]. In empty
         space the colour is a mean of all bodies', which no ray shows. Gradients are finite everywhere.
     """
-    return finished_still_life(x, viewdirs, "usual")
-
-
-def finished_still_life(x: Positions, viewdirs: Directions, finish: str) -> Output:
-    """Returns the density and the colour of `still_life` with the highlights of one of the FINISHES."""
     pattern = "... 1 3" if jnp.shape(viewdirs)[-2:-1] == (1,) else "... S 3"
     check_shapes("still_life", x=(x, "... S 3"), viewdirs=(viewdirs, pattern))
     x, viewdirs = jnp.asarray(x), jnp.asarray(viewdirs)
@@ -78,7 +67,7 @@ def finished_still_life(x: Positions, viewdirs: Directions, finish: str) -> Outp
     density, total_part, rgb = 0.0, 0.0, (0.0, 0.0, 0.0)
     for body in BODIES:
         density_of_body = body.density(body.distance(*place))
-        color = body.color(*place, direction if body.name in FINISHES[finish] else None)
+        color = body.color(*place, direction)
         # Far from all bodies the densities are 0 in float32. The tiny part keeps the colour from being 0 / 0,
         # and its square, which the gradient divides by, from being 0.
         part = density_of_body + 1e-12
@@ -126,7 +115,7 @@ def _pillar_color(x, y, z, direction):
     turn = z / 0.60  # one stripe winds round once in 0.6 units
     stripes = _step((x * _wave(turn + 0.25) + y * _wave(turn)) / _norm(x, y), 0.12)
     color = _mix((0.02, 0.36, 0.25), (0.95, 0.86, 0.25), stripes)
-    return _shaded(color, (x, y, cap), direction, _SHEEN)
+    return _scale(color, _lambert(x, y, cap))
 
 
 def _ring_place(x, y, z):
@@ -149,7 +138,7 @@ def _ring_color(x, y, z, direction):
     color = _mix((0.32, 0.05, 0.42), (0.25, 0.78, 0.85), bands)
     outward = tube / spoke * along
     normal = 0.8 * outward + 0.6 * across, 0.8 * across - 0.6 * outward, tube / spoke * z
-    return _shaded(color, normal, direction, _SHEEN)
+    return _scale(color, _lambert(*normal))
 
 
 def _brick(x, y, z):
@@ -172,7 +161,7 @@ def _lamp_core(x, y, z):
 
 
 def _lamp_core_color(x, y, z, direction):
-    return _shaded((0.45, 0.02, 0.10), _lamp_place(x, y, z), direction, _SHEEN)
+    return _scale((0.45, 0.02, 0.10), _lambert(*_lamp_place(x, y, z)))
 
 
 def _lamp_glass(x, y, z):
@@ -192,18 +181,16 @@ def _ball(x, y, z):
 
 
 def _ball_color(x, y, z, direction):
-    return _shaded((0.70, 0.05, 0.08), _ball_place(x, y, z), direction, _POLISH)
-
-
-def _shaded(color, normal, direction, exponent):
-    """Returns a surface's colour: matt if direction is None, else with the highlight of Blinn and Phong."""
-    base = _scale(color, _lambert(*normal))
+    """Returns the colour with the highlight of Blinn and Phong."""
+    normal = _ball_place(x, y, z)
+    base = _scale((0.70, 0.05, 0.08), _lambert(*normal))
     if direction is None:
         return base
     # Brightest where the normal halves the angle between light and camera.
     halfway = tuple(towards - away for towards, away in zip(_light(), direction, strict=True))
     aligned = sum(a * b for a, b in zip(normal, halfway, strict=True)) / (_norm(*normal) * _norm(*halfway))
-    highlight = 0.9 * _power(_namespace(aligned).maximum(aligned, 0.0), exponent)
+    eighth = _square(_square(_square(_namespace(aligned).maximum(aligned, 0.0))))  # products, whose bits are defined
+    highlight = 0.9 * (eighth * _square(eighth))
     return tuple(value + highlight * (1 - value) for value in base)
 
 
@@ -250,23 +237,16 @@ def _sigmoid(x):
     return portable_math.sigmoid(x) if isinstance(x, np.ndarray) else jax.nn.sigmoid(x)
 
 
-def _power(x, exponent):
-    """Computes x^exponent by products, whose bits are defined."""
-    result = None
-    while exponent:
-        if exponent & 1:
-            result = x if result is None else result * x
-        exponent >>= 1
-        x = x * x if exponent else x
-    return result
+def _square(x):
+    return x * x
 
 
 BODIES = (
-    Body("plinth", 50.0, (-0.98, -0.98, -0.81), (0.98, 0.98, -0.61), _plinth, _plinth_color),
-    Body("pillar", 50.0, (-0.64, 0.22, -0.66), (-0.16, 0.70, 0.86), _pillar, _pillar_color),
-    Body("ring", 50.0, (-0.02, -0.06, -0.62), (0.98, 0.78, 0.54), _ring, _ring_color),
-    Body("brick", 3.5, (0.09, -0.75, -0.62), (0.75, -0.09, 0.04), _brick, _brick_color),
-    Body("lamp core", 50.0, (0.07, -0.25, 0.47), (0.37, 0.05, 0.77), _lamp_core, _lamp_core_color),
-    Body("lamp glass", 2.5, (-0.14, -0.46, 0.26), (0.58, 0.26, 0.98), _lamp_glass, _lamp_glass_color),
-    Body("ball", 50.0, (-0.82, -0.82, -0.62), (0.06, 0.06, 0.26), _ball, _ball_color),
+    Body(50.0, (-0.98, -0.98, -0.81), (0.98, 0.98, -0.61), _plinth, _plinth_color),
+    Body(50.0, (-0.64, 0.22, -0.66), (-0.16, 0.70, 0.86), _pillar, _pillar_color),
+    Body(50.0, (-0.02, -0.06, -0.62), (0.98, 0.78, 0.54), _ring, _ring_color),
+    Body(3.5, (0.09, -0.75, -0.62), (0.75, -0.09, 0.04), _brick, _brick_color),
+    Body(50.0, (0.07, -0.25, 0.47), (0.37, 0.05, 0.77), _lamp_core, _lamp_core_color),
+    Body(2.5, (-0.14, -0.46, 0.26), (0.58, 0.26, 0.98), _lamp_glass, _lamp_glass_color),
+    Body(50.0, (-0.82, -0.82, -0.62), (0.06, 0.06, 0.26), _ball, _ball_color),
 )

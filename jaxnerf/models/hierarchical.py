@@ -12,10 +12,13 @@ from jaxnerf.core.types import Background, without_samples
 from jaxnerf.fields.base import Field, field_scene, needs_of_fields
 from jaxnerf.fields.mlp import FIELD as MLP
 from jaxnerf.models.base import Model, SamplerContext
-from jaxnerf.options import Options, at_least, between, option
+from jaxnerf.options import Ablation, Options, at_least, between, option
 from jaxnerf.registry import Part
 
 _MAX_SAMPLES = 16_384  # per ray
+_SAMPLES_PART = Ablation(  # `gauss` takes pairs
+    "samples a ray", less=lambda n, *_: n // 4 * 2 if n >= 4 else None, more=lambda n, *_: 2 * n if n else None
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +27,20 @@ class HierarchicalOptions(Options):
 
     needs_box = False
 
-    num_coarse: int = option(64, "samples per ray for the coarse network", range=between(1, _MAX_SAMPLES))
+    num_coarse: int = option(
+        64,
+        "samples per ray for the coarse network",
+        range=between(1, _MAX_SAMPLES),
+        ablations=(
+            _SAMPLES_PART,
+            Ablation("coarse network", lambda n, options, _: n + options.num_fine if options.num_fine else None),
+        ),
+    )
     num_fine: int = option(
-        128, "additional samples per ray for the fine network; 0: no coarse network", range=between(0, _MAX_SAMPLES)
+        128,
+        "additional samples per ray for the fine network; 0: no coarse network",
+        range=between(0, _MAX_SAMPLES),
+        ablations=(_SAMPLES_PART, Ablation("coarse network", without=0)),
     )
     rule: str = option(
         "segments",

@@ -24,6 +24,7 @@ from jaxnerf.models.grid_schedule import GridSchedule, make_grid_schedule
 from jaxnerf.options import (
     FRACTION,
     POSITIVE,
+    Ablation,
     Box,
     Changes,
     Device,
@@ -31,6 +32,7 @@ from jaxnerf.options import (
     Options,
     at_least,
     between,
+    double,
     infer,
     is_auto,
     option,
@@ -59,7 +61,14 @@ class OccupancyOptions(Options):
 
     skips_empty_cells = True
 
-    step_size: float = option("auto", "distance of samples", unit="world units", range=POSITIVE, auto=True)
+    step_size: float = option(
+        "auto",
+        "distance of samples",
+        unit="world units",
+        range=POSITIVE,
+        auto=True,
+        ablations=(Ablation("samples a ray", less=double, more=lambda step, *_: step / 2),),
+    )
     resolution: int = option("auto", "cells along the longest side", range=at_least(1), auto=True)
     threshold: float = option(0.01, "opacity over one step below which a cell is empty", range=at_least(0))
     update_every: int = option(64, "training steps between updates of the grid", range=at_least(1))

@@ -25,6 +25,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 
 CPU_MICROBATCH_SAMPLES = 12_288  # the fastest in experiments/speed: activations stay in the cache
 _MAX_THREADS = 8  # of a step on a CPU
+_IN_ONE_PROGRAM = 2  # parts of the rays: of more, XLA runs few at once
 _MAX_SHARED = 4  # a run compiles at most two: of one step, and of several in a dispatch
 _shared: dict[Any, Any] | None = None  # compiled steps, by what they were compiled from; None: they are not shared
 
@@ -65,8 +66,8 @@ def compile_step(
         batch_size: rays per step, over all devices of all processes.
         microbatch_size: rays whose gradient is computed at once; None, or more than a device has: all of them.
         devices: of all processes; None: all. On several the step is jitted over a mesh of them.
-        num_threads: of the host, that compute the gradient of an equal part of the rays each, on one device; see
-            `threads_of_step`. For more than one the step must be a `TrainStep`.
+        num_threads: that compute the gradient of an equal part of the rays each, on one device, see `threads_of_step`:
+            two those of one program, more by threads of the host. For more than one the step must be a `TrainStep`.
 
     Returns:
         step, state, data: step(state, data) -> (state, metrics) consumes its state; step.compiled is what JAX
@@ -84,8 +85,8 @@ def compile_step(
     single = len(devices) == 1
     everywhere = SingleDeviceSharding(devices[0]) if single else NamedSharding(mesh, P())
     if single:
-        parts = list(place(positions, everywhere))
-        jitted, positions = jax.jit(train_step, donate_argnums=0), parts if num_threads > 1 else parts[0]
+        positions = place(positions if num_threads > 1 else positions[0], everywhere)
+        jitted = jax.jit(train_step, donate_argnums=0)
     else:
         jitted, positions = _sharded(train_step, mesh), place(positions, NamedSharding(mesh, P("batch")))
     make = state if callable(state) else lambda: state
@@ -97,7 +98,8 @@ def compile_step(
     create = unoptimized(state, devices[0]) if callable(state) else make
     with ThreadPoolExecutor(1) as pool:
         made = None if devices[0].platform == "cpu" else pool.submit(create)
-        if num_threads > 1:
+        if num_threads > _IN_ONE_PROGRAM:
+            positions = list(positions)
             compiled = _compile_on_threads(train_step, shapes, data, positions, devices)
         else:
             compiled = _compiled(jitted.lower(shapes, data, positions), devices)

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,8 @@ from jaxnerf.training.step import ProgressData, StepLoss, TrainData
 _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIELDS)
 
 
-class RenderParts(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class RenderParts:
     """A run's config, and the functions that it describes and that images are rendered with.
 
     Attributes:
@@ -56,11 +57,11 @@ class RenderParts(NamedTuple):
     background: tuple[float, ...] | None
 
 
-class Experiment(NamedTuple):
-    """A run's config, and the functions that it describes.
+@dataclasses.dataclass(frozen=True)
+class Experiment(RenderParts):
+    """A run's config, and the functions that it describes: those that render, and those that train.
 
     Attributes:
-        config, model, cameras, load_split, view_rays, world_depth, background: see `RenderParts`.
         losses: those whose weight is not 0.
         optimizer: see `make_optimizer`.
         schedule: step -> learning rate.
@@ -70,13 +71,6 @@ class Experiment(NamedTuple):
         pixel_rays: the several rays of a pixel that draw takes; None: each ray is a pixel.
     """
 
-    config: RunConfig
-    model: Model
-    cameras: CameraParameters | None
-    load_split: Callable[..., Views]
-    view_rays: Callable[..., Any]
-    world_depth: Callable[..., Any]
-    background: tuple[float, ...] | None
     losses: tuple[StepLoss, ...]
     optimizer: optax.GradientTransformation
     schedule: Callable[[int], float]
@@ -99,7 +93,7 @@ def build(config: Config) -> Experiment:
     if train.deterministic and jax.default_backend() != "cpu":  # there all sums have a fixed order
         _check_fixed_order(losses, cameras)
         model = model._replace(render=build_model(config, fixed_order=True).render)
-        parts = parts._replace(model=model)
+        parts = dataclasses.replace(parts, model=model)
     optimizer, schedule = make_optimizer(train, None if cameras is None else config.cameras)
     needs = [*losses, cameras] if cameras is not None else losses
     extras = tuple(sorted({need for part in needs for need in part.needs}))
@@ -128,7 +122,7 @@ def build(config: Config) -> Experiment:
         return ray_batches.draw_pixels(data.seed, step, positions, data.views, data.active_pixels, **common)[1]
 
     return Experiment(
-        **parts._asdict(),
+        **vars(parts),
         losses=losses,
         optimizer=optimizer,
         schedule=schedule,

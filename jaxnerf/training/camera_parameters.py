@@ -19,7 +19,7 @@ from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Batch, Camera, Rays, Rendering
 from jaxnerf.core.views import Views
 from jaxnerf.models.base import Model
-from jaxnerf.options import POSITIVE, Changes, Device, Facts, Options, at_least, infer, option
+from jaxnerf.options import POSITIVE, Ablation, Changes, Device, Facts, Options, at_least, infer, option
 
 CAMERAS = "cameras"  # the entry of the parameters; all other entries are networks
 
@@ -31,10 +31,16 @@ class CameraOptions(Options):
     changes = Changes.TRAINING
 
     exposure: bool = option(
-        False, "whether each image has a gain per colour channel; renderings show the scene without it"
+        False,
+        "whether each image has a gain per colour channel; renderings show the scene without it",
+        ablations=(Ablation("exposures", without=False, more=True, aligned="colors"),),
     )
     exposure_lr: float = option(1e-2, "initial learning rate; it decays as that of the networks", range=POSITIVE)
-    refine: bool = option(False, "whether each pose and, common to all images, the focal length are corrected")
+    refine: bool = option(
+        False,
+        "whether each pose and, common to all images, the focal length are corrected",
+        ablations=(Ablation("refined poses", without=False, more=True, aligned="pose"),),
+    )
     refine_lr: float = option(
         5e-4,
         "initial learning rate of the corrections",

@@ -257,7 +257,7 @@ def identity(config: RunConfig) -> str:
 
 def _read_weight(name, weight):
     declaration = weight_option(name)._replace(auto=is_auto(weight))  # a loss that is not registered may have "auto"
-    return read_value(declaration, Schedule, weight, f"config.losses.{name}")
+    return read_value(declaration, Schedule, weight, f"--config.losses.{name}")
 
 
 def _is_section(kind):

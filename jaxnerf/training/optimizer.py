@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxnerf.core.loops import is_cpu
-from jaxnerf.options import BELOW_ONE, POSITIVE, Changes, Options, at_least, option
+from jaxnerf.options import BELOW_ONE, POSITIVE, Ablation, Changes, Options, at_least, option
 from jaxnerf.training.camera_parameters import CAMERAS, CameraOptions
 from jaxnerf.training.state import PROGRESS, TrainState
 
@@ -64,6 +64,7 @@ class OptimizerOptions(Options):
         0.0,
         "Above 0: evaluation uses parameters averaged over about the last 1 / power of all steps (arXiv:1212.1824).",
         range=at_least(0),
+        ablations=(Ablation("averaged parameters", without=0.0, more=lambda power, *_: None if power else 10.0),),
     )
 
 

@@ -6,7 +6,7 @@ import jax
 
 from jaxnerf.data.ray_batches import BATCHINGS
 from jaxnerf.models.base import ViewOptions
-from jaxnerf.options import Box, Changes, Device, Facts, at_least, between, infer, is_auto, option
+from jaxnerf.options import Ablation, Box, Changes, Device, Facts, at_least, between, infer, is_auto, option
 from jaxnerf.runtime import devices
 from jaxnerf.training.optimizer import OptimizerOptions
 
@@ -43,6 +43,11 @@ class TrainOptions(OptimizerOptions):
         range=at_least(1),
         auto=True,
         changes=Changes.MODEL,
+        ablations=(
+            Ablation(
+                "several rays a pixel", 1, more=lambda n, options, facts: None if facts.trains_cameras else max(n, 2)
+            ),
+        ),
     )
     one_ray_fraction: float = option(
         0.6, "fraction of training before which a pixel has one ray, see `rays_per_side`", range=between(0, 1)

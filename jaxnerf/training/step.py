@@ -85,7 +85,7 @@ class TrainStep:
     rays.
 
     Attributes:
-        gradient: (state, data, positions [N, B]) -> total: sums over the rays at some positions, and their gradient.
+        gradient: (state, data, positions) -> total: sums over the rays at some positions, and their gradient.
         finish: (state, data, *totals, axis_name=None) -> (state, metrics), from the totals of parts of the batch.
     """
 
@@ -121,8 +121,8 @@ def make_train_step(
         `data` is TrainData; for a model without a grid it may be anything that `draw` accepts. `positions` is
         [N, B] int32, the positions of this device's rays in the whole batch, in N microbatches. These run one
         after the other and their gradients are summed, so the activations of only B rays must fit into the
-        cache or memory. With an `axis_name` all sums also run over that axis of devices, as under `jax.pmap` or
-        `jax.shard_map`.
+        cache or memory. With [P, N, B], P such parts run at once, as far as the device does so. With an
+        `axis_name` all sums also run over that axis of devices, as under `jax.pmap` or `jax.shard_map`.
 
         `metrics` are scalars: "loss", "mse_<name>" of each network that renders images, "loss_<name>" of
         each loss (unweighted) if there are several, "grad_norm", the number of "rays" that were not dropped,
@@ -168,10 +168,12 @@ def make_train_step(
         return {"loss": loss, **sums}, grads
 
     def gradient(state, data, positions):
-        return _sum_over_microbatches(lambda part: sums_and_gradient(state, data, part), positions)
+        # XLA adds the gradient of the second part to the hash grid's table of the first.
+        parts = positions if positions.ndim == 3 else [positions]
+        return _sum([_sum_over_microbatches(lambda each: sums_and_gradient(state, data, each), part) for part in parts])
 
     def finish(state, data, *totals, axis_name=None):
-        total = functools.reduce(functools.partial(jax.tree.map, jnp.add), totals)
+        total = _sum(totals)
         if axis_name is not None:
             total = jax.lax.psum(total, axis_name)
         sums, grads = total
@@ -235,6 +237,10 @@ def _progress_at(step, model, data):
 def _scaled(weight, value):
     """Returns weight * value; a constant weight of 1 adds no operation."""
     return value if isinstance(weight, int | float) and weight == 1 else weight * value
+
+
+def _sum(trees):
+    return functools.reduce(functools.partial(jax.tree.map, jnp.add), trees)
 
 
 def _sum_over_microbatches(function, positions):

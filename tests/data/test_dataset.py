@@ -237,6 +237,10 @@ def test_load_dataset_takes_the_fields_of_the_data_section(tmp_path):
     np.testing.assert_allclose([views.near[0], views.far[0]], [2.5, 6.5])
     with pytest.raises(ValueError, match="scale is no option, expected one of format, dir"):
         load_dataset(tmp_path, scale=2)
+    for name, value in {"factor": 0, "background": "pink", "width": 2.5, "near": float("nan")}.items():
+        with pytest.raises(ValueError, match=f"load_dataset: {name} is .*, expected .*; correct it"):
+            load_dataset(tmp_path, **{name: value})
+    assert load_dataset(tmp_path, factor=np.int64(2), view_indices=range(2)).names == load_dataset(tmp_path).names[:2]
     with pytest.raises(ValueError, match="split is 'all'"):
         load_dataset(tmp_path, split="all")
     with pytest.raises(ValueError, match="data.dir is .*nowhere': no such folder, searched .*nowhere"):

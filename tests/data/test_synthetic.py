@@ -1,8 +1,4 @@
-"""The embedded dataset: its difficulty, its accuracy and its cache."""
-
-import dataclasses
-import functools
-import hashlib
+"""The embedded dataset: its difficulty, its splits and its cache."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +8,8 @@ from PIL import Image
 
 from jaxnerf.core import cameras, rendering
 from jaxnerf.data import synthetic
-from jaxnerf.fields import portable_math, still_life
+from jaxnerf.fields import still_life
+from jaxnerf.tools.embedded_scene import render
 
 
 @pytest.fixture(scope="session")
@@ -48,55 +45,6 @@ def test_images_upscaled_from_a_quarter_score_at_most_26_db(test_images, method)
 
     large = np.stack([np.stack([enlarge(view[..., k]) for k in range(3)], -1) for view in small])
     assert _mean_psnr(test_images, np.clip(large, 0, 1)) <= 26
-
-
-def test_the_pixels_are_the_same_on_every_machine():
-    """Whatever XLA's flags, the processor and the number of rays at once: only arithmetic that IEEE 754 defines."""
-    digest = hashlib.sha256()
-    for finish in ("usual", "matt", "shiny"):
-        stack = jax.tree.map(lambda leaf: leaf[::4], synthetic._cameras("test", 24))
-        pixels = synthetic.render_views(stack, finish)
-        np.testing.assert_array_equal(synthetic.render_views(stack, finish, chunk=100), pixels)
-        digest.update(pixels.tobytes())
-    assert digest.hexdigest() == synthetic.CHECKSUM
-
-
-@pytest.mark.parametrize("split", ["train", "test"])
-def test_the_images_that_ship_with_the_package_are_those_that_are_rendered(split, monkeypatch):
-    """If this fails after a change of the scene, run experiments/embedded/write_images.py."""
-    views = synthetic.load_synthetic(split=split, size=synthetic.SHIPPED_SIZE)
-    rays = synthetic.scene_rays(views.cameras)
-    longest = (rays.far - rays.near).argmax()  # it determines the number of segments
-    chosen = np.append(np.arange(0, len(views.pixels), 1999), longest)
-    some = jax.tree.map(lambda leaf: leaf[chosen], rays)
-    monkeypatch.setattr(synthetic, "scene_rays", lambda stack: some)
-    np.testing.assert_array_equal(synthetic.render_views(views.cameras), views.pixels[chosen])
-
-
-@pytest.mark.parametrize("finish", ["usual", "shiny"])
-def test_the_pixels_are_those_of_the_scene(finish):
-    """As the renderer of this package renders the scene that code outside sees."""
-    stack = jax.tree.map(lambda leaf: leaf[:2], synthetic._cameras("val", 20))
-    rays = jax.tree.map(np.float32, synthetic.scene_rays(stack))
-    rays = dataclasses.replace(rays, far=np.maximum(rays.near, rays.far))
-    scene = functools.partial(still_life.finished_still_life, finish=finish)
-    seen = jax.jit(lambda rays: rendering.render_rays(None, scene, rays, num_samples=384, background=jnp.ones(3)))(rays)
-    np.testing.assert_allclose(_over_white(synthetic.render_views(stack, finish)), seen.rgb, atol=5e-4)
-
-
-def test_exponentials_have_their_digits():
-    x = np.linspace(-86, 86, 20001, dtype=np.float32)
-    np.testing.assert_allclose(portable_math.exp(x), np.exp(np.float64(x)), rtol=3e-7)
-    np.testing.assert_allclose(portable_math.sigmoid(x), 1 / (1 + np.exp(-np.float64(x))), rtol=5e-7)
-    np.testing.assert_array_equal(portable_math.exp(np.float32([-np.inf, -1e30])), portable_math.exp(x[:1] * 2)[0])
-    with np.errstate(invalid="ignore"):  # its power of two is no integer
-        assert np.isnan(portable_math.exp(np.float32([np.nan]))).all()
-
-
-def test_doubling_the_segments_changes_less_than_a_thousandth():
-    stack = jax.tree.map(lambda leaf: leaf[::4], synthetic._cameras("test", 32))
-    once, twice = (_over_white(synthetic.render_views(stack, num_segments=n)) for n in (256, 512))
-    assert np.abs(once - twice).max() < 1e-3
 
 
 def test_all_matter_is_in_the_cylinder_and_between_near_and_far(cache):
@@ -136,13 +84,13 @@ def test_images_show_the_whole_scene(test_images):
 def test_the_cache_returns_the_same_bits_without_rendering(tmp_path, monkeypatch):
     first = synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels
     (path,) = tmp_path.iterdir()
-    monkeypatch.setattr(synthetic, "render_views", lambda *_: pytest.fail("rendered again"))
+    monkeypatch.setattr(render, "render_views", lambda *_: pytest.fail("rendered again"))
     np.testing.assert_array_equal(synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels, first)
     # Source code, size, split and finish are part of the file's name.
-    monkeypatch.setattr(synthetic, "render_views", lambda stack, finish: np.zeros((8 * stack.height**2, 4), np.uint16))
+    monkeypatch.setattr(render, "render_views", lambda stack, finish: np.zeros((8 * stack.height**2, 4), np.uint16))
     for change in ({"size": 9}, {"split": "test"}, {"finish": "matt"}):
         synthetic.load_synthetic(**{"split": "val", "size": 8, **change}, cache=tmp_path)
-    monkeypatch.setattr(synthetic, "_fingerprint", lambda: "changed")
+    monkeypatch.setattr(render, "fingerprint_of_code", lambda: "changed")
     assert not synthetic.load_synthetic(split="val", size=8, cache=tmp_path).pixels.any()
     assert len(list(tmp_path.iterdir())) == 5 and path.exists()
 
@@ -184,23 +132,6 @@ def test_only_the_balls_color_depends_on_the_direction():
     np.testing.assert_array_equal(density, same)
     changed = np.abs(bright - dark).max(axis=(1, 2))
     assert changed[0] > 0.3 and (changed[1:] < 1e-6).all() and (density > 1).all()
-    matt = jax.jit(functools.partial(still_life.finished_still_life, finish="matt"))
-    (matt_density, matt_bright), (_, matt_dark) = matt(x, down), matt(x, -down)
-    np.testing.assert_array_equal(matt_density, density)
-    np.testing.assert_array_equal(matt_bright, matt_dark)
-    np.testing.assert_allclose(matt_bright[1:], bright[1:], atol=1e-6)
-
-
-def test_round_opaque_objects_of_the_shiny_scene_have_highlights():
-    centers = {"pillar": (-0.40, 0.46, -0.02), "ring": (0.48, 0.36, -0.04), "ball": (-0.38, -0.38, -0.18)}
-    light = jnp.array([0.48, -0.36, 0.80])
-    around = jax.random.uniform(jax.random.key(0), (3, 8000, 3), minval=-0.9, maxval=0.9)
-    x = around + jnp.array(list(centers.values()))[:, None, :]
-    scenes = [jax.jit(functools.partial(still_life.finished_still_life, finish=finish)) for finish in ("shiny", "matt")]
-    (density, shiny), (same, matt) = (scene(x, jnp.broadcast_to(-light, (3, 1, 3))) for scene in scenes)
-    np.testing.assert_array_equal(density, same)
-    assert (jnp.where(density[..., None] > 25, shiny - matt, 0).max(axis=(1, 2)) > 0.4).all()
-    assert (shiny >= matt - 1e-6).all() and (shiny <= 1).all()
 
 
 @pytest.mark.slow

@@ -84,7 +84,7 @@ def test_cones_of_parts_of_a_pixel_are_narrower(trained):
         seen.append(rays)
         return run.render_image(variables, dataclasses.replace(rays, radius=None))
 
-    fake = run._replace(experiment=run.experiment._replace(view_rays=view_rays), render_image=render_image)
+    fake = run._replace(experiment=dataclasses.replace(run.experiment, view_rays=view_rays), render_image=render_image)
     pixels = np.float32([[[3.0, 4.0], [5.0, 4.0]]])
     render_pixels(fake, run.variables(run.steps()[-1]), views, 0, pixels, side=3, size=2.0)
     (rays,) = seen

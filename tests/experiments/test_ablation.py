@@ -17,7 +17,7 @@ from studies import common, study
 
 ablation, reproducibility = study("ablation/ablation"), study("stability/reproducibility")
 COMPLETE, variants = ablation.COMPLETE, ablation.variants
-BASE = common.configuration("ablation")
+BASE = ablation.configuration()
 VARIANTS = variants(BASE, 100)
 RAYS = Rays(
     origins=jnp.zeros((2, 3)),
@@ -31,7 +31,7 @@ RAYS = Rays(
 @functools.cache
 def params(name):
     """Returns {"network/layer": shape of its kernel}."""
-    config = common.configuration("ablation", VARIANTS[name])
+    config = ablation.configuration(VARIANTS[name])
     tree = jax.eval_shape(build_model(config).init, jax.random.key(0))
     return {
         f"{network}/{layer}": leaves["kernel"].shape
@@ -44,7 +44,7 @@ def params(name):
 def traced(name, **fields):
     """Returns the jaxpr of a rendering in training; fields are further ones of the section `sampling`."""
     more = {f"sampling.{field}": value for field, value in fields.items()}
-    model = build_model(common.configuration("ablation", VARIANTS[name] | more))
+    model = build_model(ablation.configuration(VARIANTS[name] | more))
     params = jax.eval_shape(model.init, jax.random.key(0))
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 2))
     return str(jax.make_jaxpr(model.render)(keys, params, None, RAYS, 0))

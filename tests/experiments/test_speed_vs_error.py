@@ -92,3 +92,12 @@ def test_the_serial_part_follows_from_the_gain_of_more_cores():
     faster = {"ms_per_step": 5.0, "rays_per_second": 2e5, "frame": 0.25, "setup": 2.0, "psnr": 29.5}
     row = "| lego | 10.0, 5.0 (2.00) | 100,000, 200,000 (2.00) | 0.50, 0.25 (2.00) | 4.00, 2.00 (2.00) | 30.00, 29.50 |"
     assert cores.runs_table({"lego": {1: [run], 2: [faster]}})[2:] == [row]
+    short = cores.short_table({"lego_100": {1: [run], 2: [faster]}})
+    assert short[2:] == ["| lego, 100 px | 100, 200 (2.00) | 2.0, 4.0 (2.00) |"]
+    half = {"ms_per_step": 7.5, "frame": 0.5, "setup": 2.0}  # of a step half is serial
+    parts = {"lego": {1: results(10.0, 8.0), 2: results(6.0, 4.0)}}
+    lines = cores.predictions_table({"lego": {1: [run], 2: [half]}}, parts)
+    cells = ["50%: 1.6, 1.8, 1.9", "0%: 4.0, 8.0, 16.0", "100%: 1.0, 1.0, 1.0", "0%: 4.0, 8.0, 16.0"]
+    assert lines[2:] == [f"| lego | {' | '.join(cells)} |"]
+    beside = cores.beside_table({"lego": [{"alone": 1e5, "all": 9e4, "halves": 1.1e5}]})
+    assert beside[2:] == ["| lego | 100,000 | 90,000 | 110,000 |"]

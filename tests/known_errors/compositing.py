@@ -305,8 +305,10 @@ def _exact_normals(sigma, place, x, spacing=None):
         density = [_medium(sigma, place)(x + spacing * corner, None)[0] for corner in corners]
         levels = [jnp.log1p(1000 * each * spacing) for each in density]
         gradient = sum(each[:, None] * corner for each, corner in zip(levels, corners, strict=True))
-    square = (gradient**2).sum(axis=-1, keepdims=True)
-    return -gradient / jnp.sqrt(jnp.where(square > 0, square, jnp.nan))
+    size = jnp.sqrt((gradient**2).sum(axis=-1, keepdims=True))
+    # Where the levels at the corners are nearly equal, rounding decides.
+    least = 0 if spacing is None else 0.01 * jnp.stack(levels).max(axis=0)[:, None]
+    return -gradient / jnp.where(size > least, size, jnp.nan)
 
 
 # The grid, with a scene of one density.
@@ -358,8 +360,10 @@ def _update(found, maximum, mean, spacing):
 
 def _exact_update(found, maximum, mean, spacing):
     largest = jnp.maximum(0.5 * maximum, found)
-    through = 0.75 * jnp.expm1(-spacing * mean) + 0.25 * jnp.expm1(-spacing * found)
-    uniform = -jnp.maximum(jnp.log1p(through), jnp.log(1e-30)) / spacing
+    thin = 0.75 * jnp.expm1(-spacing * mean) + 0.25 * jnp.expm1(-spacing * found)
+    thick = 0.75 * jnp.exp(-spacing * mean) + 0.25 * jnp.exp(-spacing * found)
+    log = jnp.where(thick > 0.5, jnp.log1p(thin), jnp.log(jnp.maximum(thick, 1e-30)))
+    uniform = -log / spacing
     whole = functools.partial(jnp.broadcast_to, shape=(2, 2, 2))
     return whole(largest), whole(jnp.where(largest > 0, uniform, -1))
 

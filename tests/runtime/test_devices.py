@@ -1,5 +1,6 @@
 """jit on one device, sharded jit and pmap on four: the same run."""
 
+import dataclasses
 import functools
 import re
 
@@ -136,12 +137,14 @@ def test_the_compiled_step_sums_the_gradient_and_four_numbers():
     assert sum(np.prod([int(side) for side in shape.split(",") if side]) for shape in shapes) == 2 * 9 + 4
 
 
-def test_threads_have_a_part_of_the_rays_each():
+@pytest.mark.parametrize("count", [2, 3])  # in one program, and by threads of the host
+def test_threads_have_a_part_of_the_rays_each(count):
     model, data = toy_model(), (random_rays(0, (24,)), jnp.array([2]))
     step = make_train_step(model, OPTIMIZER, toy_draw, LOSSES)
     options = {"batch_size": 24, "microbatch_size": 12}
     one, one_rows = run_steps(step, create_state(model, OPTIMIZER, 0), data, 4, 1, **options)
-    runs = [run_steps(step, create_state(model, OPTIMIZER, 0), data, 4, 1, num_threads=3, **options) for _ in range(2)]
+    options["num_threads"] = count
+    runs = [run_steps(step, create_state(model, OPTIMIZER, 0), data, 4, 1, **options) for _ in range(2)]
     assert_same(runs[0], runs[1], rtol=0, atol=0)
     several, rows = runs[0]
     assert_same(several, one, rtol=1e-5, atol=1e-6)
@@ -179,7 +182,7 @@ def test_seed_does_not_change_the_program():
     for seed in (0, 1):
         config = smoke_config()
         config.seed = seed
-        experiment = build(config)._replace(model=toy_model())
+        experiment = dataclasses.replace(build(config), model=toy_model())
         _, data = experiment.prepare(experiment.load_split("train"))
         state = jax.eval_shape(lambda: create_state(experiment.model, experiment.optimizer, 0))  # noqa: B023
         step = make_train_step(experiment.model, experiment.optimizer, experiment.draw, LOSSES)

@@ -195,8 +195,8 @@ def train_toy(folder, **options):
     experiment = smoke_experiment(lr_init=5e-2, **{"batch_size": 16, **options})
     views = experiment.load_split("train")
     data = random_rays(0, (16,)), jnp.array([-1])
-    experiment = experiment._replace(
-        model=mortal_model(), draw=lambda step, positions, _: toy_draw(step, positions, data)
+    experiment = dataclasses.replace(
+        experiment, model=mortal_model(), draw=lambda step, positions, _: toy_draw(step, positions, data)
     )
     if not folder.exists():
         checkpoints = Checkpoints(folder)

@@ -245,7 +245,8 @@ def toy():
         return keys, Batch(rays=drawn, rgb=0.5 + 0.5 * drawn.viewdirs)
 
     cells = np.arange(512, dtype=np.int32)
-    return experiment._replace(
+    return dataclasses.replace(
+        experiment,
         model=model,
         optimizer=optax.adam(1e-2),
         draw=draw,

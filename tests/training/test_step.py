@@ -1,5 +1,7 @@
 """One training step: it descends, sums over microbatches, and skips updates that are not finite."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,8 +70,8 @@ def test_too_many_nonfinite_steps_in_a_row_stop_the_run(tmp_path, monkeypatch):
     experiment = smoke_experiment(log_every=1, save_every=1)
     views = experiment.load_split("train")
     rays, bad_steps = random_rays(0, (64,)), jnp.arange(2, 20)
-    experiment = experiment._replace(
-        model=toy_model(), draw=lambda step, positions, data: toy_draw(step, positions, (rays, bad_steps))
+    experiment = dataclasses.replace(
+        experiment, model=toy_model(), draw=lambda step, positions, data: toy_draw(step, positions, (rays, bad_steps))
     )
     (tmp_path / "run").mkdir()
     with pytest.raises(ValueError, match="3 steps in a row up to 5 is not finite .*train.lr_init") as caught:
@@ -96,7 +98,8 @@ def test_a_run_of_several_steps_a_dispatch_logs_and_saves_at_the_same_steps(tmp_
         monkeypatch.setattr(compiled_step, "steps_per_dispatch", lambda *_, count=count: count)
         experiment = smoke_experiment(log_every=5, save_every=10, max_steps=23, max_reinits=0)
         views, rays = experiment.load_split("train"), random_rays(0, (64,))
-        experiment = experiment._replace(
+        experiment = dataclasses.replace(
+            experiment,
             model=toy_model(),
             draw=lambda step, positions, _, rays=rays: toy_draw(step, positions, (rays, jnp.array([7]))),
         )

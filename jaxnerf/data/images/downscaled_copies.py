@@ -52,8 +52,6 @@ def factor_for(capture: Capture, width: int) -> tuple[int, int]:
     """Returns the factor that brings a dataset's images closest to a width [px], and their full width [px]."""
     frames = [with_size(frame) for frame in capture.frames]
     full = max(frame.camera.width for frame in frames)
-    if width < 1:
-        raise ValueError(f"data.width is {width}, expected at least 1 px; correct it, or set data.factor")
     factors = np.arange(1, max(math.ceil(2 * full / width), 2) + 1)
     if capture.rendered:  # such images are not cropped
         common = math.gcd(*(side for frame in frames for side in (frame.camera.height, frame.camera.width)))

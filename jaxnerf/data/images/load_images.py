@@ -18,7 +18,6 @@ from jaxnerf.data.images.image_files import average_tiles, fits, image_form, rea
 from jaxnerf.data.images.pixel_cache import fill_pixels, num_workers
 from jaxnerf.data.images.pixel_rays import pixels_with_rays
 from jaxnerf.data.readers.base import Capture, Frame, frame_times
-from jaxnerf.data.readers.validation import check_background, check_factor
 
 _LENSES = {"pinhole": 0, "opencv": 5, "fisheye": 4}  # number of coefficients
 
@@ -83,7 +82,6 @@ def load_capture(
     Raises:
         ValueError: names the file, what was found, what is expected and what to do.
     """
-    factor, background = check_factor(factor), check_background(background)
     if capture.rendered:
         frames, shrink = tuple(map(with_size, capture.frames)), factor
     else:

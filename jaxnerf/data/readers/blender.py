@@ -98,8 +98,6 @@ def _bounds(poses):
 
 
 def _read_transforms(folder, split):
-    if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"folder is {folder!r}, expected the path of a dataset's folder; pass one")
     source = Path(folder) / f"transforms_{split}.json"
     if not source.is_file():
         existing = sorted(path.name for path in source.parent.glob("transforms*.json"))

@@ -53,8 +53,6 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     Raises:
         ValueError: names file and frame, what was found, what is expected and what to do.
     """
-    if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"folder is {folder!r}, expected the path of a dataset's folder; pass one")
     folder, stated = Path(folder), full_cameras(folder)
     if stated:
         return _read_splits(folder, stated)

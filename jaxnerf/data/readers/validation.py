@@ -1,7 +1,6 @@
 """Checks of arguments, and readers of JSON and .npy files of unknown origin."""
 
 import math
-import operator
 import os
 import unicodedata
 from collections.abc import Mapping, Sequence
@@ -15,29 +14,6 @@ from jaxnerf.options import short_repr
 from jaxnerf.runtime import atomic_files
 
 MAX_FLOAT32 = 3.4e38
-
-
-def check_factor(factor: Any) -> int:
-    """Returns the downscaling factor as an int; ValueError unless it is a whole number >= 1."""
-    try:
-        whole = operator.index(factor)
-    except TypeError:
-        whole = 0
-    if whole < 1 or isinstance(factor, bool):
-        raise ValueError(f"factor is {factor!r}, expected a whole number >= 1; 1 keeps the images as they are")
-    return whole
-
-
-def check_background(background: Any) -> tuple[float, float, float] | None:
-    """Returns a colour as a tuple of 3 floats, or None for None; ValueError unless all are in [0, 1]."""
-    if background is None:
-        return None
-    values = tuple(background) if np.ndim(background) == 1 else ()
-    if len(values) != 3 or not all(is_number(value) and 0 <= value <= 1 for value in values):
-        raise ValueError(
-            f"background is {background!r}, expected red, green, blue in [0, 1]; None takes RGB without alpha"
-        )
-    return tuple(float(value) for value in values)
 
 
 def is_number(value: Any) -> bool:

@@ -43,7 +43,7 @@ def save(curves: Curves, path: pathlib.Path, *, ylabel: str, lines_only: Sequenc
     """Writes curves as PNG: seconds on a logarithmic axis, knees marked.
 
     Args:
-        curves: to draw.
+        curves: to draw, of seconds above 0.
         path: of the image.
         ylabel: of the other axis.
         lines_only: names of curves that are drawn as thin lines, without points and knees.
@@ -67,8 +67,12 @@ def save(curves: Curves, path: pathlib.Path, *, ylabel: str, lines_only: Sequenc
         if len(points) > 2 and not thin:
             marked = points[knee(points)]
             axes.plot(*marked, "D", markersize=11, fillstyle="none", color=line.get_color(), label=f"knee of {label}")
-    positive = all(seconds > 0 for points in curves.values() for seconds, _ in points)
-    axes.set(xlabel="seconds of training", ylabel=ylabel, xscale="log" if positive else "linear")
+    axes.set(xlabel="seconds of training", ylabel=ylabel, xscale="log")
+    times = [seconds for points in curves.values() for seconds, _ in points]
+    ticks = [step * 10.0**power for power in range(-3, 7) for step in (1, 2, 5)]
+    ticks = [tick for tick in ticks if min(times) / 2 < tick < 2 * max(times)]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
     axes.grid(alpha=0.3)
     for label in axes.legend(fontsize="small").get_texts():
         label.set_parse_math(False)

@@ -122,6 +122,7 @@ def test_a_run_that_fails_keeps_no_other_from_the_table(monkeypatch, tmp_path, c
 
 def test_the_knee_is_the_point_farthest_above_the_chord():
     assert drawing.knee([(1, 10.0), (2, 18.0), (3, 19.0), (10, 20.0)]) == 1
+    assert drawing.knee([(1, 20.0), (2, 21.0)]) == 0
     assert drawing.lines({"a": [(1, 10.0), (2, 18.0), (10, 20.0)]}, "PSNR")[2].endswith(" *")
     assert not any(line.endswith(" *") for line in drawing.lines({"a": [(1, 10.0), (2, 18.0)]}, "PSNR"))
 

@@ -8,15 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from jaxnerf.configs import default
 from jaxnerf.data.geometry.path_poses import natural_key
 from jaxnerf.data.images.image_files import IMAGE_SUFFIXES, is_hidden, read_image
 from jaxnerf.data.readers.image_paths import fold
 from jaxnerf.evaluation import protocol
 from jaxnerf.evaluation.aggregate import means
 from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
-from jaxnerf.runtime import atomic_files
+from jaxnerf.evaluation.restore import dataset_at
+from jaxnerf.runtime import atomic_files, cli
 from jaxnerf.training import build
-from jaxnerf.training.config import Config
+from jaxnerf.training.config import Config, RunConfig, read_config
+from jaxnerf.training.workdir import load_config
 
 _logger = logging.getLogger(__name__)
 
@@ -76,6 +79,16 @@ def score_folder(
     results = _scored(map(_colors, paths), references, masks, shown) | {"paired_by": how, **about}
     atomic_files.write_text(target, atomic_files.to_json(results))
     return results
+
+
+def reference_config(config: Config | None, workdir: str | None, data_dir: str | None) -> RunConfig | None:
+    """Returns the config whose dataset predictions are compared with: a given one, a workdir's, or the default.
+
+    The dataset is the one in data_dir if that is given. None where there is nothing of the three.
+    """
+    if config is None and not workdir:
+        return read_config(cli.use_data(default.get_config(), data_dir)) if data_dir else None
+    return dataset_at(load_config(workdir) if config is None else read_config(config), data_dir)
 
 
 def _scored(predictions, references, masks, names):
