@@ -167,7 +167,7 @@ class Step(NamedTuple):
         run: (state, data, positions) -> (state, metrics); consumes the state.
         state: at step 0.
         data: TrainData.
-        positions: [microbatches, rays] int32.
+        positions: [microbatches, rays] int32, or [parts, microbatches, rays].
         count_flops: () -> FLOPs of the step without updates of the grid, the whole batch as one microbatch:
             XLA counts the body of a loop once, however often it runs.
     """
@@ -180,8 +180,11 @@ class Step(NamedTuple):
     count_flops: Callable[[], float]
 
 
-def compile_step(config, views=None) -> Step:
-    """Compiles the training step of a config; views are those of the split "train", read when None."""
+def compile_step(config, views=None, num_parts: int = 1) -> Step:
+    """Compiles the training step of a config; views are those of the split "train", read when None.
+
+    With several parts, their gradients are computed at once, as on several cores.
+    """
     config, views, _ = auto_config.resolve(config, load_split(config, "train") if views is None else views)
     config, _ = auto_config.resolve_for_device(config)
     experiment = build.build(config)
@@ -189,7 +192,11 @@ def compile_step(config, views=None) -> Step:
     state = create_state(experiment.model, experiment.optimizer, experiment.config.seed, valid)
     parts = experiment.model, experiment.optimizer, experiment.draw, experiment.losses
     step = make_train_step(*parts, pixel_rays=experiment.pixel_rays)
-    positions = jnp.asarray(split_positions(config.train.batch_size, 1, config.train.microbatch_size)[0])
+    batch, size = config.train.batch_size, config.train.microbatch_size
+    if num_parts > 1:
+        size = math.gcd(size or batch, batch // num_parts)
+    positions = jnp.asarray(split_positions(batch, num_parts, size))
+    positions = positions if num_parts > 1 else positions[0]
 
     def count_flops():
         no_updates = data._replace(cells=None if data.cells is None else data.cells[:0])

@@ -23,22 +23,10 @@ from jaxnerf.core.encoding import (
 from jaxnerf.core.losses import distortion_loss
 from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
 from jaxnerf.core.normals import density_normals
-from jaxnerf.core.occupancy.grid import (
-    OccupancyGrid,
-    create_grid,
-    grid_from_scene,
-    mask_scene,
-    update_grid,
-)
+from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, grid_from_scene, mask_scene, update_grid
 from jaxnerf.core.occupancy.packed import render_packed
 from jaxnerf.core.poses import look_at, se3_exponential, turntable
-from jaxnerf.core.rendering import (
-    points_on_rays,
-    render_hierarchical,
-    render_image,
-    render_rays,
-    render_samples,
-)
+from jaxnerf.core.rendering import points_on_rays, render_hierarchical, render_image, render_rays, render_samples
 from jaxnerf.core.sampling import (
     importance_points,
     inverse_cdf,
@@ -64,8 +52,7 @@ if _typing.TYPE_CHECKING:
     from jaxnerf.data.dataset import load_dataset
     from jaxnerf.data.ray_batches import draw_batch
     from jaxnerf.evaluation.evaluate import train_and_evaluate, train_many
-    from jaxnerf.evaluation.restore import load_scene, restore_run
-    from jaxnerf.evaluation.trained_run import TrainedRun
+    from jaxnerf.evaluation.restore import TrainedRun, load_scene, restore_run
     from jaxnerf.fields.hash_grid import hash_grid_field
     from jaxnerf.fields.mlp import mlp_field
     from jaxnerf.fields.still_life import still_life
@@ -82,7 +69,7 @@ _ON_DEMAND = {
     "still_life": "jaxnerf.fields.still_life",
     "load_scene": "jaxnerf.evaluation.restore",
     "restore_run": "jaxnerf.evaluation.restore",
-    "TrainedRun": "jaxnerf.evaluation.trained_run",
+    "TrainedRun": "jaxnerf.evaluation.restore",
     "train_and_evaluate": "jaxnerf.evaluation.evaluate",
     "train_many": "jaxnerf.evaluation.evaluate",
     "register_exporter": "jaxnerf.tools.exporters.registration",

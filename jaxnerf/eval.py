@@ -14,7 +14,7 @@ _CONFIG = run_flags.define_config(
     "A config that replaces the workdir's: a name, or the path of a file. When it is not given, flags such as "
     "--config.eval.chunk=4096 change the workdir's.",
 )
-_RUN = run_flags.define("scored", "uncertainty/NNN.tiff and compares it with the true errors")
+_RUN = run_flags.RunFlags("scored", "uncertainty/NNN.tiff and compares it with the true errors")
 _SPLIT = flags.DEFINE_string("split", None, "The split of the dataset. It overrides config.eval.split.")
 _WATCH = flags.DEFINE_bool("watch", False, "Whether to score each new checkpoint until training ends.")
 _POLL = flags.DEFINE_float(

@@ -222,13 +222,9 @@ def register_reader(name: str, read: Callable[..., Any], *, detect: Callable[...
     Raises:
         ValueError: if another format has that name.
     """
-    READERS.add(name, Reader(read, detect or _never))
+    READERS.add(name, Reader(read, detect or (lambda folder: False)))
 
 
 def needs_folder(format: str) -> bool:
     """Returns whether datasets of a format, or of "auto", lie in a folder, unlike the embedded scene."""
     return is_auto(format) or READERS.get(format).views is None
-
-
-def _never(folder):
-    return False

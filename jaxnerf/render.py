@@ -11,7 +11,7 @@ from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
 
 _SIDE = {"lower_bound": 1, "upper_bound": 16384}
-_RUN = run_flags.define(
+_RUN = run_flags.RunFlags(
     "rendered", "uncertainty/0000.tiff, in units of colour, an image of it, and a video", required=True
 )
 _PATH = flags.DEFINE_string(

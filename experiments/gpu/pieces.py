@@ -307,7 +307,7 @@ def cpu_cores(context: Context) -> dict[str, Any]:
     usable = len(os.sched_getaffinity(0))
     counts = [count for count in (1, 2, 4, 8, 16) if count <= usable][: 2 if context.tiny else None]
     out = context.folder / "cpu_cores"
-    command = [sys.executable, str(common.ROOT / "experiments" / "speed" / "cores.py"), f"--out={out}", "--noparts"]
+    command = [sys.executable, str(common.ROOT / "experiments" / "speed" / "cores.py"), f"--out={out}", "--parts="]
     command += [f"--cores={','.join(map(str, counts))}", "--runs=fox_200", "--rounds=1", "--gain=1"]
     command += [f"--seconds={1 if context.tiny else 10}", f"--tiny={context.tiny}"]
     done = subprocess.run(command, env={**os.environ, "JAX_PLATFORMS": "cpu"}, capture_output=True, text=True)

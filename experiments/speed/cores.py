@@ -42,7 +42,7 @@ _RUNS = flags.DEFINE_list("runs", [], "Runs of step_parts.py, such as lego_400; 
 _ROUNDS = flags.DEFINE_integer("rounds", 3, "Measurements of each run with each number of cores.", lower_bound=1)
 _SECONDS = flags.DEFINE_float("seconds", 60, "Of training of a whole run; 0: no whole runs.", lower_bound=0)
 _GAIN = flags.DEFINE_float("gain", 1.75, "How many times as long the fewest cores train.", lower_bound=1)
-_PARTS = flags.DEFINE_bool("parts", True, "Whether the parts of a step are measured, too.")
+_PARTS = flags.DEFINE_list("parts", None, "Runs whose parts of a step are measured, too; those of --runs by default.")
 _BESIDE = flags.DEFINE_list("beside", [], "Runs of which two are trained beside each other, for --seconds / 3.")
 _TINY = flags.DEFINE_bool("tiny", False, "Tiny sizes, as a test.")
 _ONE = flags.DEFINE_list("one", None, "kind,run,seconds,workdir: measures this here, into the file --out.")
@@ -70,9 +70,12 @@ def main(argv: list[str]) -> None:
     runs = common.chosen("--runs", _RUNS.value or known, known)
     beside = common.chosen("--beside", _BESIDE.value, known)
     counts = [int(count) for count in _CORES.value]
-    kinds = ["run", "frame"] * bool(_SECONDS.value) + ["parts"] * _PARTS.value
-    plan = [(turn, *each) for turn in range(_ROUNDS.value) for each in itertools.product(kinds, runs, counts)]
-    plan += [(turn, "beside", name, counts[-1]) for turn in range(_ROUNDS.value) for name in beside]
+    in_parts = runs if _PARTS.value is None else common.chosen("--parts", _PARTS.value, runs)
+    plan = []
+    for turn in range(_ROUNDS.value):
+        for kinds, names in ((["run", "frame"] * bool(_SECONDS.value), runs), (["parts"], in_parts)):
+            plan += [(turn, *each) for each in itertools.product(kinds, names, counts)]
+        plan += [(turn, "beside", name, counts[-1]) for name in beside]
     for turn, kind, name, count in plan:
         path = _path(out, name, kind, count, turn)
         if not path.exists():
@@ -87,8 +90,8 @@ def main(argv: list[str]) -> None:
         return dict(zip(counts, ([common.read_json(path) for path in paths] for paths in found), strict=True))
 
     lines, short = [*common.provenance(), ""], []
-    parts = {name: read(name, "parts") for name in runs} if "parts" in kinds else {}
-    if "run" in kinds:
+    parts = {name: read(name, "parts") for name in in_parts}
+    if _SECONDS.value:
         whole = {}
         for name in runs:
             found, frames = read(name, "run"), read(name, "frame")
@@ -125,7 +128,8 @@ def _config(name):
 
 def _parts(name, seconds, workdir):
     del seconds, workdir
-    return step_parts.measure(_config(name), warm_up=_WARM_UP, num_steps=_STEPS)
+    num_parts = min(len(os.sched_getaffinity(0)), 2)  # as in training on two cores
+    return step_parts.measure(_config(name), warm_up=_WARM_UP, num_steps=_STEPS, num_parts=num_parts)
 
 
 def _whole_run(name, seconds, workdir):
@@ -285,14 +289,19 @@ def predictions_table(
     for name, by_count in measured.items():
         (least, few), (more, many) = list(by_count.items())[:2]
         columns = [[[statistics.median(each[key] for each in found)] for found in (few, many)] for key in _TIMES]
+        cells = [cell(*column, more / least) for column in columns]
         if name in parts:
             before, after = (_medians(parts[name][count]) for count in (least, more))
             names = sorted(before.keys() - {"whole step"})
-            columns.insert(1, [[found.get(part, 0.0) for part in names] for found in (before, after)])
-        rows.append([name, *(cell(*column, more / least) for column in columns)])
+            cells.insert(
+                1, cell(*([found.get(part, 0.0) for part in names] for found in (before, after)), more / least)
+            )
+        elif parts:
+            cells.insert(1, "-")
+        rows.append([name, *cells])
     heads = [f"serial: times faster on {', '.join(map(str, _PREDICTED))} cores", *_TIMES.values()]
     if parts:
-        heads.insert(2, "a step by its parts, as XLA spreads it")
+        heads.insert(2, "a step by its parts")
     return common.markdown(heads, rows)
 
 

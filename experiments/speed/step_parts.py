@@ -52,18 +52,19 @@ def measure_all(kept: dict[str, Any], save: Callable[[dict], None]) -> None:
             save(kept)
 
 
-def measure(config, *, warm_up: int = 1500, num_steps: int = 64) -> dict[str, Any]:
+def measure(config, *, warm_up: int = 1500, num_steps: int = 64, num_parts: int = 1) -> dict[str, Any]:
     """Returns the time of each part of a step, in ms.
 
     Args:
         config: of the run.
         warm_up: steps before the measurement, in which the grid becomes sparse.
         num_steps: steps that are timed; a multiple of the interval of updates.
+        num_parts: of the rays, whose gradients are computed at once.
 
     Raises:
         ValueError: if the profiler recorded less than _LEAST of the time; it drops events above about a million.
     """
-    step = common.compile_step(config)
+    step = common.compile_step(config, num_parts=num_parts)
     state = step.state
 
     def take(count):

@@ -22,13 +22,13 @@ import common
 import uncertainty_runs as runs
 
 from jaxnerf.core.cameras import pixel_grid
-from jaxnerf.evaluation.metrics import object_mask, pixel_mask
+from jaxnerf.evaluation.metrics import pixel_mask
 from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime import cli
 from jaxnerf.tools.uncertainty import laplace
 from jaxnerf.tools.uncertainty.base import UncertaintySource
-from jaxnerf.tools.uncertainty.calibration import figures, pixel_error, score_order
+from jaxnerf.tools.uncertainty.calibration import figures, object_mask, pixel_error, score_order
 from jaxnerf.tools.uncertainty.predict import make_predictor
 
 SCENES = {
@@ -111,7 +111,7 @@ def _scored(run, variables, views, predictors):
         kept = np.ones((height, width), bool) if mask is None else np.asarray(mask, bool)
         error = pixel_error(image.rgb, truth)
         for name, predictor in predictors.items():
-            predicted, row = predictor.scored(rays, image.rgb, truth, mask, on_object)
+            predicted, row = predictor.scored(rays, image.rgb, truth, views, index)
             rows[name].append(row)
             psnr[name].append([-10 * np.log10((each[kept] ** 2).mean()) for each in (error, predicted)])
         rows["1 - opacity"].append(score_order(error, 1 - image.opacity, kept, on_object))

@@ -39,10 +39,12 @@ _TRAIN = flags.DEFINE_string("train", None, "The config whose training is measur
 _STEPS = flags.DEFINE_integer("steps", 400, "The steps of each training without a browser; 0: none.")
 _SECONDS = flags.DEFINE_float("seconds", 20.0, "The time with and without a browser in turn.")
 _CLIENT = flags.DEFINE_integer("client", 0, "Internal: acts as a browser on this port that moves its camera.")
+_IMAGES = flags.DEFINE_string("images", os.devnull, "Internal: the client adds a line for each image, its time.")
 SIDES = (100, 200, 400)  # px
 MESSAGES_PER_SECOND = 20.0  # of a camera that is dragged
 _DRAG_SECONDS = 6.0
 _FRAMES = 8
+_LEAST_IMAGE = 1500  # bytes of a message; other messages are shorter
 _BY_ITSELF = -1.0  # in place of the camera's speed: a page that renders by itself
 
 
@@ -190,7 +192,7 @@ def _busy_cost(config):
         "a browser whose camera moves": 1.0,
         "a browser that renders by itself": _BY_ITSELF,
     }
-    rates = {name: [] for name in browsers}
+    rates, gaps = {name: [] for name in browsers}, []
     with tempfile.TemporaryDirectory() as folder:
         flags = ["--config.train.max_steps=1000000", "--config.train.preview_every=0", "--config.train.log_every=5"]
         process = _train(config, folder, *flags, "--viewer", "--viewer_port=0")
@@ -205,8 +207,12 @@ def _busy_cost(config):
                 if moves is None:
                     rates[name].append(_steps_per_second(folder))
                 else:
-                    with _browser(port, moves):
+                    images = pathlib.Path(folder) / "images.txt"
+                    with _browser(port, moves, images):
                         rates[name].append(_steps_per_second(folder))
+                    if moves > 0:
+                        gaps += np.diff([float(line) for line in images.read_text().split()][10:]).tolist()
+                    images.unlink(missing_ok=True)
         process.terminate()
         process.communicate()
     base = statistics.median(rates["no browser"])
@@ -219,6 +225,12 @@ def _busy_cost(config):
     for name, values in rates.items():
         shown = ", ".join(f"{value:.2f}" for value in values)
         lines.append(f"| {name} | {shown} | {statistics.median(values) / base:.0%} |")
+    middle, most = 1000 * np.quantile(gaps, (0.5, 0.95))
+    lines += [
+        "",
+        f"While the camera moves, an image comes {1 / np.mean(gaps):.1f} times a second; from one to the next",
+    ]
+    lines += [f"it takes {middle:.0f} ms in the median and {most:.0f} ms at the 95th percentile."]
     return "\n".join([*lines, ""])
 
 
@@ -232,8 +244,8 @@ def _steps_per_second(folder):
 class _browser:
     """A process that acts as a browser, while the context lasts."""
 
-    def __init__(self, port, moves):
-        self._command = [sys.executable, __file__, f"--client={port}", f"--seconds={moves}"]
+    def __init__(self, port, moves, images=os.devnull):
+        self._command = [sys.executable, __file__, f"--client={port}", f"--seconds={moves}", f"--images={images}"]
 
     def __enter__(self):
         self._process = subprocess.Popen(self._command, stderr=subprocess.DEVNULL)  # it says that it was stopped
@@ -250,7 +262,7 @@ def _act_as_browser(port):
     address, name = f"ws://127.0.0.1:{port}", f"viser-v{viser.__version__}"
     angle = 0.0
     options = {"subprotocols": [name], "max_size": None, "compression": None, "origin": f"http://127.0.0.1:{port}"}
-    with websockets.sync.client.connect(address, **options) as socket:
+    with websockets.sync.client.connect(address, **options) as socket, open(_IMAGES.value, "a", buffering=1) as images:
         while True:
             half = np.pi / 2 + 0.3  # looks down at the origin from above, turned about the vertical
             pose = {"wxyz": _product((np.cos(angle / 2), 0, 0, np.sin(angle / 2)), (np.cos(half), np.sin(half), 0, 0))}
@@ -264,7 +276,8 @@ def _act_as_browser(port):
             end = time.perf_counter() + 1 / MESSAGES_PER_SECOND
             while (left := end - time.perf_counter()) > 0:
                 try:
-                    socket.recv(timeout=left)
+                    if len(socket.recv(timeout=left)) > _LEAST_IMAGE:
+                        print(time.perf_counter(), file=images)
                 except TimeoutError:
                     break
 

@@ -180,7 +180,8 @@ def draw_batch(
         ValueError: on an unknown batching, or if a depth is wanted and the views have no observations.
     """
     observed = not set(DEPTH_FIELDS).isdisjoint(extras)
-    keys, index, chosen = _draw(seed, step, positions, views, active_pixels, batching, observed, rays_per_side)
+    options = {"batching": batching, "extras": extras, "rays_per_side": rays_per_side}
+    keys, index, chosen = draw_pixels(seed, step, positions, views, active_pixels, **options)
     view = jnp.searchsorted(views.offset, index, side="right", method="compare_all") - 1
     place = index - views.offset[view]
     width = views.size[view, 1]
@@ -251,20 +252,10 @@ def draw_pixels(
     batching: str = "all_images",
     extras: Iterable[str] = (),
     rays_per_side: Int[ArrayLike, ""] = 1,
-) -> tuple[Key[Array, " B"], Int[Array, " B"]]:
-    """Returns the keys of `draw_batch` and the ids of the pixels that its rays pass through."""
-    observed = not set(DEPTH_FIELDS).isdisjoint(extras)
-    return _draw(seed, step, positions, views, active_pixels, batching, observed, rays_per_side)[:2]
+) -> tuple[Key[Array, " B"], Int[Array, " B"], Int[Array, " B"] | None]:
+    """Returns the keys of `draw_batch`, the ids of the pixels that its rays pass through, and their observations.
 
-
-def _is_one(rays_per_side):
-    return isinstance(rays_per_side, int) and rays_per_side == 1
-
-
-def _draw(seed, step, positions, views, active_pixels, batching, observed, rays_per_side):
-    """Returns keys and ids, see `draw_pixels`; and the index [B] of each ray's observation, -1 for none.
-
-    The last value is None unless observed.
+    The observations are indices [B], -1 for rays that go through none; None unless the extras need them.
     """
     if batching not in BATCHINGS:
         raise ValueError(f"draw_batch: batching is {batching!r}, expected one of {BATCHINGS}")
@@ -284,7 +275,7 @@ def _draw(seed, step, positions, views, active_pixels, batching, observed, rays_
             count = last - first
     index = jax.vmap(lambda key: jax.random.randint(key, (), first, first + count))(pixel_keys)
     index = index if active_pixels is None else active_pixels.ids(index)
-    if not observed:
+    if set(DEPTH_FIELDS).isdisjoint(extras):
         return keys, index, None
     if views.sparse is None or not views.sparse.view.shape[0]:
         raise ValueError(
@@ -299,6 +290,10 @@ def _draw(seed, step, positions, views, active_pixels, batching, observed, rays_
     view, (column, row) = sparse.view[chosen], jnp.floor(sparse.pixel[chosen]).astype(jnp.int32).T
     there = jnp.asarray(views.offset)[view] + row * jnp.asarray(views.size)[view, 1] + column
     return keys, jnp.where(chosen >= 0, there, index), chosen
+
+
+def _is_one(rays_per_side):
+    return isinstance(rays_per_side, int) and rays_per_side == 1
 
 
 def step_key(seed: Integer[ArrayLike, ""], step: Int[ArrayLike, ""]) -> Key[Array, ""]:

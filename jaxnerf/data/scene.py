@@ -86,13 +86,13 @@ class SceneOptions(Options):
         return tuple(self.background)
 
 
-def bounded_by_alpha(scene: SceneOptions, views: Views, *, ndc: bool) -> bool:
+def bounded_by_alpha(scene: SceneOptions, views: Views, *, ndc: bool, refined: bool) -> bool:
     """Returns whether alpha bounds a scene.
 
-    It does not if the scene moves: no image then shows where all of it ever is. Normalised device coordinates hold
-    what the cameras see.
+    It does not if the scene moves: no image then shows where all of it ever is. Nor does it where poses are refined:
+    the outlines of wrong poses cut matter away. Normalised device coordinates hold what the cameras see.
     """
-    return scene.use_alpha and views.pixels.shape[-1] == 4 and not ndc and views.time is None
+    return scene.use_alpha and views.pixels.shape[-1] == 4 and not ndc and views.time is None and not refined
 
 
 def resolve_scene(

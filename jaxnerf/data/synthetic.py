@@ -41,15 +41,11 @@ def load_synthetic(
         Views: pixels [V * size * size, 4] uint16, rays with t in [2.6, 5.4].
 
     Raises:
-        ValueError: on another split, size or finish.
+        ValueError: on another split.
     """
     if split not in _COUNT:
         raise ValueError(f"split is {split!r}, expected one of {', '.join(_COUNT)}; choose one of these")
-    if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= 4096:
-        raise ValueError(f"size is {size!r}, expected a whole number of pixels from 1 to 4096; 100 is the default")
-    if finish not in FINISHES:
-        raise ValueError(f"finish is {finish!r}, expected one of {FINISHES}; correct data.finish")
-    count, size = _COUNT[split], int(size)
+    count = _COUNT[split]
     stack = _cameras(split, size)
     if (size, finish) == (SHIPPED_SIZE, "usual") and split != "val":
         pixels = _shipped(split)

@@ -15,7 +15,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images, protocol
-from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.options import short_repr
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.training import metric_log

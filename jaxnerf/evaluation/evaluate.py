@@ -21,7 +21,7 @@ import jax
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation import aggregate, output_images
-from jaxnerf.evaluation.metrics import image_metrics, object_mask, pixel_mask
+from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.evaluation.previews import Previews
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
 from jaxnerf.evaluation.supersampling import rays_per_side_of_views, render_pixels, training_cameras
@@ -280,9 +280,8 @@ def _score_views(run, render, views, sides, folder, shard, predictor):
                 row |= {"rays_per_pixel": int(sides[index]) ** 2}
                 row |= {f"{name}_one_ray": plain[name] for name in ("psnr", "ssim")}
             if predictor is not None:
-                masks = pixel_mask(views, index), object_mask(views, index)
                 rays = run.experiment.view_rays(views, index, pixels)
-                error, figures = predictor.scored(rays, image.rgb, truth, *masks)
+                error, figures = predictor.scored(rays, image.rgb, truth, views, index)
                 output_images.write_error(folder, f"{index:03d}", error)
                 row |= figures
             output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)

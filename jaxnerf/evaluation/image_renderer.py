@@ -28,7 +28,7 @@ def image_renderer(
 
     def image(variables, rays, chunk=None):
         requested = min(default if chunk is None else chunk, 1 << (rays.near.size - 1).bit_length())
-        key = requested, _shapes(variables)
+        key = requested, tuple((leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(variables))
 
         def attempt(size):
             def part(rays):
@@ -53,7 +53,3 @@ def image_renderer(
         return result
 
     return image
-
-
-def _shapes(tree):
-    return tuple((leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(tree))

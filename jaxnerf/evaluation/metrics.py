@@ -79,15 +79,6 @@ def pixel_mask(views: Views, index: int) -> jax.Array | None:
     return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
 
 
-def object_mask(views: Views, index: int) -> jax.Array | None:
-    """Returns [H, W] bool of one of Views: which pixels show the object, by alpha above a half; None without alpha."""
-    if views.pixels.shape[-1] != 4:
-        return None
-    (height, width), first = views.size[index], int(views.offset[index])
-    alpha = jnp.asarray(views.pixels[first : first + height * width, 3]).reshape(height, width)
-    return alpha > jnp.iinfo(alpha.dtype).max // 2
-
-
 @functools.cache
 def _check_memory(height, width, unmasked):
     pixels = jax.ShapeDtypeStruct((height, width, 3), jnp.float32)

@@ -16,9 +16,8 @@ from jaxnerf.core.metrics import psnr, round_to_8_bits
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation import aggregate, output_images
 from jaxnerf.evaluation.metrics import pixel_mask
-from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
+from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
-from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import memory, processes, stages
 from jaxnerf.training import metric_log
 from jaxnerf.training.optimizer import image_params

@@ -1,10 +1,10 @@
-"""Restores a trained run as functions for other code."""
+"""Restores a trained run as functions that read and render its checkpoints."""
 
 import dataclasses
 import functools
 import os
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 
@@ -13,7 +13,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.image_renderer import image_renderer
-from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.models.base import Model
 from jaxnerf.options import AUTO, Changes, changing, is_auto, replaced
 from jaxnerf.registry import needs_folder
 from jaxnerf.runtime import stages
@@ -23,6 +23,35 @@ from jaxnerf.training.config import Config, RunConfig, auto_fields, changed, ide
 from jaxnerf.training.state import rendered_shapes
 from jaxnerf.training.stored_cameras import is_of_run, training_views, without_images
 from jaxnerf.training.workdir import load_config
+
+
+class TrainedRun(NamedTuple):
+    """A run's experiment and the functions that read and render its checkpoints.
+
+    Attributes:
+        experiment: what its config describes for rendering, see `build.RenderParts`.
+        steps: () -> the steps of the finished checkpoints, ascending.
+        variables: step -> (params, grid) of that checkpoint; the grid is None where the model has none.
+        render: (variables, Rays [...]) -> Rendering [...] without weights, jitted.
+        identity: text that is equal for configs that render alike, see `config.identity`.
+        render_image: (variables, Rays [...], chunk=None, median_depth=False) -> Rendering [...] as `render`, in
+            chunks that fit into memory.
+        variables_of: (`image_params`, grid) of a state of training -> (params, grid) as `variables` returns them.
+        model_with: (settings of the section `eval`, by name; wrap=None) -> the Model that renders with these in place
+            of the run's own, and whose field is wrapped as `build_model` does. It takes the same variables.
+        settings: what the images of the same variables depend on: the options of the section `eval` that change them,
+            by name, and what a tool has changed about the run.
+    """
+
+    experiment: build.RenderParts
+    steps: Callable[[], list[int]]
+    variables: Callable[[int], tuple]
+    render: Callable[[tuple, Rays], Rendering]
+    identity: str
+    render_image: Callable[..., Rendering]
+    variables_of: Callable[[Any, Any], tuple]
+    model_with: Callable[..., Model]
+    settings: Mapping[str, Any] = {}
 
 
 def restore_run(

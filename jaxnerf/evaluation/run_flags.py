@@ -1,14 +1,14 @@
 """The flags of programs that render a run, and the run and the predicted errors that they ask for."""
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from absl import flags
 
 from jaxnerf.runtime import cli
 
 if TYPE_CHECKING:
-    from jaxnerf.evaluation.trained_run import TrainedRun
+    from jaxnerf.evaluation.restore import TrainedRun
 
 MAX_UNCERTAINTY = (  # the help of --max_uncertainty
     "Cells of the occupancy grid that are more uncertain are empty, so that floaters go; auto: as low as training rays "
@@ -18,18 +18,43 @@ MAX_UNCERTAINTY = (  # the help of --max_uncertainty
 flags.disclaim_key_flags()  # a flag defined here belongs to the program that calls
 
 
-class RunFlags(NamedTuple):
+class RunFlags:
     """Flags that say which checkpoint is rendered, how, and which errors are predicted."""
 
-    workdir: flags.FlagHolder
-    data_dir: flags.FlagHolder
-    step: flags.FlagHolder
-    chunk: flags.FlagHolder
-    bake_occupancy: flags.FlagHolder
-    max_uncertainty: flags.FlagHolder
-    uncertainty: flags.FlagHolder
-    members: flags.FlagHolder
-    coverage: flags.FlagHolder
+    def __init__(self, done: str, written: str, *, required: bool = False):
+        """Defines the flags.
+
+        Args:
+            done: what the program does with a checkpoint, for the help.
+            written: what it writes of predicted errors, for the help.
+            required: whether --workdir must be given.
+        """
+        self.workdir = flags.DEFINE_string("workdir", None, "The run's folder.", required=required)
+        self.data_dir = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
+        self.step = cli.define_step(f"The checkpoint's step. When it is not given, the newest is {done}.")
+        self.chunk = cli.define_count(
+            "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
+        )
+        self.bake_occupancy = flags.DEFINE_bool(
+            "bake_occupancy",
+            None,
+            "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
+            "config.eval.bake_occupancy.",
+        )
+        self.max_uncertainty = cli.define_fraction("max_uncertainty", MAX_UNCERTAINTY)
+        self.uncertainty = flags.DEFINE_string(
+            "uncertainty",
+            None,
+            "An estimator of the error of each pixel: laplace, of one run, ensemble, of several, or a registered one. "
+            f"The program writes {written}.",
+        )
+        self.members = flags.DEFINE_list("members", None, "ensemble: workdirs of the other runs, which differ in seed.")
+        self.coverage = flags.DEFINE_float(
+            "coverage",
+            0.9,
+            "The fraction of true errors that the intervals of --uncertainty are to hold. They are calibrated on the "
+            "views that config.data.hold_out has kept from training.",
+        )
 
     def restore(self, config: Any = None, settings: Mapping[str, Any] | None = None) -> "TrainedRun":
         """Restores the run as the flags say; config, settings: see `restore_run`; settings win over the flags."""
@@ -70,41 +95,3 @@ def define_config(help: str, **options: Any) -> flags.FlagHolder:
         return option_names()
 
     return cli.define_config(help, load_saved=load_saved, option_names=option_names, **options)
-
-
-def define(done: str, written: str, *, required: bool = False) -> RunFlags:
-    """Defines the flags.
-
-    Args:
-        done: what the program does with a checkpoint, for the help.
-        written: what it writes of predicted errors, for the help.
-        required: whether --workdir must be given.
-    """
-    return RunFlags(
-        workdir=flags.DEFINE_string("workdir", None, "The run's folder.", required=required),
-        data_dir=flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir."),
-        step=cli.define_step(f"The checkpoint's step. When it is not given, the newest is {done}."),
-        chunk=cli.define_count(
-            "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
-        ),
-        bake_occupancy=flags.DEFINE_bool(
-            "bake_occupancy",
-            None,
-            "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
-            "config.eval.bake_occupancy.",
-        ),
-        max_uncertainty=cli.define_fraction("max_uncertainty", MAX_UNCERTAINTY),
-        uncertainty=flags.DEFINE_string(
-            "uncertainty",
-            None,
-            "An estimator of the error of each pixel: laplace, of one run, ensemble, of several, or a registered one. "
-            f"The program writes {written}.",
-        ),
-        members=flags.DEFINE_list("members", None, "ensemble: workdirs of the other runs, which differ in seed."),
-        coverage=flags.DEFINE_float(
-            "coverage",
-            0.9,
-            "The fraction of true errors that the intervals of --uncertainty are to hold. They are calibrated on the "
-            "views that config.data.hold_out has kept from training.",
-        ),
-    )

@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxnerf.core.types import check_shapes
 from jaxnerf.fields import portable_math
 
+_LIGHT = (0.48, -0.36, 0.80)  # the direction that it comes from
 WIDTH = 0.015  # world units, over which a body's density falls at its outline
 
 Positions = Float[ArrayLike, "*batch samples 3"]
@@ -148,36 +149,16 @@ def _brick(x, y, z):
     return sqrt(sqrt(sum(square * square for square in squares) + 1e-12)) - 0.33
 
 
-def _brick_color(x, y, z, direction):
-    return 0.05, 0.25, 0.80
-
-
 def _lamp_place(x, y, z):
     return x - 0.22, y + 0.10, z - 0.62
-
-
-def _lamp_core(x, y, z):
-    return _norm(*_lamp_place(x, y, z)) - 0.15
 
 
 def _lamp_core_color(x, y, z, direction):
     return _scale((0.45, 0.02, 0.10), _lambert(*_lamp_place(x, y, z)))
 
 
-def _lamp_glass(x, y, z):
-    return _norm(*_lamp_place(x, y, z)) - 0.36
-
-
-def _lamp_glass_color(x, y, z, direction):
-    return 0.98, 0.50, 0.05
-
-
 def _ball_place(x, y, z):
     return x + 0.38, y + 0.38, z + 0.18
-
-
-def _ball(x, y, z):
-    return _norm(*_ball_place(x, y, z)) - 0.44
 
 
 def _ball_color(x, y, z, direction):
@@ -187,21 +168,26 @@ def _ball_color(x, y, z, direction):
     if direction is None:
         return base
     # Brightest where the normal halves the angle between light and camera.
-    halfway = tuple(towards - away for towards, away in zip(_light(), direction, strict=True))
+    halfway = tuple(towards - away for towards, away in zip(_LIGHT, direction, strict=True))
     aligned = sum(a * b for a, b in zip(normal, halfway, strict=True)) / (_norm(*normal) * _norm(*halfway))
     eighth = _square(_square(_square(_namespace(aligned).maximum(aligned, 0.0))))  # products, whose bits are defined
     highlight = 0.9 * (eighth * _square(eighth))
     return tuple(value + highlight * (1 - value) for value in base)
 
 
-def _light():
-    return 0.48, -0.36, 0.80
+def _sphere(place, radius):
+    """Returns the distance of a body whose middle is where `place` is 0."""
+    return lambda x, y, z: _norm(*place(x, y, z)) - radius
+
+
+def _plain(*color):
+    """Returns the colour of a body that has the same one everywhere."""
+    return lambda x, y, z, direction: color
 
 
 def _lambert(x, y, z):
     """Returns the brightness of a matt surface with its normal along (x, y, z), softened on the dark side."""
-    light = _light()
-    facing = (x * light[0] + y * light[1] + z * light[2]) / _norm(x, y, z)
+    facing = (x * _LIGHT[0] + y * _LIGHT[1] + z * _LIGHT[2]) / _norm(x, y, z)
     softened = 0.5 + 0.5 * facing
     return 0.35 + 0.65 * softened * softened
 
@@ -245,8 +231,8 @@ BODIES = (
     Body(50.0, (-0.98, -0.98, -0.81), (0.98, 0.98, -0.61), _plinth, _plinth_color),
     Body(50.0, (-0.64, 0.22, -0.66), (-0.16, 0.70, 0.86), _pillar, _pillar_color),
     Body(50.0, (-0.02, -0.06, -0.62), (0.98, 0.78, 0.54), _ring, _ring_color),
-    Body(3.5, (0.09, -0.75, -0.62), (0.75, -0.09, 0.04), _brick, _brick_color),
-    Body(50.0, (0.07, -0.25, 0.47), (0.37, 0.05, 0.77), _lamp_core, _lamp_core_color),
-    Body(2.5, (-0.14, -0.46, 0.26), (0.58, 0.26, 0.98), _lamp_glass, _lamp_glass_color),
-    Body(50.0, (-0.82, -0.82, -0.62), (0.06, 0.06, 0.26), _ball, _ball_color),
+    Body(3.5, (0.09, -0.75, -0.62), (0.75, -0.09, 0.04), _brick, _plain(0.05, 0.25, 0.80)),
+    Body(50.0, (0.07, -0.25, 0.47), (0.37, 0.05, 0.77), _sphere(_lamp_place, 0.15), _lamp_core_color),
+    Body(2.5, (-0.14, -0.46, 0.26), (0.58, 0.26, 0.98), _sphere(_lamp_place, 0.36), _plain(0.98, 0.50, 0.05)),
+    Body(50.0, (-0.82, -0.82, -0.62), (0.06, 0.06, 0.26), _sphere(_ball_place, 0.44), _ball_color),
 )

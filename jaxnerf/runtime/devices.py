@@ -67,7 +67,7 @@ def compile_step(
         microbatch_size: rays whose gradient is computed at once; None, or more than a device has: all of them.
         devices: of all processes; None: all. On several the step is jitted over a mesh of them.
         num_threads: that compute the gradient of an equal part of the rays each, on one device, see `threads_of_step`:
-            two those of one program, more by threads of the host. For more than one the step must be a `TrainStep`.
+            two in one program, more by threads of the host. For more than one the step must be a `TrainStep`.
 
     Returns:
         step, state, data: step(state, data) -> (state, metrics) consumes its state; step.compiled is what JAX

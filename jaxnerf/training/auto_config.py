@@ -63,7 +63,7 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         views = dataset.load_split(data, "train", capture=capture, fingerprint=config.fingerprint)
     fingerprint = config.fingerprint or dataset.fingerprint(data, capture)
     sampler = config.declared_by(SAMPLERS)
-    has_alpha = bounded_by_alpha(config.scene, views, ndc=data.ndc)
+    has_alpha = bounded_by_alpha(config.scene, views, ndc=data.ndc, refined=config.cameras.refine)
     # A box only for rendering holds all that cameras see.
     has_alpha &= config.has_box
     scene, found = resolve_scene(config.scene, views, ndc=data.ndc, world=data.world, has_alpha=has_alpha)

@@ -26,8 +26,7 @@ from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.training.camera_parameters import CameraParameters
 from jaxnerf.training.config import Config, RunConfig, part_sections, read_config
 from jaxnerf.training.optimizer import make_optimizer
-from jaxnerf.training.pixel_rays import PixelRays
-from jaxnerf.training.step import ProgressData, StepLoss, TrainData
+from jaxnerf.training.step import PixelRays, ProgressData, StepLoss, TrainData
 
 # The optional fields that datasets provide.
 _FILLED_BATCH_FIELDS = ("image_index", "pixel", "alpha", *ray_batches.DEPTH_FIELDS)
@@ -227,6 +226,7 @@ def build_cameras(config: RunConfig, needs: tuple[str, ...] = ()) -> CameraParam
         refine=options.refine,
         view_rays=functools.partial(ray_batches.view_rays, ndc=config.data.ndc, needs=needs),
         background=dataset.background_of(config.data),
+        refine_focal=options.refine_focal,
     )
 
 
@@ -363,7 +363,7 @@ def _prepare(config, model, extras, views):
             views,
             model.grid_schedule,
             # What is empty in one image of a scene that moves may hold matter in others.
-            use_alpha=bounded_by_alpha(config.scene, views, ndc=config.data.ndc),
+            use_alpha=bounded_by_alpha(config.scene, views, ndc=config.data.ndc, refined=config.cameras.refine),
             # Nor does it where a lens sees beside it: its view is not that of a frustum.
             min_views=0 if views.time is not None or sees_sideways(views) else model.grid_schedule.min_views,
             ndc=config.data.ndc,

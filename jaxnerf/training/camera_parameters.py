@@ -21,6 +21,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.models.base import Model
 from jaxnerf.options import POSITIVE, Ablation, Changes, Device, Facts, Options, at_least, infer, option
 
+_LEAST_ANGLE = 1e-3  # squared radians between axes, below which the point that they look at is undefined
 CAMERAS = "cameras"  # the entry of the parameters; all other entries are networks
 
 
@@ -38,16 +39,19 @@ class CameraOptions(Options):
     exposure_lr: float = option(1e-2, "initial learning rate; it decays as that of the networks", range=POSITIVE)
     refine: bool = option(
         False,
-        "whether each pose and, common to all images, the focal length are corrected",
+        "Whether each pose is corrected, by turns and moves about what the cameras look at. Alpha then does not bound "
+        "the scene, as outlines seen from wrong poses cut matter away.",
         ablations=(Ablation("refined poses", without=False, more=True, aligned="pose"),),
     )
+    refine_focal: bool = option(False, "with `refine`: whether the focal length, common to all images, is, too")
     refine_lr: float = option(
-        5e-4,
-        "initial learning rate of the corrections",
-        unit="radians, fractions of the cameras' spread and of the focal length",
+        4e-3,
+        "Initial learning rate of the corrections; it decays exponentially, to a hundredth. That of the focal length "
+        "is a tenth.",
+        unit="radians, fractions of the distance of the cameras from what they look at and of the focal length",
         range=POSITIVE,
     )
-    refine_start_step: int = option(300, "training step before which cameras do not move", range=at_least(0))
+    refine_start_step: int = option(50, "training step before which cameras do not move", range=at_least(0))
     num_images: int = option("auto", "images of the split `train`; do not set it", auto=True, changes=Changes.NOTHING)
 
     def resolve(self, facts: Facts, device: Device) -> tuple["CameraOptions", list[str]]:
@@ -66,9 +70,10 @@ class CameraParameters(NamedTuple):
     Attributes:
         num_images: V of the split "train".
         exposure: whether each image has a gain per colour channel.
-        refine: whether poses and focal length are corrected.
+        refine: whether poses are corrected.
         view_rays: (Views, index, pixels) -> Rays.
         background: [3] the colour behind alpha, which exposure leaves as it is; None: black.
+        refine_focal: whether the focal length is corrected where poses are.
     """
 
     num_images: int
@@ -76,6 +81,7 @@ class CameraParameters(NamedTuple):
     refine: bool
     view_rays: Callable[..., Rays]
     background: Sequence[float] | None = None
+    refine_focal: bool = False
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -85,8 +91,9 @@ class CameraParameters(NamedTuple):
     def init(self) -> dict[str, jax.Array]:
         """Returns the parameters before training: no exposure, no correction."""
         exposure = {"log_gains": jnp.zeros((self.num_images, 3))} if self.exposure else {}
-        poses = {"twists": jnp.zeros((self.num_images, 6)), "log_focal": jnp.zeros(())} if self.refine else {}
-        return exposure | poses
+        poses = {"twists": jnp.zeros((self.num_images, 6))} if self.refine else {}
+        focal = {"log_focal": jnp.zeros(())} if self.refine and self.refine_focal else {}
+        return exposure | poses | focal
 
     def added_to(self, model: Model) -> Model:
         """Returns a Model whose parameters have the entry "cameras"."""
@@ -131,7 +138,8 @@ class CameraParameters(NamedTuple):
                     f"{len(cameras.to_world)}, expected those that it was trained on; give its own --data_dir"
                 )
             cameras = corrected_cameras(cameras, found["twists"])
-        cameras = dataclasses.replace(cameras, focal=jnp.asarray(cameras.focal) * jnp.exp(found["log_focal"]))
+        if self.refine_focal:
+            cameras = dataclasses.replace(cameras, focal=jnp.asarray(cameras.focal) * jnp.exp(found["log_focal"]))
         return dataclasses.replace(views, cameras=cameras)
 
     def summary(self, params: Mapping[str, Any], views: Views) -> list[str]:
@@ -146,10 +154,10 @@ class CameraParameters(NamedTuple):
             turned = norm((after - before)[:, :, :3].reshape(-1, 9)) / math.sqrt(8)
             angle = jnp.degrees(2 * jnp.arcsin(jnp.median(turned)))
             moved = jnp.median(norm((after - before)[:, :, 3]))
-            zoom = jnp.exp(params[CAMERAS]["log_focal"])
+            zoom = jnp.exp(params[CAMERAS].get("log_focal", 0.0))
             lines.append(
-                f"cameras       refined by {angle:.2g} degrees and {moved:.2g} world units (medians); "
-                f"focal length times {zoom:.4f}"
+                f"cameras       refined by {angle:.2g} degrees and {moved:.2g} world units (medians)"
+                + f"; focal length times {zoom:.4f}" * self.refine_focal
             )
         return lines
 
@@ -169,26 +177,40 @@ def exposure_gains(log_gains: Float[ArrayLike, "V 3"]) -> Float[Array, "V 3"]:
 
 
 def corrected_cameras(cameras: Camera, twists: Float[ArrayLike, "V 6"]) -> Camera:
-    """Returns cameras that are moved by rigid motions about their own positions, along the axes of the world.
+    """Returns cameras that are moved by rigid motions about what they look at, along the axes of the world.
 
-    A common rotation, translation or scaling of all cameras is removed: the mean rotation vector and the mean
-    translation are 0, and so is the component of the translations along the cameras' offsets from their mean.
+    The point is the one nearest to all cameras' axes. Turns about it show the scene from another side, moves shift it
+    in the image: their gradients are hardly correlated, whereas turns and moves of a camera about its own position
+    both shift the image. A common rotation, translation or scaling of all cameras is removed: the mean rotation vector
+    and the mean translation are 0, and so is the component of the translations along the cameras' offsets from their
+    mean.
 
     Args:
         cameras: stacked, [V].
-        twists: [V, 6] see `se3_exponential`; in radians, and in units of the RMS distance of the cameras from their
-            mean position. Without such a distance, as in a panorama, there is no translation.
+        twists: [V, 6] see `se3_exponential`; in radians, and in units of the RMS distance of the cameras from the
+            point. Without such a distance, as in a panorama, there is no translation.
     """
-    to_world = jnp.asarray(cameras.to_world)
-    eyes, twists = to_world[:, :, 3], jnp.asarray(twists)
-    offsets = eyes - eyes.mean(axis=0, keepdims=True)
-    squares = (offsets**2).sum()
+    to_world, twists = jnp.asarray(cameras.to_world), jnp.asarray(twists)
+    center, middle = nearest_to_axes(to_world), to_world[:, :, 3].mean(axis=0)
+    offsets, spread = (to_world[:, :, 3] - each[None] for each in (center, middle))
     twists = twists - twists.mean(axis=0, keepdims=True)
     turns, moves = twists[:, :3], twists[:, 3:]
-    scaling = (moves * offsets).sum() / jnp.where(squares > 0, squares, 1)
-    moves = (moves - scaling * offsets) * jnp.sqrt(squares / len(eyes))
+    squares = (spread**2).sum()
+    scaling = (moves * spread).sum() / jnp.where(squares > 0, squares, 1)
+    moves = (moves - scaling * spread) * jnp.sqrt((offsets**2).sum() / len(offsets))
     motions = se3_exponential(jnp.concatenate([turns, moves], axis=-1))
     # Sums of products instead of a matmul, which may round the camera to ten bits.
-    axes = (motions[:, :, :3, None] * to_world[:, None, :, :3]).sum(axis=2)
-    positions = eyes + motions[:, :, 3]
-    return dataclasses.replace(cameras, to_world=jnp.concatenate([axes, positions[:, :, None]], axis=-1))
+    at_center = jnp.concatenate([to_world[:, :, :3], offsets[:, :, None]], axis=-1)
+    moved = (motions[:, :, :3, None] * at_center[:, None, :, :]).sum(axis=2)
+    return dataclasses.replace(cameras, to_world=moved.at[:, :, 3].add(motions[:, :, 3] + center[None]))
+
+
+def nearest_to_axes(to_world: Float[ArrayLike, "V 3 4"]) -> Float[Array, "3"]:
+    """Computes the point with the least mean squared distance from the cameras' axes, near them if it is undefined."""
+    to_world = jnp.asarray(to_world)
+    eyes, axes = to_world[:, :, 3], to_world[:, :, 2]
+    middle = eyes.mean(axis=0)
+    across = jnp.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    away = (across * (eyes - middle[None])[:, None, :]).sum(axis=2).mean(axis=0)
+    # Of parallel axes no point is nearest.
+    return middle + jnp.linalg.solve(across.mean(axis=0) + _LEAST_ANGLE * jnp.eye(3), away)

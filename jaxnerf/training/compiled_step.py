@@ -49,7 +49,7 @@ class CompiledStep:
 
     Attributes:
         data: TrainData on the devices.
-        num_threads: of the host, that compute the gradient of a part of the rays each; see `devices.threads_of_step`.
+        num_threads: that compute the gradient of a part of the rays each; see `devices.threads_of_step`.
         prepare_seconds, compile_seconds: that it took to prepare the data, and to compile.
     """
 

@@ -1,15 +1,18 @@
-"""The config of a run: the tree of the options of its parts."""
+"""The config of a run: the tree of the options of its parts; and as a ConfigDict, which flags and Python code set."""
 
+import ast
 import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeAlias
 
-from ml_collections import ConfigDict, FieldReference
+from absl import flags
+from ml_collections import ConfigDict, FieldReference, config_flags
 
 from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.scene import SceneOptions
 from jaxnerf.options import (
+    AUTO,
     Changes,
     Option,
     Options,
@@ -17,6 +20,9 @@ from jaxnerf.options import (
     as_tuples,
     declarations,
     is_auto,
+    is_kind,
+    is_schedule,
+    is_tuple,
     option,
     read,
     read_value,
@@ -27,7 +33,6 @@ from jaxnerf.options import (
 )
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS, Part, Registry
 from jaxnerf.runtime import memory
-from jaxnerf.runtime.config_fields import typed
 from jaxnerf.training.camera_parameters import CameraOptions
 from jaxnerf.training.earlier_options import RENAMED, in_todays_names, refuse, today
 from jaxnerf.training.options import EvalOptions, TrainOptions
@@ -149,7 +154,8 @@ def read_config(config: Config) -> RunConfig:
     content, left = in_todays_names(config.to_dict() if isinstance(config, ConfigDict) else config)
     refuse(left, "--config.")
     record = content.pop("fingerprint", "")
-    kinds = {field.name: field.type for field in dataclasses.fields(RunConfig) if _is_section(field.type)}
+    types = {field.name: field.type for field in dataclasses.fields(RunConfig)}
+    kinds = {name: kind for name, kind in types.items() if isinstance(kind, type) and issubclass(kind, Options)}
     top = read(RunConfig, {name: content.pop(name) for name in declarations(RunConfig) if name in content}, "config.")
     own = {name: read(kind, _section(content, name), f"config.{name}.") for name, kind in kinds.items()}
     losses = {name: _read_weight(name, weight) for name, weight in _section(content, "losses").items()}
@@ -260,10 +266,6 @@ def _read_weight(name, weight):
     return read_value(declaration, Schedule, weight, f"--config.losses.{name}")
 
 
-def _is_section(kind):
-    return isinstance(kind, type) and issubclass(kind, Options)
-
-
 def _section(content, name):
     if name not in content:
         raise ValueError(f"--config.{name} is missing; restore the config")
@@ -312,3 +314,58 @@ def used_sections(config: RunConfig) -> set[str]:
         part = registry.get(name) if name in registry.names() else Part(None)
         used |= {part.section or name, *part.networks}
     return used
+
+
+def typed(value: Any, kind: Any, *, auto: bool) -> Any:
+    """Returns a value for a ConfigDict's field that accepts the values of one type, or "auto", too.
+
+    Args:
+        value: of the field.
+        kind: an annotation of an option, see `option`.
+        auto: whether "auto" is accepted.
+    """
+    if kind == Schedule:
+        return FieldReference(value, field_type=_SCHEDULE)
+    if auto and kind is not str:
+        return FieldReference(value, field_type=_AUTO_TYPES[tuple if is_tuple(kind) else kind])
+    return float(value) if kind is float else value  # the type of a flag is that of the value
+
+
+class _Accepts(type):
+    """A type whose instances are the values that a field accepts."""
+
+    def __instancecheck__(cls, value):
+        return cls.accepts(value)
+
+
+class _Literal(flags.ArgumentParser):
+    """Reads "auto" as text and all else as a Python literal of the field's type."""
+
+    def __init__(self, field_type, syntactic_help):
+        self._type, self.syntactic_help = field_type, syntactic_help
+
+    def parse(self, argument):
+        value = argument
+        if isinstance(argument, str) and argument != AUTO:
+            try:
+                value = ast.literal_eval(argument[:1].upper() + argument[1:])
+            except (SyntaxError, ValueError):
+                value = None
+        if not isinstance(value, self._type):
+            raise ValueError(f"expected {self.syntactic_help}")
+        return value
+
+    def flag_type(self):
+        return self.syntactic_help
+
+
+def _auto_type(kind):
+    accepts = staticmethod(lambda value: is_auto(value) or is_kind(value, kind))
+    field_type = _Accepts(f"auto_{kind.__name__}", (), {"accepts": accepts})
+    config_flags.register_flag_parser_for_type(field_type, _Literal(field_type, f"auto, or {kind.__name__}"))
+    return field_type
+
+
+_AUTO_TYPES = {kind: _auto_type(kind) for kind in (bool, int, float, tuple)}
+_SCHEDULE = _Accepts("schedule", (), {"accepts": staticmethod(lambda value: is_auto(value) or is_schedule(value))})
+config_flags.register_flag_parser_for_type(_SCHEDULE, _Literal(_SCHEDULE, "a number, ((step, value), ...), or auto"))

@@ -25,6 +25,8 @@ _MAX_RMS = 3.0
 _DECAY = 0.05
 # Up to the first number of steps the average takes the parameters of every step, and then those of every eighth: adding
 # them is a pass over the whole table.
+_POSE_DECAY = 1e-2  # of the learning rate of poses over training, as in arXiv:2104.06405
+_FOCAL_RATE = 0.1  # of that of poses: it is one number, on which all images act
 _AVERAGE_ALL, _AVERAGE_EVERY = 256, 8
 _ITERATIONS = ((3.4445, -4.775, 2.0315),) * 5  # optax's own; listed one by one, they compile once, as a loop
 
@@ -83,7 +85,8 @@ def make_optimizer(
     """
     moments = {"b1": _BETA1, "b2": train.beta2, "eps": train.epsilon}
 
-    def optimizer_with(schedule):
+    def optimizer_with(decay_data=None):
+        schedule = learning_rate(train, decay_data)
         decay = _DECAY if train.muon else 0.0
         optimizer = optax.adamw(schedule, **moments, weight_decay=decay) if decay else optax.adam(schedule, **moments)
         if not train.table_momentum:
@@ -91,39 +94,44 @@ def make_optimizer(
             optimizer = optax.partition({"table": table, "other": optimizer}, _tables)
         if train.muon:
             optimizer = with_muon(optimizer, schedule, train.muon)
-        return optimizer if cameras is None else _with_cameras(optimizer, train, schedule, cameras)
+        return optimizer if cameras is None else _with_cameras(optimizer, train, decay_data, cameras)
 
     def update(grads, state, params=None, *, decay=None):
-        return optimizer_with(learning_rate(train, decay)).update(grads, state, params)
+        return optimizer_with(decay).update(grads, state, params)
 
-    optimizer = optax.GradientTransformationExtraArgs(optimizer_with(learning_rate(train)).init, update)
+    optimizer = optax.GradientTransformationExtraArgs(optimizer_with().init, update)
     if train.averaging_power:
         optimizer = with_averaging(optimizer, train.averaging_power)
     return optimizer, learning_rate(train)
 
 
-def _with_cameras(optimizer, train, schedule, cameras):
+def _with_cameras(optimizer, train, decay, cameras):
     """Returns an optimizer that updates the entry "cameras" of the parameters by Adam with learning rates of its own.
 
-    They decay as that of the networks. Cameras do not move before refine_start_step, while the scene is fog.
+    That of exposures decays as that of the networks, that of poses exponentially. Cameras do not move before
+    refine_start_step.
     """
 
-    def adam(initial, first_step):
-        def rate(step):
-            return jnp.where(step < first_step, 0.0, initial / train.lr_init * schedule(step))
+    def adam(initial, final, power, first_step=0):
+        rates = {"lr_init": initial, "lr_final": final, "lr_decay_power": power, "warmup_steps": 0}
+        rate = learning_rate(dataclasses.replace(train, **rates), decay)
+        return optax.adam(
+            lambda step: jnp.where(step < first_step, 0.0, rate(step)), _BETA1, train.beta2, train.epsilon
+        )
 
-        return optax.adam(rate, _BETA1, train.beta2, train.epsilon)
+    def of_poses(rate):
+        return adam(rate, _POSE_DECAY * rate, 1.0, cameras.refine_start_step)
 
+    last_exposure = cameras.exposure_lr * train.lr_final / train.lr_init
     updates = {
         "networks": optimizer,
-        "log_gains": adam(cameras.exposure_lr, 0),
-        "poses": adam(cameras.refine_lr, cameras.refine_start_step),
+        "log_gains": adam(cameras.exposure_lr, last_exposure, train.lr_decay_power),
+        "twists": of_poses(cameras.refine_lr),
+        "log_focal": of_poses(_FOCAL_RATE * cameras.refine_lr),
     }
 
     def label(path, _):
-        if path[0].key != CAMERAS:
-            return "networks"
-        return "log_gains" if path[1].key == "log_gains" else "poses"
+        return "networks" if path[0].key != CAMERAS else path[1].key
 
     return optax.partition(updates, lambda params: jax.tree_util.tree_map_with_path(label, params))
 

@@ -50,7 +50,7 @@ def save_config(workdir: str | os.PathLike, config: RunConfig) -> None:
 def _check_same_run(workdir, config):
     content, left = _saved(workdir)
     refuse(left, f"{workdir}: belongs to a run of another version, whose ", Changes.TRAINING)
-    old, new = (_as_saved(each) for each in (read_config(content), config))
+    old, new = (_without_unused_losses(flatten(json.loads(each.to_json()))) for each in (read_config(content), config))
     free = {name for name, option, _, _ in declared(config) if not option.changes & Changes.TRAINING}
     fixed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key) and key not in free]
     if "fingerprint" in fixed:
@@ -76,10 +76,6 @@ def saved_options(workdir: str | os.PathLike) -> dict[str, Any]:
         ValueError: if there is no run; names the file.
     """
     return _without_unused_losses(flatten(_saved(workdir)[0]))
-
-
-def _as_saved(config):
-    return _without_unused_losses(flatten(json.loads(config.to_json())))
 
 
 def _without_unused_losses(flat):

@@ -155,10 +155,5 @@ def test_field_is_bounded_with_finite_gradients():
 def test_invalid_arguments_are_errors():
     with pytest.raises(ValueError, match="split is 'all', .*train, val, test"):
         synthetic.load_synthetic(split="all")
-    with pytest.raises(ValueError, match="finish is 'wet', expected one of .*correct data.finish"):
-        synthetic.load_synthetic(finish="wet")
-    for size in (0, 2.5, True):
-        with pytest.raises(ValueError, match="size is"):
-            synthetic.load_synthetic(size=size)
     with pytest.raises(ValueError, match="viewdirs"):
         still_life.still_life(jnp.zeros((2, 4, 3)), jnp.zeros((2, 3, 3)))

@@ -15,7 +15,7 @@ FILES = ROOT / "experiments" / "cluster"
 def flags_of(program):
     """Returns the names of a program's flags."""
     source = (ROOT / "jaxnerf" / f"{program}.py").read_text()
-    if "run_flags.define" in source:
+    if "run_flags.RunFlags" in source:
         source += (ROOT / "jaxnerf" / "evaluation" / "run_flags.py").read_text()
     return {*re.findall(r'(?:DEFINE|define)_\w+\(\s*"(\w+)"', source), *re.findall(r"\.define_(config)\(", source)}
 

@@ -29,12 +29,12 @@ from jaxnerf.extend import Field
 from jaxnerf.options import Options, option
 from jaxnerf.registry import FIELDS, SAMPLERS, Part
 from jaxnerf.runtime import cli
-from jaxnerf.runtime.config_fields import typed
 from jaxnerf.tools.exporters.registration import EXPORTERS
 from jaxnerf.tools.uncertainty.base import UncertaintySource
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
 from jaxnerf.training import auto_config
 from jaxnerf.training.build import build_model
+from jaxnerf.training.config import typed
 from jaxnerf.training.metric_log import read_rows
 from jaxnerf.training.state import rendered_shapes
 from jaxnerf.training.step import StepLoss, _value

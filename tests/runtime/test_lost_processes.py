@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from jaxnerf.runtime import lost_processes
+from jaxnerf.runtime import processes
 from runs import ROOT, SMOKE_FLAGS, start_together
 
 TWICE = (
@@ -41,7 +41,7 @@ SILENT = (
     ],
 )
 def test_describe(messages, line):
-    assert re.match(line, lost_processes.describe(messages))
+    assert re.match(line, processes.describe_loss(messages))
 
 
 @pytest.mark.parametrize(
@@ -50,9 +50,9 @@ def test_describe(messages, line):
 def test_an_abort_prints_one_line_and_other_messages_stay(message, line):
     program = f"""if True:
         import os, sys, time
-        from jaxnerf.runtime import lost_processes
-        lost_processes._LAST_WORDS = 0
-        watch = lost_processes.LostProcesses()
+        from jaxnerf.runtime import processes
+        processes._LAST_WORDS = 0
+        watch = processes.LostProcesses()
         os.write(2, b"a library's message\\n")
         watch.flush()
         print("the program's", file=sys.stderr)

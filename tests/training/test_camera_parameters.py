@@ -23,6 +23,7 @@ from jaxnerf.training.camera_parameters import (
     CameraParameters,
     corrected_cameras,
     exposure_gains,
+    nearest_to_axes,
 )
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.config import read_config
@@ -35,7 +36,7 @@ from toys import LOSSES, toy_rendering
 pytest_plugins = ["run_fixtures"]
 pytestmark = pytest.mark.usefixtures("unoptimized")
 
-BOTH = {"cameras.exposure": True, "cameras.refine": True, "cameras.refine_start_step": 0}
+BOTH = {"cameras.exposure": True, "cameras.refine": True, "cameras.refine_focal": True, "cameras.refine_start_step": 0}
 COUNT, SIZE = 6, 24
 TRAIN = {"lr_init": 1e-2, "lr_final": 1e-4, "lr_steps": 100, "warmup_steps": 0, "averaging_power": 0.0, "muon": 0.0}
 TRAIN |= {"beta2": 0.99, "epsilon": 1e-15}
@@ -86,6 +87,26 @@ def test_cameras_at_one_point_only_turn(twists):
     assert all_finite(slopes(twists))
 
 
+def test_turns_are_about_what_the_cameras_look_at():
+    start, target = cameras(), np.float32([0.3, -0.2, 0.5])
+    shifted = dataclasses.replace(start, to_world=start.to_world.at[:, :, 3].add(target[None]))
+    np.testing.assert_allclose(jax.jit(nearest_to_axes)(shifted.to_world), target, atol=2e-3)
+    moved = corrected(shifted, random_twists(3, 0.2).at[:, 3:].set(0))
+
+    def seen(stack):
+        poses = np.asarray(stack.to_world)
+        return np.einsum("vij,vi->vj", poses[:, :, :3], target - poses[:, :, 3])
+
+    np.testing.assert_allclose(seen(moved), seen(shifted), atol=5e-3)  # the point stays where it was in each image
+    assert np.linalg.norm(moved.to_world[:, :, 3] - shifted.to_world[:, :, 3], axis=1).min() > 0.1
+
+
+def test_parallel_axes_look_at_no_point_far_away():
+    poses = cameras().to_world.at[:, :, :3].set(jnp.eye(3))
+    found = jax.jit(nearest_to_axes)(poses)
+    np.testing.assert_allclose(found, poses[:, :, 3].mean(axis=0), atol=1e-3)
+
+
 # Recovery from images of a known scene
 
 
@@ -119,7 +140,7 @@ def images(stack, gains):
 
 def recover(views, num_steps, *, exposure=False, refine=False):
     """Returns CameraParameters and the parameters that training through the known scene finds."""
-    parameters = CameraParameters(COUNT, exposure, refine, ray_batches.view_rays)
+    parameters = CameraParameters(COUNT, exposure, refine, ray_batches.view_rays, refine_focal=refine)
     model = Model(
         init=lambda key: {"fine": {"unused": jnp.zeros(())}},
         render=lambda keys, params, grid, rays, step: {"fine": render(rays)},
@@ -172,7 +193,7 @@ def test_pose_noise_and_focal_length_are_recovered():
 
 
 def test_cameras_do_not_move_before_their_first_step():
-    parameters = CameraParameters(COUNT, True, True, None)
+    parameters = CameraParameters(COUNT, True, True, None, refine_focal=True)
     params = {"fine": jnp.ones(3), CAMERAS: parameters.init()}
     optimizer, _ = make_optimizer(OptimizerOptions(**TRAIN), CameraOptions(**{**RATES, "refine_start_step": 2}))
 
@@ -185,9 +206,9 @@ def test_cameras_do_not_move_before_their_first_step():
         return jax.lax.scan(step, optimizer.init(params), length=4)[1]
 
     found = updates(params)
-    for name in ("twists", "log_focal"):
+    for name, rate in (("twists", RATES["refine_lr"]), ("log_focal", 0.1 * RATES["refine_lr"])):
         moved = np.abs(found[CAMERAS][name]).reshape(4, -1).max(axis=1)
-        np.testing.assert_allclose(moved, [0, 0, RATES["refine_lr"], RATES["refine_lr"]], rtol=0.2)
+        np.testing.assert_allclose(moved, [0, 0, rate, rate], rtol=0.2)
     np.testing.assert_allclose(np.abs(found[CAMERAS]["log_gains"]), RATES["exposure_lr"], rtol=0.2)
     np.testing.assert_allclose(np.abs(found["fine"]), TRAIN["lr_init"], rtol=0.2)
 
@@ -240,8 +261,13 @@ def make_step(config):
 
 def test_what_is_off_is_absent(blob_field):
     assert make_step(blob_config({}))[1].params.keys() == {"fine"}
-    for field, names in (("exposure", {"log_gains"}), ("refine", {"twists", "log_focal"})):
-        found = make_step(blob_config({f"cameras.{field}": True}))[1].params[CAMERAS]
+    focal = {"cameras.refine": True, "cameras.refine_focal": True}
+    for fields, names in (
+        ({"cameras.exposure": True}, {"log_gains"}),
+        ({"cameras.refine": True}, {"twists"}),
+        (focal, {"twists", "log_focal"}),
+    ):
+        found = make_step(blob_config(fields))[1].params[CAMERAS]
         assert found.keys() == names and all(leaf.shape[:1] in ((), (60,)) for leaf in found.values())
 
 

@@ -25,9 +25,8 @@ from jaxnerf.training import auto_config, build
 from jaxnerf.training.checkpoint import Checkpoints
 from jaxnerf.training.compiled_step import _gather_ahead
 from jaxnerf.training.options import TrainOptions
-from jaxnerf.training.pixel_rays import PixelRays
 from jaxnerf.training.state import create_state
-from jaxnerf.training.step import ProgressData, make_train_step
+from jaxnerf.training.step import PixelRays, ProgressData, make_train_step
 from runs import PACKED, smoke_config
 
 pytest_plugins = ["run_fixtures"]

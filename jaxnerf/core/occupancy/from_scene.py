@@ -11,13 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jaxnerf.core import rendering, volume_rendering
 from jaxnerf.core.loops import vary_like
 from jaxnerf.core.occupancy.grid import OccupancyGrid, cells_around, grid_from_scene, mark_cells
-from jaxnerf.core.occupancy.packed import (
-    count_occupied,
-    evaluate_samples,
-    fill_buffer,
-    flattened,
-    occupied_words,
-)
+from jaxnerf.core.occupancy.packed import count_occupied, evaluate_samples, fill_buffer, flattened, occupied_words
 from jaxnerf.core.occupancy.ray_marching import march_rays
 from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Background, Rays, Samples, SceneFn, Vector

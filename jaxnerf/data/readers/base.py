@@ -232,7 +232,7 @@ def moved_near(capture: Capture, positions: Float[np.ndarray, "V 3"] | None = No
     """
     if positions is None:
         train = (capture.splits or {}).get("train") or range(len(capture.frames))
-        positions = np.stack([_position(capture.frames[index].camera) for index in train])
+        positions = np.float64([capture.frames[index].camera.to_world for index in train])[:, :, 3]
     origin = origin_near(positions)
     if origin is None:
         return capture
@@ -245,10 +245,6 @@ def moved_near(capture: Capture, positions: Float[np.ndarray, "V 3"] | None = No
         choices=(*capture.choices, line),
         origin=origin,
     )
-
-
-def _position(camera):
-    return np.asarray(camera.to_world, np.float64)[:, 3]
 
 
 def _moved(frame, origin):

@@ -4,7 +4,6 @@ Files that state more of their cameras than these are detected as the format "tr
 for them, it reads their cameras all the same, in a world where near is 2 and far 6.
 """
 
-import math
 import os
 from pathlib import Path
 
@@ -12,18 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnerf.data.geometry.poses import gaze_center
-from jaxnerf.data.readers import base
+from jaxnerf.data.readers import base, json_frames
 from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.data.readers.image_paths import ImageFinder, nearly
-from jaxnerf.data.readers.json_frames import MIRROR, read_cameras, read_poses, read_splits, split_ranges
-from jaxnerf.data.readers.split_files import full_cameras, split_files
-from jaxnerf.data.readers.validation import is_number, read_json, read_times, required
+from jaxnerf.data.readers.validation import read_json, read_times, required
 from jaxnerf.registry import Reader
 
 _RANGE = (2.0, 6.0)  # near and far of the NeRF paper's synthetic scenes, world units
 _FILES = CameraFiles(
     poses="every transform_matrix of transforms_*.json",
-    mirror=MIRROR,
+    mirror=json_frames.MIRROR,
     focal="transforms_*.json: camera_angle_x to about {angle:.4g}",
 )
 
@@ -43,13 +40,13 @@ def read_capture(folder: str | os.PathLike, *, split: str | None = None) -> Capt
     source, content = _read_transforms(folder, split or "train")  # whose error names the files that there are
     if split is None:
         source = Path(folder)
-        paths = split_files(source)
-        read, notes = read_splits(paths, lambda path: _frames(read_json(path), path))
+        paths = json_frames.split_files(source)
+        read, notes = json_frames.read_splits(paths, lambda path: _frames(read_json(path), path))
         named = {
             name: [frame._replace(name=f"{name}/{frame.name}") for frame in frames]
             for name, (frames, _) in read.items()
         }
-        frames, splits = sum(named.values(), []), split_ranges(paths, named)
+        frames, splits = sum(named.values(), []), json_frames.split_ranges(paths, named)
         notes = [*(note for _, own in read.values() for note in own), *notes]
     else:
         frames, notes = _frames(content, source)
@@ -73,10 +70,10 @@ def read_capture(folder: str | os.PathLike, *, split: str | None = None) -> Capt
 
 def _training_poses(folder) -> Float[np.ndarray, "V 3 4"]:
     """Returns the poses of the split "train", or of the first without one, without looking for its images."""
-    splits = split_files(folder)
+    splits = json_frames.split_files(folder)
     split = "train" if "train" in splits or not splits else next(iter(splits))
     source, content = _read_transforms(folder, split)
-    return np.stack(read_poses(source, _listed(content, source))[0])
+    return np.stack(json_frames.read_poses(source, json_frames.listed_frames(content, source))[0])
 
 
 def _bounds(poses):
@@ -108,41 +105,18 @@ def _read_transforms(folder, split):
     return source, read_json(source)
 
 
-def _check_angle(content, source):
-    """Raises a ValueError if a file has a wrong angle, or neither an angle nor a focal length anywhere."""
-    if "camera_angle_x" not in content:
-        frames = content.get("frames") if isinstance(content.get("frames"), list) else []
-        stated = set(content).union(*(frame for frame in frames if isinstance(frame, dict)))
-        if any(key in stated for key in ("fl_x", "camera_angle_x", "camera_angle_y")):
-            return
-    angle = required(content, "camera_angle_x", source)
-    if not is_number(angle) or not 1e-6 < angle < math.pi - 1e-6:  # outside, the focal length is no float32
-        hint = "convert it from degrees" if is_number(angle) and angle > 0 else "export it again"
-        raise ValueError(f"{source}: camera_angle_x is {angle!r}, expected radians between 0 and pi; {hint}")
-
-
 def _frames(content, source):
     """Returns the Frames that a file lists, and notes."""
-    _check_angle(content, source)
-    entries, finder = _listed(content, source), ImageFinder(source.parent)
+    entries, finder = json_frames.listed_frames(content, source), ImageFinder(source.parent)
     times = read_times(entries)
     images = [_image_path(finder, frame, where) for where, frame in entries]
-    poses, notes = read_poses(source, entries)
+    poses, notes = json_frames.read_poses(source, entries)
     shown = [(*entry, image) for entry, image in zip(entries, images, strict=True)]
-    cameras, camera_notes = read_cameras([(source, content)], shown, poses)
+    cameras, camera_notes = json_frames.read_cameras([(source, content)], shown, poses)
     frames = [
         Frame(image.stem, image, camera, time=time) for image, camera, time in zip(images, cameras, times, strict=True)
     ]
     return frames, [*finder.notes(source), *notes, *camera_notes]
-
-
-def _listed(content, source):
-    """Returns (where, entries) of each frame of a file."""
-    listed = required(content, "frames", source)
-    if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
-        found = "an empty list" if listed == [] else f"{str(listed)[:40]!r}"
-        raise ValueError(f"{source}: frames is {found}, expected one object {{...}} per image; export it again")
-    return [(f"{source}, frame {index}", frame) for index, frame in enumerate(listed)]
 
 
 def _image_path(finder, frame, where):
@@ -153,8 +127,7 @@ def _image_path(finder, frame, where):
     raise ValueError(f"{where}: {finder.folder / path}.png does not exist, expected its image{todo}")
 
 
-def _detect(folder):
-    return bool(split_files(folder)) and not full_cameras(folder)
-
-
-READER = Reader(read_capture, detect=_detect)
+READER = Reader(
+    read_capture,
+    detect=lambda folder: bool(json_frames.split_files(folder)) and not json_frames.full_cameras(folder),
+)

@@ -129,7 +129,7 @@ def _other_angles(fields, camera, image):
 
 
 def _angle(fields, key):
-    return number_in(fields, key, "radians between 0 and pi", 1e-6, math.pi - 1e-6)
+    return number_in(fields, key, "radians between 0 and pi, not degrees", 1e-6, math.pi - 1e-6)
 
 
 def number_in(

@@ -1,5 +1,6 @@
-"""Poses, cameras and splits of frames that JSON files list, for the readers of Blender's files and transforms.json."""
+"""Frames that JSON files list, and files of splits, for the readers of Blender's files and transforms.json."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,12 @@ from jaxtyping import Float
 
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
-from jaxnerf.data.readers.intrinsics import ignored_facts, read_camera
-from jaxnerf.data.readers.validation import required
+from jaxnerf.data.readers.intrinsics import STATED, ignored_facts, read_camera, wrong_value
+from jaxnerf.data.readers.validation import read_json, required
 
+SPLITS = ("train", "val", "test")
+# What no file of the NeRF paper's Blender renders has: it shows that the cameras are those of another program.
+_FOREIGN = (*STATED, "mask_path", "ply_file_path", "applied_transform", "applied_scale", "orientation_override")
 MIRROR = "also negate row 1 of every transform_matrix (the world is mirrored)"  # see `CameraFiles.mirror`
 
 
@@ -82,3 +86,39 @@ def split_ranges(paths: Mapping[str, Path], frames: Mapping[str, Sequence]) -> d
         splits[split] = tuple(range(start, start + count))
         start += count
     return splits
+
+
+def split_files(folder: str | os.PathLike) -> dict[str, Path]:
+    """Returns {split: path} of the files transforms_<split>.json in a folder; {} if there is none for training."""
+    paths = {split: Path(folder) / f"transforms_{split}.json" for split in SPLITS}
+    found = {split: path for split, path in paths.items() if path.is_file()}
+    return found if "train" in found else {}
+
+
+def full_cameras(folder: str | os.PathLike) -> str:
+    """Returns which fields of a dataset's split files a Blender render does not state; "" if there are none.
+
+    The cameras of Blender's renders have one field, camera_angle_x, and a world in which near is 2 and far 6. Files
+    that state more are read as transforms.json is: world, near and far follow from the cameras and points.
+    """
+    for path in split_files(folder).values():
+        try:
+            content = read_json(path)
+        except ValueError:  # reported by the reader
+            continue
+        frames = content.get("frames") if isinstance(content.get("frames"), list) else []
+        stated = set(content).union(*(frame for frame in frames if isinstance(frame, dict)))
+        keys = [key for key in _FOREIGN if key in stated]
+        if "camera_angle_x" not in stated and "camera_angle_y" in stated:
+            keys.append("camera_angle_y")
+        if keys:
+            return f"{path.name} states {', '.join(keys[:4])}{', ...' if len(keys) > 4 else ''}"
+    return ""
+
+
+def listed_frames(content: Mapping[str, Any], source: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Returns (where, entries) of each frame that a file lists; where: for messages."""
+    frames = required(content, "frames", source)
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise wrong_value(source, "frames", frames, "a list of one object {...} per image; export it again")
+    return [(f"{source}, frame {index}", frame) for index, frame in enumerate(frames)]

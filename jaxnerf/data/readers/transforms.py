@@ -6,18 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxnerf.data.readers import json_frames
 from jaxnerf.data.readers.base import CameraFiles, Capture, Frame
 from jaxnerf.data.readers.image_paths import ImageFinder, fold, nearly
 from jaxnerf.data.readers.intrinsics import number_in, wrong_value
-from jaxnerf.data.readers.json_frames import MIRROR, read_cameras, read_poses, read_splits, split_ranges
 from jaxnerf.data.readers.ply import read_points
-from jaxnerf.data.readers.split_files import SPLITS, full_cameras, split_files
 from jaxnerf.data.readers.validation import is_number, read_json, read_times, required
 from jaxnerf.registry import Reader
 
 _FILES = CameraFiles(
     poses="every transform_matrix of the JSON files",
-    mirror=MIRROR,
+    mirror=json_frames.MIRROR,
     focal="{file}: fl_x, fl_y (or camera_angle_x) to about {x:.5g}, {y:.5g}",
 )
 _UNUSED = {  # facts of other programs that are no camera's, and what sets them instead
@@ -53,7 +52,7 @@ def read_capture(folder: str | os.PathLike) -> Capture:
     Raises:
         ValueError: names file and frame, what was found, what is expected and what to do.
     """
-    folder, stated = Path(folder), full_cameras(folder)
+    folder, stated = Path(folder), json_frames.full_cameras(folder)
     if stated:
         return _read_splits(folder, stated)
     source, finder = folder / "transforms.json", ImageFinder(folder)
@@ -74,8 +73,8 @@ def read_capture(folder: str | os.PathLike) -> Capture:
 
 def _read_splits(folder, stated):
     """Returns the Capture of a file for each split; stated: see `full_cameras`."""
-    paths, finder = split_files(folder), ImageFinder(folder)
-    files, notes = read_splits(paths, lambda path: _read_file(path, finder))
+    paths, finder = json_frames.split_files(folder), ImageFinder(folder)
+    files, notes = json_frames.read_splits(paths, lambda path: _read_file(path, finder))
     first = files["train"]
     frames = dict(zip(files, _common_names(files), strict=True))
     if (folder / "transforms.json").is_file():
@@ -87,7 +86,7 @@ def _read_splits(folder, stated):
         format="transforms",
         source=first.source,
         frames=sum(frames.values(), ()),
-        splits=split_ranges(paths, frames) if len(paths) > 1 else None,
+        splits=json_frames.split_ranges(paths, frames) if len(paths) > 1 else None,
         points=first.points,
         box=first.box,
         notes=(*_joined_notes(files.values()), *finder.notes(first.source), *notes),
@@ -163,8 +162,8 @@ def _read_file(source, finder):
     _check_applied(content, source)
     points, points_notes = _points(content, source, finder)
     box, box_notes = _box(content, source)
-    poses, pose_notes = read_poses(source, [(entry.where, entry.content) for entry in kept])
-    cameras, camera_notes = read_cameras(
+    poses, pose_notes = json_frames.read_poses(source, [(entry.where, entry.content) for entry in kept])
+    cameras, camera_notes = json_frames.read_cameras(
         [(source, content)], [(entry.where, entry.content, entry.image) for entry in kept], poses
     )
     radii = [_crop_radius({**content, **entry.content}, entry.where) for entry in kept]
@@ -178,10 +177,7 @@ def _read_file(source, finder):
 
 def _entries(content, source, finder):
     """Returns all entries, sorted by name, the folder that holds all their images, and notes."""
-    frames = required(content, "frames", source)
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise wrong_value(source, "frames", frames, "a list of one object {...} per image; export it again")
-    places = [f"{source}, frame {index}" for index in range(len(frames))]
+    places, frames = zip(*json_frames.listed_frames(content, source), strict=True)
     stated = [required(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
     paths = [finder.inside(path, key="file_path", source=where) for path, where in zip(stated, places, strict=True)]
     images = [finder.find(path) for path in paths]
@@ -265,7 +261,7 @@ def _splits(file, finder):
     places |= {entry.image: index for index, entry in enumerate(file.kept)}
     absent = {entry.path for entry in file.entries if entry.image is None}
     splits, notes = {}, []
-    for split in SPLITS:
+    for split in json_frames.SPLITS:
         key = f"{split}_filenames"
         names = file.content.get(key, [])
         if not isinstance(names, list):
@@ -338,8 +334,7 @@ def _check_applied(content, source):
         number_in({"applied_scale": (content["applied_scale"], source)}, "applied_scale", "more than 0", 1e-30)
 
 
-def _detect(folder):
-    return (folder / "transforms.json").is_file() or bool(full_cameras(folder))
-
-
-READER = Reader(read_capture, detect=_detect)
+READER = Reader(
+    read_capture,
+    detect=lambda folder: (folder / "transforms.json").is_file() or bool(json_frames.full_cameras(folder)),
+)

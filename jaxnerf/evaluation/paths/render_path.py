@@ -20,9 +20,8 @@ from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.paths.camera_path import CameraPath
-from jaxnerf.evaluation.restore import newest_step, refined_views
+from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views
 from jaxnerf.evaluation.supersampling import MAX_RAYS, render_pixels, trained_footprint, training_cameras
-from jaxnerf.evaluation.trained_run import TrainedRun
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.runtime.stages import Progress

@@ -144,7 +144,7 @@ class Study:
         self.by_slug = {each.slug: each for each in [complete(), *variants]}
         self._done: dict[tuple[str, int, float], Result] = {}
         self.failed: dict[str, str] = {}
-        self._pose = any(each.aligned == "pose" for each in variants)
+        self._pose, self._full_pose = any(each.aligned == "pose" for each in variants), False
         (folder / "trials").mkdir(exist_ok=True)
 
     def search(self) -> Outcome:
@@ -219,6 +219,7 @@ class Study:
     def _run_trial(self, variant, seed, length, path, full):
         steps = 0 if full else round(self.plan.steps * length / self.plan.length)
         pose = variant.aligned == "pose" or (variant.slug == COMPLETE and self._pose)
+        pose = self._full_pose if full else pose  # it takes seconds, and longer in fog
         try:
             trainer = self._full_trainer if full else self._trainer
             result, images = trainer.run(variant.values, seed, length, steps=steps, pose=pose)
@@ -312,6 +313,7 @@ class Study:
         wanted = [slug for slug, each in known.items() if _improves(self.by_slug[slug], each.verdict(margin))]
         chosen = _one_each([self._full[slug] for slug in wanted if slug in self._full])
         smaller = [each for each in chosen if each.change != LESS]
+        self._full_pose = any(each.aligned == "pose" for each in chosen)
         length, refused = self._longest(), []
         base = self.trial(complete(), 0, length, full=True)
         for each in [chosen, smaller] if len(smaller) < len(chosen) else [chosen]:

@@ -10,8 +10,7 @@ import numpy as np
 
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.evaluate import result_folder
-from jaxnerf.evaluation.restore import newest_step
-from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.evaluation.restore import TrainedRun, newest_step
 from jaxnerf.runtime import stages
 
 # What the error is measured against.

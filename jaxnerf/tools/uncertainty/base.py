@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxnerf.core.types import Rays
 from jaxnerf.core.views import Views
-from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.models.base import FINAL_NETWORK
 from jaxnerf.runtime.fingerprint import fingerprint
 

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Bool
 
+from jaxnerf.core.views import Views
 from jaxnerf.runtime import atomic_files
 
 _NUM_BINS = 50
@@ -54,6 +56,15 @@ class Calibration(NamedTuple):
 def pixel_error(rgb: ArrayLike, truth: ArrayLike) -> np.ndarray:
     """Returns the error [...] of colours [..., 3]: the RMS over their channels."""
     return np.sqrt(((np.clip(np.asarray(rgb), 0, 1) - np.asarray(truth)) ** 2).mean(axis=-1))
+
+
+def object_mask(views: Views, index: int) -> Bool[np.ndarray, "H W"] | None:
+    """Returns which pixels of one of Views show the object, by alpha above a half; None without alpha."""
+    if views.pixels.shape[-1] != 4:
+        return None
+    (height, width), first = views.size[index], int(views.offset[index])
+    alpha = np.asarray(views.pixels[first : first + height * width, 3]).reshape(height, width)
+    return alpha > np.iinfo(alpha.dtype).max // 2
 
 
 def calibrate(

@@ -15,7 +15,7 @@ from jaxnerf.core import contraction
 from jaxnerf.core.occupancy.grid import OccupancyGrid
 from jaxnerf.core.views import check_pixels
 from jaxnerf.data.ray_batches import draw_batch
-from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.options import is_auto
 from jaxnerf.runtime import stages
 from jaxnerf.tools.uncertainty.base import UncertaintySource

@@ -27,7 +27,7 @@ from jaxnerf.core.types import Rays, Vector
 from jaxnerf.core.views import check_pixels
 from jaxnerf.data.ray_batches import draw_batch
 from jaxnerf.evaluation.image_renderer import image_renderer
-from jaxnerf.evaluation.trained_run import TrainedRun
+from jaxnerf.evaluation.restore import TrainedRun
 from jaxnerf.fields.base import Field
 from jaxnerf.runtime import atomic_files, stages
 from jaxnerf.runtime.fingerprint import fingerprint

@@ -18,7 +18,7 @@ from jaxnerf.runtime import stages
 from jaxnerf.runtime.fingerprint import fingerprint
 from jaxnerf.tools.uncertainty import calibration as calibrations
 from jaxnerf.tools.uncertainty.base import Score, UncertaintySource
-from jaxnerf.tools.uncertainty.calibration import Calibration, pixel_error, score_order
+from jaxnerf.tools.uncertainty.calibration import Calibration, object_mask, pixel_error, score_order
 from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY
 from jaxnerf.tools.uncertainty.one_at_a_time import one_at_a_time
 from jaxnerf.tools.uncertainty.registration import ESTIMATORS
@@ -55,24 +55,24 @@ class Predictor(NamedTuple):
         rays: Rays,
         rgb: ArrayLike,
         truth: ArrayLike,
-        mask: ArrayLike | None,
-        on_object: ArrayLike | None = None,
+        views: Views,
+        index: int,
     ) -> tuple[np.ndarray, dict]:
         """Predicts the errors of an image, and compares them with its true errors.
 
         Args:
             rays: Rays [H, W].
             rgb, truth: [H, W, 3].
-            mask: [H, W] bool, the pixels that count; None: all.
-            on_object: [H, W] bool, those of them that show the object; None: unknown.
+            views, index: that the image shows, for its mask and its alpha.
 
         Returns:
             The predicted errors [H, W]; and the figures of `score_order`, with a calibration "coverage", the
             fraction of pixels whose errors are within their intervals, and "interval", the mean half width.
         """
         score, error = self._score(rays), pixel_error(rgb, truth)
+        mask = pixel_mask(views, index)
         kept = np.ones(error.shape, bool) if mask is None else np.asarray(mask, bool)
-        row = score_order(error, score, kept, on_object)
+        row = score_order(error, score, kept, object_mask(views, index))
         if self.calibration is not None:
             width = self.calibration.interval(score)
             row |= {"coverage": float((error <= width)[kept].mean()), "interval": float(width[kept].mean())}

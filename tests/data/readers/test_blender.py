@@ -132,10 +132,10 @@ def _pose(row, column, value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (_set("frames", []), "frames is an empty list"),
-        (_set("frames", {}), "frames is '{}'"),
+        (_set("frames", []), r"frames is \[\]"),
+        (_set("frames", {}), "frames is {}"),
         (lambda content: content.pop("frames"), "has no frames"),
-        (lambda content: content.pop("camera_angle_x"), "has no camera_angle_x"),
+        (lambda content: content.pop("camera_angle_x"), "has no fl_x or camera_angle_x"),
         (_set("camera_angle_x", math.nan), "camera_angle_x is nan"),
         (_set("camera_angle_x", 39.6), "camera_angle_x is 39.6.*degrees"),
         (_set("camera_angle_x", 0), "camera_angle_x is 0"),

@@ -13,7 +13,7 @@ from jaxnerf.tools.needs import run
 from jaxnerf.tools.needs.run import Request, find_needs
 from jaxnerf.tools.needs.study import Settings
 from jaxnerf.tools.needs.trial import Result
-from runs import start
+from runs import PACKED, as_flags, start
 
 SETTINGS = Settings(60.0, 0.1)
 
@@ -81,6 +81,9 @@ def test_a_study_that_is_killed_continues(tmp_path):
     out = tmp_path / "out"
     flags = [
         "--config=configs/smoke.py",
+        *as_flags(PACKED),
+        "--config.train.lr_init=0.01",
+        "--config.train.lr_final=0.001",
         f"--data_dir={tmp_path / 'data'}",
         f"--out={out}",
         "--budget=150s",
