@@ -84,7 +84,7 @@ def _of_lens(lens):
         inputs["distortion"] = Input((len(SIZES[lens]),), "signed0", 1e-3, 1)
     pose = inputs | {"to_world": Input((3, 4), "signed", 1e-2, 1e2)}
     shared = {"prepare": functools.partial(_pixels, lens), "fixed": ("start",), "whole": True}
-    place = {"prepare": functools.partial(_points, lens), "fixed": ("start",), "whole": True}
+    place = {"prepare": functools.partial(_points, lens), "fixed": ("start",), "whole": True, "bfloat16": False}
     bend = functools.partial(functools.partial, lens=lens)
     found = [
         Row("undistort", lens, inputs, bend(_undistort), bend(_exact_undistort), **shared),
@@ -184,7 +184,8 @@ def _exact_undistort(lens, pixels, focal, center, distortion=None, start=None):
         return target
     forward = lambda point: jnp.stack(_bend(lens, distortion, (point[0], point[1])))  # noqa: E731
     point = start
-    for _ in range(2):  # of second order, from 1e-7 away; so is the derivative of the last step
+    for _ in range(3):  # of second order, from 1e-2 away where inputs are bfloat16
+        point = jax.lax.stop_gradient(point)  # at the solution the derivative of the last step is that of all
         (a, b), (c, d) = jax.jacfwd(forward)(point)
         x, y = forward(point) - target
         point = point - jnp.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)

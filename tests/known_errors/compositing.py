@@ -193,7 +193,7 @@ def _renderers():
             _normals,
             _exact_normals,
             whole=True,
-            constant=("sigma",),
+            constant=("sigma", "spacing"),
             **plain,
         ),
         Row("mask_scene", "", normal, _masked, _exact_masked, **plain),

@@ -82,6 +82,7 @@ def rows() -> list[Row]:
             _distortion,
             _exact_distortion,
             prepare=lambda given: given | {"edges": ascending(given["edges"])},
+            bfloat16=False,  # weights of renderings are float32
         ),
     ]
 
@@ -154,7 +155,7 @@ def _ssim(a, b):
 
 def _distortion(weights, edges):
     samples = jaxnerf.samples_from_edges(None, edges[None])
-    zero, ends = jnp.zeros(1), (edges[:1], edges[-1:])
+    zero, ends = jnp.zeros(1), (edges[:1].astype(samples.t.dtype), edges[-1:].astype(samples.t.dtype))
     vectors = jnp.zeros((1, 3))
     rays = Rays(origins=vectors, directions=vectors, viewdirs=vectors, near=ends[0], far=ends[1])
     seen = Rendering(

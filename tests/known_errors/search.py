@@ -157,8 +157,9 @@ def climb(meter: Meter, *, generations: int, count: int = 256, seed: int = 0, kn
             order = np.argsort(-errors)[:KEPT]
             found = [Worst(float(errors[i]), z[i] if i >= first else None, _at(inputs, i), slopes[i]) for i in order]
             worst[column] = sorted(worst.get(column, []) + found, key=lambda each: -each.error)[:KEPT]
-        parents = [each.z for column in worst.values() for each in column if each.z is not None]
-        z = _changed(rng, parents, count)
+        if generation < generations:
+            parents = [each.z for column in worst.values() for each in column if each.z is not None]
+            z = _changed(rng, parents or [*z], count)
     return {column: found[0] for column, found in worst.items()}
 
 
