@@ -67,13 +67,12 @@ def test_a_jump_counts_by_how_far_its_input_is():
     assert np.isinf(search._backward(np.full((1, 1), 2.0), want, moved, search.EPS, 0, arrays)).all()
 
 
-@pytest.mark.parametrize(
-    "row",
-    [
-        pytest.param(row, id=str(row), marks=pytest.mark.extra if str(row) in AGAIN else pytest.mark.slow)
-        for row in ROWS
-    ],
-)
+def _parameters():
+    marks = {name: pytest.mark.extra if name in AGAIN else pytest.mark.slow for name in NAMES}
+    return [pytest.param(row, id=str(row), marks=marks[str(row)]) for row in ROWS]
+
+
+@pytest.mark.parametrize("row", _parameters())
 def test_no_error_has_outgrown_its_bound(row):
     record, found = records.read()[str(row)], _largest(row)
     beyond = [
