@@ -72,13 +72,13 @@ def main(argv: list[str]) -> None:
         for seed in common.seeds_of("--seeds", _SEEDS.value):
             folder = pathlib.Path(_OUT.value) / f"{name}_{_SIDE.value}_{kind}_{amount:g}_seed{seed}_{_STEPS.value}"
             found = measured(folder, kind, amount, seed)
-            rows.append(row(f"{name}, {_SIDE.value} px", found, kind, amount, seed))
+            rows.append(row(f"{name}, {_SIDE.value} px", found, kind, amount, seed, _STEPS.value))
             print(f"{folder}: {found}", flush=True)
     published = PUBLISHED if (name, kinds) == ("lego", [("twist", 0.15)]) else []
     common.publish([*common.markdown(HEADS, [*rows, *published]), "", *common.provenance()], _TABLE.value)
 
 
-def row(name: str, found: dict[str, float], kind: str, amount: float, seed: int) -> tuple[str, ...]:
+def row(name: str, found: dict[str, float], kind: str, amount: float, seed: int, steps: int) -> tuple[str, ...]:
     """Returns the cells of a row of the table."""
     turns = (f"{found['turn_before']:.2f}", f"{found['turn']:.3f}")
     moves = (f"{found['move_before']:.3f}", f"{found['move']:.4f}")
@@ -87,8 +87,7 @@ def row(name: str, found: dict[str, float], kind: str, amount: float, seed: int)
         name,
         noise,
         str(seed),
-        f"{_STEPS.value:,}",
-        f"{found['seconds']:.0f}",
+        f"{steps:,}",
         *turns,
         *moves,
         f"{found['focal']:.4f}",

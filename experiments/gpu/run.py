@@ -4,7 +4,7 @@
 
 Each piece is saved to <out>/results.json when it is done, and finished pieces are not repeated. A piece that would not
 fit into the rest of --minutes waits for the next call. docs/guides/accelerators.md describes the pieces, and how to run
-them on a lent machine. docs/results/gpu.md is put together from the pages of several calls.
+them on a lent machine. docs/results/reproducibility.md is put together from the pages of several calls.
 """
 
 import functools

@@ -37,3 +37,10 @@ def test_a_motion_of_the_world_is_seen_by_the_cameras_that_barf_perturbs():
     seen = np.einsum("vji,vj->vi", moved[:, :, :3], x - moved[:, :, 3])
     expected = np.einsum("vji,vj->vi", TRUTH[:, :, :3], after - TRUTH[:, :, 3])
     np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
+def test_a_row_has_a_cell_for_each_head():
+    found = {"turn_before": 13.5, "turn": 0.2, "move_before": 0.7, "move": 0.02, "focal": 1.0, "psnr": 30.0}
+    assert {len(poses.HEADS)} == {
+        len(cells) for cells in (poses.row("lego", found, "twist", 0.15, 0, 3000), *poses.PUBLISHED)
+    }

@@ -23,6 +23,7 @@ _EQUAL = flags.DEFINE_enum("equal", "seconds", ["seconds", "steps"], "What paire
 _SECONDS = flags.DEFINE_float(
     "seconds", 0.0, "Training time of a trial. 0: as long as the budget allows.", lower_bound=0.0
 )
+_LEAN = flags.DEFINE_bool("lean", True, "Whether to seek the lean model, too, or verdicts alone.")
 _PARTS = flags.DEFINE_list("parts", [], "Parts to try, such as 'view dependence,levels'. Empty: all.")
 _SHRINK = flags.DEFINE_integer(
     "shrink",
@@ -41,7 +42,7 @@ def main(argv):
     from jaxnerf.tools.needs.study import Settings
 
     config = cli.use_data(_CONFIG.value or capture.get_config(), _DATA_DIR.value, _FORMAT.value)
-    settings = Settings(_budget(_BUDGET.value), _MARGIN.value, _EQUAL.value, _SECONDS.value)
+    settings = Settings(_budget(_BUDGET.value), _MARGIN.value, _EQUAL.value, _SECONDS.value, _LEAN.value)
     find_needs(Request(config, settings, tuple(_PARTS.value), _SHRINK.value), _OUT.value)
 
 

@@ -183,7 +183,7 @@ def _kept_factor(folder):
 def _check_origin(folder, request, config, factor):
     """Raises a ValueError if the folder holds trials of something else; writes what they are of."""
     plain = json.loads(changed(config, {"data.dir": ""}).to_json())
-    settings = request.settings._replace(budget=0.0)._asdict()
+    settings = request.settings._replace(budget=0.0, lean=True)._asdict()
     origin = json.loads(json.dumps({"config": plain, "settings": settings, "parts": request.parts, "shrink": factor}))
     path = folder / _ORIGIN
     if not path.exists():

@@ -36,12 +36,15 @@ class Settings(NamedTuple):
         margin: dB that a needed part contributes at least.
         equal: "seconds" or "steps", what paired runs have in common.
         length: seconds of a trial; 0: as the budget allows.
+        lean: whether the lean model is sought, too; otherwise the curve is that of the complete model, as long as a
+            trial.
     """
 
     budget: float
     margin: float
     equal: str = "seconds"
     length: float = 0.0
+    lean: bool = True
 
 
 class Plan(NamedTuple):
@@ -309,6 +312,8 @@ class Study:
         Images are as large as the run's own here, and the longest runs take what is left of the budget, as what short
         runs of small images do without may be missed later.
         """
+        if not self.settings.lean:
+            return [], None, [], self.plan.length
         known, margin = self.effects(), self.settings.margin
         wanted = [slug for slug, each in known.items() if _improves(self.by_slug[slug], each.verdict(margin))]
         chosen = _one_each([self._full[slug] for slug in wanted if slug in self._full])

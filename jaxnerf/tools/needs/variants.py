@@ -125,7 +125,8 @@ def facts_of(config: RunConfig, views: Views) -> Facts:
         config: resolved.
         views: of the split "train".
     """
-    has_alpha = bounded_by_alpha(config.scene, views, ndc=config.data.ndc) and config.has_box
+    refined = config.cameras.refine
+    has_alpha = bounded_by_alpha(config.scene, views, ndc=config.data.ndc, refined=refined) and config.has_box
     return dataset_facts(
         views,
         config.scene.box,
