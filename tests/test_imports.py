@@ -39,6 +39,7 @@ ALLOWED = {
 HANDS_OVER = {
     ("jaxnerf.train", "tools.options_page"),
     ("jaxnerf.train", "tools.viewer"),
+    ("jaxnerf.eval", "tools.alignment"),
     ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
     ("jaxnerf.report", "tools.curve"),
