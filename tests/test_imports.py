@@ -29,6 +29,7 @@ RANKS = {
 ALLOWED = {
     ("models", "fields"),
     ("tools.capture_check", "tools.next_images"),
+    ("tools.needs", "tools.curve"),
     ("tools.viewer", "tools.exporters"),
     ("tools.viewer", "tools.next_images"),
     ("tools.viewer", "tools.uncertainty"),
@@ -41,6 +42,7 @@ HANDS_OVER = {
     ("jaxnerf.eval", "tools.alignment"),
     ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
+    ("jaxnerf.report", "tools.curve"),
     ("jaxnerf.data.synthetic", "tools.embedded_scene"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),
