@@ -27,6 +27,14 @@ from jaxnerf.evaluation.metrics import image_metrics, pixel_mask
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime.atomic_files import partial_file, write_text
 from jaxnerf.runtime.devices import split_positions
+from jaxnerf.tools.curve.machine import (  # noqa: F401
+    REFERENCE_GFLOPS,
+    comparable,
+    matrix_gflops,
+    seconds,
+    times,
+)
+from jaxnerf.tools.curve.machine import describe as describe_machine
 from jaxnerf.training import auto_config, build
 from jaxnerf.training import config as run_config
 from jaxnerf.training.config import RunConfig
@@ -34,9 +42,7 @@ from jaxnerf.training.state import create_state
 from jaxnerf.training.step import make_train_step
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-REFERENCE_GFLOPS = 93.0  # matrix product of the machine that the project's limits in seconds refer to
 _SCORED = "scored.json"  # in the workdir of a run that is trained to its end and scored
-_MATRIX_SIDE = 1024
 _MOST_SPLITS = 6
 _splits: dict[tuple[str, str], Views] = {}
 PAGE = flags.DEFINE_string(
@@ -210,12 +216,6 @@ def differences(scores: Mapping[int, float], others: Mapping[int, float]) -> lis
     return [scores[seed] - others[seed] for seed in sorted(scores.keys() & others.keys())]
 
 
-def describe_machine() -> str:
-    """Returns what timings depend on."""
-    cores = len(os.sched_getaffinity(0))
-    return f"{jax.devices()[0].device_kind}, {cores} core(s), XLA_FLAGS={os.environ.get('XLA_FLAGS', '')!r}"
-
-
 def commit() -> str:
     """Returns the commit of the working tree, with "-dirty" after it where files differ; "unknown" outside git.
 
@@ -240,31 +240,6 @@ def few_cores(count: int | None) -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, cores)
-
-
-def matrix_gflops(repeats: int = 12) -> float:
-    """Returns the median GFLOP/s of the product of two float32 matrices on this machine now."""
-    matrix = jnp.full((_MATRIX_SIDE, _MATRIX_SIDE), 1 / _MATRIX_SIDE)
-    product = jax.jit(lambda a, b: jnp.dot(a, b, precision="highest"))
-    return 2 * _MATRIX_SIDE**3 / 1e9 / statistics.median(times(lambda: product(matrix, matrix), repeats))
-
-
-def comparable(seconds: float, gflops: float) -> float:
-    """Returns the seconds that the machine of REFERENCE_GFLOPS would take."""
-    return seconds * gflops / REFERENCE_GFLOPS
-
-
-def times(call: Callable[[], Any], repeats: int) -> list[float]:
-    """Returns the seconds of repeated calls, after one that may compile and that warms the caches."""
-    jax.block_until_ready(call())
-    return [seconds(call) for _ in range(repeats)]
-
-
-def seconds(call: Callable[[], Any]) -> float:
-    """Returns the seconds until the result of a call is ready."""
-    started = time.perf_counter()
-    jax.block_until_ready(call())
-    return time.perf_counter() - started
 
 
 def read_json(path: pathlib.Path) -> dict[str, Any]:

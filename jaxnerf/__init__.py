@@ -25,6 +25,7 @@ from jaxnerf.core.metrics import mse, psnr, round_to_8_bits, ssim
 from jaxnerf.core.normals import density_normals
 from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, grid_from_scene, mask_scene, update_grid
 from jaxnerf.core.occupancy.packed import render_packed
+from jaxnerf.core.pose_estimation import PoseEstimate, estimate_pose
 from jaxnerf.core.poses import look_at, se3_exponential, turntable
 from jaxnerf.core.rendering import points_on_rays, render_hierarchical, render_image, render_rays, render_samples
 from jaxnerf.core.sampling import (
@@ -92,7 +93,7 @@ def __dir__():
 __all__ = [
     # cameras and rays
     "Camera", "Rays", "pixel_grid", "undistort", "rays_from_pixels", "pixel_radius", "project", "ndc_rays", "ndc_to_t",
-    "look_at", "turntable", "se3_exponential",
+    "look_at", "turntable", "se3_exponential", "PoseEstimate", "estimate_pose",
     # samples along rays
     "Samples", "uniform_edges", "stepped_edges", "samples_from_edges", "samples_from_points", "inverse_cdf",
     "importance_points", "merge_edges", "points_on_rays",

@@ -32,6 +32,13 @@ _ERROR_BUDGET = flags.DEFINE_float(
 _PREDICTIONS = flags.DEFINE_string(
     "predictions", None, "A folder of images, or of color/ with images, that are scored in place of a run."
 )
+_ALIGN = flags.DEFINE_string(
+    "align",
+    None,
+    "pose, exposure, or pose,exposure: each view's pose, or gains per colour channel, are fitted to its image with the "
+    "scene fixed, and scores after that stand beside those before. When it is not given, what the run has trained of "
+    "its own images is aligned; none: nothing.",
+)
 _SHARD = flags.DEFINE_string(
     "shard",
     None,
@@ -45,10 +52,11 @@ def main(argv):
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
     from jaxnerf.evaluation import evaluate
     from jaxnerf.runtime import shards
+    from jaxnerf.tools.alignment import align_views
 
     shard = shards.parse(_SHARD.value)
     _check_flags(is_sharded=shard != shards.WHOLE)
-    predictor = _RUN.predictor()
+    predictor, make_aligner = _RUN.predictor(), align_views.requested(_ALIGN.value)
     workdir, split, overwrite = _RUN.workdir.value, _SPLIT.value, _OVERWRITE.value
     restore = functools.partial(_RUN.restore, _CONFIG.value)
     if _PREDICTIONS.value:
@@ -67,11 +75,14 @@ def main(argv):
 
             found = choose(workdir, restore, budget, **target)
         run = restore(found)
-        results = evaluate.score_run(run, workdir, shard=shard, predictor=predictor and predictor(run), **target)
+        tools = {"predictor": predictor and predictor(run), "aligner": make_aligner(run)}
+        results = evaluate.score_run(run, workdir, shard=shard, **tools, **target)
     if results is None:
         print(f"shard {_SHARD.value} is done; views of other shards are missing")
         return
     print(evaluate.summary(results))
+    if aligned := align_views.line(results):
+        print(aligned)
 
 
 def _check_flags(is_sharded):
@@ -85,6 +96,7 @@ def _check_flags(is_sharded):
         "step": _RUN.step.value,
         "error_budget": _ERROR_BUDGET.value,
         "uncertainty": _RUN.uncertainty.value,
+        "align": _ALIGN.value,
     }
     of_a_run = of_one_checkpoint | {
         "chunk": _RUN.chunk.value,

@@ -3,14 +3,22 @@
 `python -m jaxnerf.report` is the same program. PSNR and SSIM are those that jaxnerf-eval has written, of the newest
 checkpoint that it has scored; "training PSNR" is that of the last batches of rays. Options that differ between the
 runs follow. Neither JAX's devices nor the datasets are used.
+
+jaxnerf-report --curve=DATASET --seconds=5,15,60 trains a run of each length and scores it: speed against error.
 """
 
 import pathlib
 
 from absl import flags
 
+from jaxnerf.evaluation import run_flags
 from jaxnerf.runtime import cli
 
+_CONFIG = run_flags.define_config("The config of the runs of --curve: a name, or the path of a file; capture if none.")
+_CURVE = flags.DEFINE_string("curve", None, "A dataset's folder, or a workdir, whose own curve is then drawn.")
+_SECONDS = flags.DEFINE_list("seconds", [], "Seconds of training for --curve; of a workdir, times to read its log at.")
+_COMPARE = flags.DEFINE_string("compare", None, "A CSV file with points of other programs, which join the --curve.")
+_OUT = flags.DEFINE_string("out", "runs/curve", "The folder of --curve: curve.csv, curve.png and the runs.")
 _CSV = flags.DEFINE_string("csv", None, "A file to write: one row for each run, with all options that differ.")
 _PLOT = flags.DEFINE_string(
     "plot", None, "A .png or .svg to write: PSNR over time and over steps. It needs matplotlib, the extra `report`."
@@ -21,6 +29,17 @@ _FORMATS = (".png", ".svg")
 
 def main(argv):
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
+    if _CURVE.value:
+        from jaxnerf.configs import capture
+        from jaxnerf.tools.curve.curve import report
+
+        if argv[1:] or _CSV.value or _PLOT.value:
+            raise ValueError("--curve takes no RUN, --csv or --plot; see --out, or omit it")
+        config = cli.use_data(_CONFIG.value or capture.get_config(), _CURVE.value)
+        report(_CURVE.value, config, _SECONDS.value, _OUT.value, compare=_COMPARE.value, plugins=flags.FLAGS.plugins)
+        return
+    if _SECONDS.value or _COMPARE.value or _CONFIG.value:
+        raise ValueError("--seconds, --compare and --config belong to --curve=DATASET; give it, or omit them")
     from jaxnerf.evaluation import run_report
     from jaxnerf.runtime.atomic_files import write_text
 
@@ -58,7 +77,7 @@ def _new_file(flag):
 
 def run():
     """Runs the program."""
-    cli.run(main, positional=True)
+    cli.run(main, positional=True, stopped="within a run or before; the same command continues")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,8 @@ SURFACE = {
     "pixel_radius": "camera pixels |",
     "project": "camera x |",
     "se3_exponential": "twists |",
+    "estimate_pose": "scene image camera start | near far num_samples=128 background=None render=None key=None "
+    "pixels=None num_pixels=8192 with_focal=False with_gains=False max_iterations=30 chunk=1024",
     "uniform_edges": "near far | num_segments in_disparity=False",
     "stepped_edges": "key near far | step_size num_segments",
     "samples_from_edges": "key edges | rule='segments'",
@@ -80,7 +82,7 @@ SURFACE = {
     "register_estimator": "name estimate |",
 }
 TYPES = ["Rays", "Samples", "PackedSamples", "Rendering", "Camera", "Views", "Batch", "OccupancyGrid", "SceneFn"]
-TYPES += ["SparsePoints", "TrainedRun"]
+TYPES += ["SparsePoints", "TrainedRun", "PoseEstimate"]
 SOURCE = r"Eqs?\. ?\d|Section \d|Appendix|arXiv|\d{4} code|released codes?|\([A-Z][a-z]+ .*\d{4}"
 
 

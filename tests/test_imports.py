@@ -29,6 +29,7 @@ RANKS = {
 ALLOWED = {
     ("models", "fields"),
     ("tools.capture_check", "tools.next_images"),
+    ("tools.needs", "tools.curve"),
     ("tools.viewer", "tools.exporters"),
     ("tools.viewer", "tools.next_images"),
     ("tools.viewer", "tools.uncertainty"),
@@ -38,8 +39,10 @@ ALLOWED = {
 HANDS_OVER = {
     ("jaxnerf.train", "tools.options_page"),
     ("jaxnerf.train", "tools.viewer"),
+    ("jaxnerf.eval", "tools.alignment"),
     ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
+    ("jaxnerf.report", "tools.curve"),
     ("jaxnerf.data.synthetic", "tools.embedded_scene"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
     ("jaxnerf.extend", "tools.exporters"),

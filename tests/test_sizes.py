@@ -9,11 +9,13 @@ from runs import ROOT
 MAX_LINES, MAX_PARAMETERS, MAX_MODULE = 80, 8, 500  # lines of code without docstrings and comments; lines of a file
 CONTRACT = "its keywords are public names, see test_api.py"
 MANY_PARAMETERS = {
+    "core/pose_estimation.py:estimate_pose": CONTRACT,
     "core/rendering.py:render_rays": CONTRACT,
     "core/rendering.py:render_hierarchical": CONTRACT,
     "core/occupancy/grid.py:update_grid": CONTRACT,
     "core/occupancy/grid.py:grid_from_scene": CONTRACT,
     "data/ray_batches.py:draw_batch": CONTRACT,
+    "evaluation/evaluate.py:score_run": "each is a flag of jaxnerf-eval",
     "options.py:option": "each names a property of a declaration, and most declarations have two or three",
     "models/grid_schedule.py:make_grid_schedule": "its keywords are options of samplers, those of plug-ins, too",
     "models/occupancy.py:render_with_grid": "it adds the grid's steps to what render_packed takes",

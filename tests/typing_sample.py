@@ -42,6 +42,14 @@ def make_rays(camera: jaxnerf.Camera) -> jaxnerf.Rays:
     return rays
 
 
+def find_pose(camera: jaxnerf.Camera) -> Array:
+    image, options = jnp.zeros((16, 16, 3)), {"num_pixels": 64}
+    found: jaxnerf.PoseEstimate = jaxnerf.estimate_pose(
+        scene, image, camera, camera.to_world, near=2.0, far=6.0, background=(1.0, 1.0, 1.0), with_gains=True, **options
+    )
+    return found.covariance
+
+
 def make_samples(key: Array, rays: jaxnerf.Rays) -> jaxnerf.Samples:
     edges = jaxnerf.uniform_edges(rays.near, rays.far, num_segments=8)
     steps = jaxnerf.stepped_edges(key, rays.near, rays.far, step_size=0.5, num_segments=8)

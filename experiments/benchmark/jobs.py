@@ -121,11 +121,6 @@ def configuration(job: Job, overrides: Mapping[str, Any] | Sequence = ()):
     return config
 
 
-def at_time(config, time_limit: float):
-    """Returns a config that trains for so many seconds."""
-    return common.changed(config, {"train.max_seconds": float(time_limit)})
-
-
 def check_protocol(config, name: str) -> None:
     """Raises ValueError if a config reads or scores other images than a protocol does."""
     for option, expected in PROTOCOLS[name].options.items():

@@ -38,7 +38,7 @@ def results_of(score: Mapping[str, Any], folder: pathlib.Path) -> dict[str, Any]
     """Returns the content of a results file.
 
     Args:
-        score: of a run, as one_run.py writes it.
+        score: of a run, as jaxnerf.tools.curve.one_run writes it.
         folder: the workdir of the run, whose images are hashed and compared.
     """
     order = sorted(range(len(score["images"])), key=lambda index: score["images"][index]["name"])

@@ -14,9 +14,7 @@ the mark "headline", as in the README. --nerfbaselines writes each run's scores 
 nerfbaselines_layout.py.
 """
 
-import os
 import pathlib
-import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -27,11 +25,13 @@ from absl import flags
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 from benchmark import jobs, nerfbaselines_layout, settings, tables
-from speed.training import covers
 
 from jaxnerf.data.dataset import dataset_folder
 from jaxnerf.runtime import cli
 from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.tools.curve import measure
+from jaxnerf.tools.curve.measure import SCORE
+from jaxnerf.tools.curve.runs import train_and_score
 
 _JOBS = flags.DEFINE_list("jobs", list(jobs.JOBS), "Names of jobs, see --list.")
 _LIST = flags.DEFINE_bool("list", False, "Print the jobs, and do nothing else.")
@@ -41,7 +41,6 @@ _OUT = flags.DEFINE_string("out", "runs/benchmark", "Folder of the runs and thei
 _ANY_COMMIT = flags.DEFINE_bool("any_commit", False, "Do not repeat runs of other commits with the same config.")
 _REPORT = flags.DEFINE_bool("report", False, "Train nothing; write the tables of what is there.")
 _NERFBASELINES = flags.DEFINE_string("nerfbaselines", None, "Folder for the scores in the layout of nerfbaselines.")
-_ONE_RUN = pathlib.Path(__file__).resolve().with_name("one_run.py")
 
 
 def main(argv: list[str]) -> None:
@@ -111,7 +110,7 @@ def missing(names: Sequence[str]) -> dict[str, str]:
 
 def read_scores(out: pathlib.Path, name: str) -> list[dict[str, Any]]:
     """Returns the scores of a job's finished runs, each with its workdir, the newest first."""
-    paths = sorted((out / name).glob(f"*/{settings.SCORE}"))
+    paths = sorted((out / name).glob(f"*/{SCORE}"))
     found = [{**common.read_json(path), "workdir": path.parent.name} for path in paths]
     return sorted(found, key=lambda score: score["datetime"], reverse=True)
 
@@ -142,9 +141,9 @@ def is_finished(
     """
     for score in scores:
         time = score["time_limit"]
-        if not covers(score, time_limit):
+        if not measure.covers(score, time_limit):
             continue
-        expected = common.plain_config(jobs.at_time(config, time))
+        expected = common.plain_config(measure.at_time(config, time))
         if score["commit"] == commit and time == time_limit:
             remedy = "give another --out, or remove that folder"
             common.check_origin({"config": score["config"]}, {"config": expected}, score["workdir"], remedy)
@@ -166,28 +165,15 @@ def _measure(plan, configs, out, commit):
             workdir = out / name / f"{time:g}s-{commit}"
             print(f"{run}: {'continues' if workdir.exists() else 'starts'} in {workdir}", flush=True)
             on_cpu = _is_cpu() if on_cpu is None else on_cpu
-            command = [sys.executable, str(_ONE_RUN), f"--job={name}", f"--seconds={time:g}", f"--workdir={workdir}"]
-            command += [f"--set={value}" for value in _SET.value]
+            about = {"job": name, "overrides": {**jobs.JOBS[name].overrides, **settings.parse(_SET.value)}}
+            about |= {"commit": commit, "config": common.plain_config(measure.at_time(configs[name], time))}
             with common.few_cores(jobs.JOBS[name].cores if on_cpu else None):
-                status = run_to_end(command, {**os.environ, "JAXNERF_COMMIT": commit})
-            score = common.read_json(workdir / settings.SCORE)
-            if status or not score:
+                score = train_and_score(configs[name], time, workdir, about=about)
+            if score is None:
                 failed.append(run)
             else:
                 print(f"{run}: {score['psnr']:.2f} dB, SSIM {score['ssim']:.4f}", flush=True)
     return failed
-
-
-def run_to_end(command: Sequence[str], environment: Mapping[str, str]) -> int:
-    """Runs a program and returns its exit status; a signal that stops this program stops that one, which may save."""
-    # In a session of its own it receives a signal once, from here: a second one would end it before it has saved.
-    process = subprocess.Popen(command, env=environment, start_new_session=True)
-    try:
-        return process.wait()
-    except KeyboardInterrupt:
-        process.send_signal(signal.SIGTERM)
-        process.wait()
-        raise
 
 
 def _is_cpu():

@@ -1,4 +1,4 @@
-"""What the programs of the benchmark share: the flag --set, and the name of the file with a run's scores."""
+"""The flag --set of the benchmark: options in place of the jobs' own."""
 
 import ast
 from collections.abc import Sequence
@@ -7,8 +7,6 @@ from typing import Any
 from absl import flags
 
 from jaxnerf.training.config import option_names
-
-SCORE = "score.json"  # in the workdir of a run that is trained and scored
 
 
 def define_set() -> flags.FlagHolder:

@@ -2,15 +2,12 @@
 
 import pathlib
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import common
 
-from jaxnerf.evaluation.evaluate import score_run, train_and_evaluate
-from jaxnerf.evaluation.restore import restore_run
-from jaxnerf.training import metric_log, workdir
+from jaxnerf.tools.curve.measure import covers, run_to
 
 
 def _curve(config, seconds, **overrides):
@@ -52,6 +49,9 @@ CURVES = {
 }
 
 
+_DETAILS = ("settings", "conventions", "comparable_with", "images")  # of a score, which a curve does not need
+
+
 def measure(
     kept: dict[str, Any],
     save: Callable[[dict], None],
@@ -90,7 +90,7 @@ def measure(
                 point = run_to(time_limit, configuration(name, seed), folder / workdir_name(name, seed, time_limit))
                 if point is None:
                     return False
-                points.append(point)
+                points.append({key: value for key, value in point.items() if key not in _DETAILS})
                 points.sort(key=lambda point: point["time_limit"])
                 save(kept)
                 print(f"{name}, seed {seed}: {point['psnr']:.2f} dB in {point['seconds']:.0f} s", flush=True)
@@ -107,36 +107,6 @@ def workdir_name(name: str, seed: int, time_limit: float) -> str:
     return f"{name.replace(' ', '_')}-{seed}-{time_limit:g}"
 
 
-def run_to(time_limit: float, config, where: pathlib.Path) -> dict[str, Any] | None:
-    """Returns the scores of a run after so many seconds of training, or None if it was interrupted.
-
-    Args:
-        time_limit: seconds of training.
-        config: of the run.
-        where: its workdir. Comparable seconds are scaled by the machine's speed just before and after the run.
-    """
-    config = common.changed(config, {"train.max_seconds": float(time_limit)})
-    fresh = not metric_log.read_rows(where)
-    speed, started = [common.matrix_gflops()], time.perf_counter()
-    if not train_and_evaluate(config, where):
-        return None
-    wall = time.perf_counter() - started
-    speed.append(common.matrix_gflops())
-    result = score_run(restore_run(where), where, overwrite=True)
-    trained, compiling = result["training_seconds"], result["compile_seconds"]
-    return {
-        "time_limit": time_limit,
-        "ended": result["step"] >= workdir.load_config(where).train.max_steps,
-        "seconds": trained,
-        "comparable": common.comparable(trained, sum(speed) / 2),
-        "gflops": speed,
-        "compile_seconds": compiling,
-        "setup_seconds": wall - trained - compiling if fresh else None,  # not known of a run that was interrupted
-        "rays": result["rays_seen"],
-        **{key: result[key] for key in ("step", "psnr", "ssim", "seconds_per_frame", "views", "parameters")},
-    }
-
-
 def medians(runs: dict[str, list[dict]]) -> list[dict]:
     """Returns the points of a curve: the medians over its runs, at each time at which all were scored."""
     time_limits = sorted(set.intersection(*({point["time_limit"] for point in points} for points in runs.values())))
@@ -147,8 +117,3 @@ def medians(runs: dict[str, list[dict]]) -> list[dict]:
         found.append({key: statistics.median(point[key] for point in same) for key in numbers})
         found[-1]["seeds"] = [point["psnr"] for point in same]
     return found
-
-
-def covers(point: dict[str, Any], time_limit: float) -> bool:
-    """Returns whether a run of so many seconds need not be measured: it was, or a shorter one ended by itself."""
-    return point["time_limit"] == time_limit or (point["ended"] and point["time_limit"] < time_limit)

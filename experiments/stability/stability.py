@@ -1,19 +1,18 @@
-"""Measures how far the renderer is from exact on the hard cases, and what exactness costs.
+"""Measures how far core is from exact: on the hard cases, and on the worst inputs that a search finds.
 
-    python experiments/stability/stability.py [--page=FILE.md] [--cost_only]
+    python experiments/stability/stability.py [--page=FILE.md] [--search] [--rows=psnr,ssim]
 
 Prints for each case of tests/hard_cases the error that is nearest to its bar, or furthest beyond it, of the values
-and of the gradients; the sums by family, beside the forms of the released codes on the same cases; and the time of
-value and gradient of jaxnerf's compositing beside the released codes' cumulative product, in turn. With --page the
-table of families in that file, between the lines <!-- stability --> and <!-- /stability -->, is replaced.
+and of the gradients; and the sums by family, beside the forms of the released codes on the same cases. Prints the
+known maximum errors of all public functions, see tests/known_errors. With --search it looks for larger ones first,
+starting from those that are known, and records them with their bounds in tests/known_errors/bounds.json, for all
+functions or for --rows only. With --page the tables in that file are replaced: "stability" and "known errors".
 """
 
-import functools
 import itertools
+import json
 import pathlib
-import statistics
 import sys
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -24,37 +23,39 @@ sys.path += [str(pathlib.Path(__file__).resolve().parents[up] / name) for up, na
 import common
 
 from hard_cases import ALL, compositing, importance, naive
-from jaxnerf import Rays, Samples, render_samples
 from jaxnerf.runtime import cli
+from jaxnerf.runtime.atomic_files import write_text
+from known_errors import ROWS, Row, records, search
+from known_errors.rows import flat
 
 HEADS = ("family", "cases", "checks", "failed", "worst value", "worst gradient", "naive: failed")
-_COST_ONLY = flags.DEFINE_bool("cost_only", False, "Skip the table.")
-_REPEATS = flags.DEFINE_integer("repeats", 101, "Pairs of timings; the median of their ratios counts.", lower_bound=1)
-_SIZES = ((4096, 64), (1024, 192), (256, 768))  # rays, samples
+_SEARCH = flags.DEFINE_bool("search", False, "Search for larger errors than those that are known.")
+_NAMES = flags.DEFINE_list("rows", [], "Functions to search, all if empty; the hard cases are then not run.")
+_GENERATIONS = flags.DEFINE_integer("generations", 40, "How often the search changes the worst inputs.", lower_bound=0)
+_SEED = flags.DEFINE_integer("seed", 0, "Of the search.")
+_BATCH, _REPEATS = 4096, 9  # of timings: inputs at once, and calls, of which the fastest counts
 
 
 def main(argv: list[str]) -> None:
-    """Prints the cases and the table, then the cost."""
+    """Prints the cases and the tables."""
     del argv
-    lines = [] if _COST_ONLY.value else _table()
-    for line in cost():
-        print(line, flush=True)
-        lines.append(line + "  ")
-    if common.PAGE.value and not _COST_ONLY.value:
-        common.replace(pathlib.Path(common.PAGE.value), lines, "stability")
+    names = common.chosen("--rows", _NAMES.value, [row.name for row in ROWS])
+    if _SEARCH.value:
+        search_rows(names)
+    common.publish(errors_table(), "known errors")
+    if not names:
+        common.publish(_table(), "stability")
 
 
 def _table():
-    """Prints every case, then the families, and returns the lines of the families."""
+    """Prints every case, and returns the lines of the families."""
     lines = common.markdown(HEADS, [family(*group) for group in _families()])
     outside, _ = importance.padding_bias(importance.PADDING)
     lines += [
         "",
         f"A padding of {importance.PADDING:g} on the weights puts {100 * outside:.1f} % of the samples outside "
         f"the weight, where that is {importance.OPACITY:g} in one of {importance.SEGMENTS} segments.",
-        "",
     ]
-    print("\n".join(lines))
     return lines
 
 
@@ -122,62 +123,68 @@ def _fraction(checks, kind):
     return f"{100 * max(ratios):.0f} %" if ratios else "-"
 
 
-def cost() -> Iterator[str]:
-    """Yields a line for each size: time of value and gradient against the naive form, interleaved."""
-    yield common.describe_machine()
-    for shape in _SIZES:
-        arrays = _arrays(*shape)
-        ours, theirs = (_value_and_slopes(render) for render in (render_samples, naive.render_samples))
-        pairs = []
-        for turn in range(_REPEATS.value + 1):
-            order = (ours, theirs) if turn % 2 else (theirs, ours)  # neither always runs in a warm cache
-            times = {run: common.seconds(functools.partial(run, arrays)) for run in order}
-            pairs.append((times[ours], times[theirs]))
-        pairs = pairs[1:]  # the first compiles
-        own, other = (1e3 * statistics.median(times) for times in zip(*pairs, strict=True))
-        ratios = sorted(a / b for a, b in pairs)
-        low, middle, high = (ratios[len(ratios) * part // 4] for part in (1, 2, 3))
-        yield (
-            f"{shape[0]} rays x {shape[1]} samples: value and gradient {own:.2f} ms, naive {other:.2f} ms, "
-            f"median of ratios {middle:.3f} (quartiles {low:.3f} to {high:.3f})"
+def search_rows(names: list[str]) -> None:
+    """Searches for the largest errors of rows, all if no names are given, and records them in the table of bounds."""
+    table = records.read()
+    for row in ROWS:
+        if names and row.name not in names:
+            continue
+        meter, old = search.Meter(row), table.get(str(row), {})
+        found = search.climb(meter, generations=_GENERATIONS.value, seed=_SEED.value, known=records.known(old))
+        table[str(row)] = {"nanoseconds": nanoseconds(row)} | {
+            " ".join(column): records.entry(worst) for column, worst in found.items()
+        }
+        table = {str(each): table[str(each)] for each in ROWS if str(each) in table}
+        write_text(records.PATH, json.dumps(table) + "\n")
+        errors = [f"{column} {worst.error:.3g}" for (column, worst) in ((" ".join(c), w) for c, w in found.items())]
+        print(f"{row}: {', '.join(errors)}", flush=True)
+        jax.clear_caches()
+
+
+def nanoseconds(row: Row) -> float:
+    """Returns the time of the jitted function for each number of its inputs or outputs, whichever are more."""
+    z = np.random.default_rng(0).uniform(size=(_BATCH, row.size()))
+    inputs = jax.tree.map(jnp.asarray, row.decode(z))
+    run = jax.jit(jax.vmap(lambda given: flat(row.run(**given))))
+    count = max(run(inputs).size, sum(x.size for name, x in inputs.items() if name not in row.fixed))
+    return float(f"{1e9 * min(common.times(lambda: run(inputs), _REPEATS)) / count:.2g}")
+
+
+def errors_table() -> list[str]:
+    """Returns the lines of the table of known errors: of each function, the variant with the largest."""
+    found: dict[str, dict[str, tuple[float, str]]] = {}
+    for row in ROWS:
+        record, columns = records.read()[str(row)], found.setdefault(row.name, {})
+        for column, each in record.items():
+            if isinstance(each, dict) and each["found"] >= columns.get(column, (-1.0, ""))[0]:
+                variant = f"{row.variant}: " if row.variant else ""
+                columns[column] = each["found"], variant + _abbreviated(row, each["inputs"])
+        most = max(record["nanoseconds"], columns.get("nanoseconds", (0.0, ""))[0])
+        columns["nanoseconds"] = most, ""
+    rows = []
+    for name, columns in found.items():
+        cells = [" / ".join(_number(columns.get(f"{way} {kind}")) for kind in search.KINDS) for way in search.WAYS]
+        worst = max(columns[f"jitted {kind}"] for kind in search.KINDS if f"jitted {kind}" in columns)
+        rows.append((f"`{name}`", *cells, worst[1], f"{columns['nanoseconds'][0]:.2g}"))
+    return common.markdown(("function", *search.WAYS, "jitted: the input with the largest error", "ns"), rows)
+
+
+def _number(found):
+    return "-" if found is None else f"{found[0]:.2g}" if found[0] < 100 else f"{found[0]:.0e}".replace("e+0", "e")
+
+
+def _abbreviated(row, inputs):
+    """Returns the inputs in a few characters: numbers and vectors of three, and the ends of longer ones."""
+    parts = []
+    for name, value in inputs.items():
+        values = np.ravel(value)
+        if name in row.fixed or name == "unused":
+            continue
+        shown = (
+            " ".join(f"{x:.2g}" for x in values) if values.size <= 3 else f"{values.min():.2g} ... {values.max():.2g}"
         )
-
-
-def _arrays(rays, samples):
-    """Returns random density, rgb, rays and samples, and the gradient that reaches each output."""
-    rng = np.random.default_rng(0)
-    shape = rays, samples
-    edges = np.sort(rng.uniform(2, 6, (rays, samples + 1)), axis=-1)
-    directions = rng.normal(size=(rays, 3))
-    viewdirs = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, jnp.float32),
-        {
-            "density": 4 * rng.exponential(size=shape) * (rng.uniform(size=shape) < 0.5),
-            "rgb": rng.uniform(size=(*shape, 3)),
-            "rays": Rays(
-                origins=np.zeros((rays, 3)),
-                directions=directions,
-                viewdirs=viewdirs,
-                near=np.full(rays, 2.0),
-                far=np.full(rays, 6.0),
-            ),
-            "samples": Samples(t=(edges[:, 1:] + edges[:, :-1]) / 2, delta=np.diff(edges)),
-            "slopes": {name: rng.normal(size=rays) for name in ("opacity", "depth", "disparity")}
-            | {"rgb": rng.normal(size=(rays, 3))},
-        },
-    )
-
-
-def _value_and_slopes(render):
-    """Returns a compiled function of _arrays: all outputs, and their gradient by density and colour."""
-
-    def total(field, rays, samples, slopes):
-        seen = render(lambda x, viewdirs: field, rays, samples)
-        return sum((getattr(seen, name) * slope).sum() for name, slope in slopes.items()), seen
-
-    run = jax.jit(jax.value_and_grad(total, has_aux=True))
-    return lambda given: run((given["density"], given["rgb"]), given["rays"], given["samples"], given["slopes"])
+        parts.append(f"{name} {shown}")
+    return ", ".join(parts)
 
 
 if __name__ == "__main__":

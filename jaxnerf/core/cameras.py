@@ -69,12 +69,11 @@ def _is_fisheye(camera):
 
 def _before_lens(function, camera, pixels):
     """Returns the points [..., 2] that the lens distorts, of a fisheye as long as their angle, and which exist."""
-    pixels = jnp.asarray(pixels)
+    pixels, focal, center = at_least_float32(pixels, camera.focal, camera.center)
     check_shapes(function, pixels=(pixels, "... 2"))
     _check_one(function, camera, "focal", "center")
     lead = (1,) * (pixels.ndim - 1)
-    focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
-    target = (pixels - center) / focal
+    target = (pixels - center.reshape(*lead, 2)) / focal.reshape(*lead, 2)
     if camera.distortion is None or camera.lens == "pinhole":
         return target, jnp.ones(target.shape[:-1], bool)
     distort, distortion = _lens(function, camera)
@@ -235,11 +234,11 @@ def project(camera: Camera, x: Num[ArrayLike, "*batch 3"]) -> tuple[Float[Array,
         does not see, behind it or beyond a fold of the lens, see `undistort`, or so near the camera that the gradient
         of its pixel overflows, has pixels inf, with gradient 0.
     """
-    x = jnp.asarray(x)
+    x, to_world, focal, center = at_least_float32(x, camera.to_world, camera.focal, camera.center)
     check_shapes("project", x=(x, "... 3"))
     _check_one("project", camera, "to_world", "focal", "center")
-    to_world, lead = jnp.asarray(camera.to_world), (1,) * (x.ndim - 1)
-    focal, center = (jnp.asarray(value).reshape(*lead, 2) for value in (camera.focal, camera.center))
+    lead = (1,) * (x.ndim - 1)
+    focal, center = (value.reshape(*lead, 2) for value in (focal, center))
     offset = x - to_world[:, 3].reshape(*lead, 3)
     # Sums of products instead of a matmul, which may round the camera to ten bits.
     local = (to_world[:, :3].reshape(*lead, 3, 3) * offset[..., None]).sum(axis=-2)

@@ -34,9 +34,9 @@ def turntable(
     Returns:
         Poses [N, 3, 4].
     """
-    center, up = jnp.asarray(center, jnp.float32), jnp.asarray(up, jnp.float32)
+    center, radius, up = (jnp.asarray(value, jnp.float32) for value in (center, radius, up))
     check_shapes("turntable", center=(center, "3"), up=(up, "3"), radius=(radius, ""))
-    if is_known(jnp.asarray(radius) <= 0):
+    if is_known(radius <= 0):
         raise ValueError(f"turntable: radius is {radius}, expected more than 0")
     up = normalize(up)
     across = jnp.cross(up, jnp.array([1.0, 0.1, 0.0]))

@@ -375,8 +375,8 @@ def _interpolate(lower, upper, fraction):
 
 
 def _width(lower, upper):
-    equal = upper == lower
-    return jnp.where(equal, 0, jnp.where(equal, 0, upper) - jnp.where(equal, 0, lower))  # inf - inf would be NaN
+    infinite = jnp.isinf(lower)
+    return jnp.where(infinite, 0, upper - jnp.where(infinite, 0, lower))  # inf - inf would be NaN
 
 
 def _count_below(sums, target):

@@ -75,7 +75,7 @@ def opacity(
 
     Takes the arguments of `transmittance` and raises its errors.
     """
-    return _absorbed(optical_depth("opacity", density, length).sum(axis=-1))
+    return absorbed(optical_depth("opacity", density, length).sum(axis=-1))
 
 
 def exclusive_sum(values: Float[ArrayLike, "*batch samples"]) -> Float[Array, "*batch samples"]:
@@ -219,7 +219,7 @@ def half_depths(
     """
     behind = behind + before
     positive = jnp.where(depth > 0, depth, 1)
-    fraction = 1 - divide(clamp(behind - math.log(2), 0, positive), positive)
+    fraction = divide(clamp(math.log(2) - (behind - depth), 0, positive), positive)
     fraction = fraction if rule == "points" else fraction - 0.5
     place = t + fraction * jnp.where(jnp.isinf(delta), 0, delta)
     return jnp.where((behind < math.log(2)) | (depth <= 0), jnp.inf, place)
@@ -308,7 +308,7 @@ def optical_depth(
 
 @jax.custom_jvp
 def _weights(depth):
-    return _previous(jnp.exp(-running_sum(depth)), first=1) * _absorbed(depth)
+    return _previous(jnp.exp(-running_sum(depth)), first=1) * absorbed(depth)
 
 
 @_weights.defjvp
@@ -331,7 +331,7 @@ def _weights_jvp(primals, tangents, *, long_ray=4096):
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _packed_weights(depth, starts, longest):
     behind = jnp.exp(-running_sum_since(starts, depth, longest))
-    return jnp.where(starts, 1, _previous(behind)) * _absorbed(depth)
+    return jnp.where(starts, 1, _previous(behind)) * absorbed(depth)
 
 
 @_packed_weights.defjvp
@@ -340,7 +340,7 @@ def _packed_weights_jvp(longest, primals, tangents):
     depth, starts = primals
     behind = jnp.exp(-running_sum_since(starts, depth, longest))
     change = behind * running_sum_since(starts, tangents[0], longest)
-    weights = jnp.where(starts, 1, _previous(behind)) * _absorbed(depth)
+    weights = jnp.where(starts, 1, _previous(behind)) * absorbed(depth)
     return weights, change - jnp.where(starts, 0, _previous(change))
 
 
@@ -370,8 +370,8 @@ def _follow_transmittance(weights, depth):
     both = depth + following
     thin = both < 1e-12  # the derivative squares it, which would underflow
     safe = jnp.where(thin, 1, both)
-    ratio = jnp.where(thin, rate, jnp.expm1(rate * jnp.minimum(safe, 4)) / _absorbed(safe))
-    growth = _absorbed(depth) * ratio
+    ratio = jnp.where(thin, rate, jnp.expm1(rate * jnp.minimum(safe, 4)) / absorbed(safe))
+    growth = absorbed(depth) * ratio
     fraction = growth / (1 + growth)
     second = jnp.concatenate([weights[..., 1:], jnp.zeros_like(weights[..., :1])], axis=-1)
     moved = jnp.where(_sample_index(depth) % 2 == 0, fraction * second, 0)
@@ -419,11 +419,11 @@ def _previous(x, first=0):
 
 
 @jax.custom_jvp
-def _absorbed(depth):
+def absorbed(depth: Float[ArrayLike, "*shape"]) -> Float[Array, "*shape"]:
     """Computes 1 - exp(-x) without cancellation, in the value for small x and in the derivative for large x."""
     return -jnp.expm1(-depth)
 
 
-@_absorbed.defjvp
+@absorbed.defjvp
 def _absorbed_jvp(primals, tangents):
-    return _absorbed(primals[0]), jnp.exp(-primals[0]) * tangents[0]
+    return absorbed(primals[0]), jnp.exp(-primals[0]) * tangents[0]

@@ -131,6 +131,7 @@ def score_run(
     views: Views | None = None,
     shard: tuple[int, int] = shards.WHOLE,
     predictor: Any = None,
+    aligner: Any = None,
 ) -> dict[str, Any] | None:
     """Scores one checkpoint and writes <workdir>/eval/<step>/.
 
@@ -145,6 +146,7 @@ def score_run(
         shard: (index, count): only every count-th view, from view `index` on.
         predictor: `uncertainty.predict.Predictor`; its predicted errors are written to uncertainty/NNN.tiff, and
             compared with the true ones. None: no error is predicted.
+        aligner: `alignment.align_views.Aligner`; its figures are in the results, too. None: no view is aligned.
 
     Returns:
         What results.json holds; None while views of other shards are missing.
@@ -167,6 +169,8 @@ def score_run(
         provenance["rays_per_pixel"] = fingerprint(sides)
     if predictor is not None:
         provenance["uncertainty"] = predictor.identity
+    if aligner is not None:
+        provenance["aligned"] = aligner.identity
     if target.exists() and not overwrite:
         return aggregate.read(target, provenance, _REMEDY)
     shards.make_folder(partial, provenance, overwrite=overwrite, file=aggregate.PROVENANCE, remedy=_REMEDY)
@@ -175,11 +179,13 @@ def score_run(
             for name in aggregate.FOLDERS:
                 (partial / name).mkdir(exist_ok=True)
             render = functools.partial(render_pixels, run, variables, views)
-            _score_views(run, render, views, sides, partial, shard, predictor)
+            align = None if aligner is None else functools.partial(aligner.scored, run, variables, views)
+            _score_views(run, render, views, sides, partial, shard, (predictor, align))
 
             def summarize(finished):
                 results = aggregate.results_of(run, workdir, views, variables, finished, provenance)
                 found = {} if predictor is None else {"uncertainty": predictor.summary(results["images"])}
+                found |= {} if aligner is None else aligner.summary(results["images"])
                 return results | found
 
             options = {"count": len(views.names), "errors": predictor is not None, "overwrite": overwrite}
@@ -257,9 +263,9 @@ def summary(results: dict[str, Any]) -> str:
     return f"{step}{metrics} over {results['views']} views{speed}{errors}{paired}{note}"
 
 
-def _score_views(run, render, views, sides, folder, shard, predictor):
+def _score_views(run, render, views, sides, folder, shard, tools):
     """Renders and scores those views of a shard that are not finished, with rays along the `sides` [V] of a pixel."""
-    count = len(views.names)
+    count, (predictor, align) = len(views.names), tools
     frames = shards.indices_of(range(count), shard)
     files = [aggregate.view_files(folder, index, count=count, errors=predictor is not None) for index in frames]
     sizes = [tuple(int(side) for side in views.size[index]) for index in frames]
@@ -284,6 +290,8 @@ def _score_views(run, render, views, sides, folder, shard, predictor):
                 error, figures = predictor.scored(rays, image.rgb, truth, views, index)
                 output_images.write_error(folder, f"{index:03d}", error)
                 row |= figures
+            if align is not None:
+                row |= align(index, image.rgb, side=int(sides[index]))
             output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
             aggregate.mark_finished(folder, index, row, truth, image, count=count, first=index == todo[0])
             progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")

@@ -22,6 +22,7 @@ from jaxnerf.training.workdir import load_config
 
 FILE = "cameras.npz"
 _MAX_SIZE = 2**28  # bytes of all arrays; masks have a bit for each pixel
+_APART = ("pixels", "cameras", "sparse")  # fields of Views that are dropped, or stored one by one
 _AGAIN = "remove it, and it is made again from the dataset"
 
 
@@ -75,7 +76,7 @@ def is_of_run(workdir: str | os.PathLike, config: RunConfig) -> bool:
 
 
 def _fields(part):
-    return [field.name for field in dataclasses.fields(part) if field.name not in ("pixels", "cameras", "sparse")]
+    return [field.name for field in dataclasses.fields(part) if field.name not in _APART]
 
 
 def _key(config):

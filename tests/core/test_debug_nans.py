@@ -395,6 +395,7 @@ def cases():
 
 
 READS_FILES = {"load_dataset", "draw_batch", "load_scene", "restore_run", "train_and_evaluate", "train_many"}
+MINIMIZES = {"estimate_pose"}  # an argument of the smallest value, which has no gradient of use
 
 
 @pytest.fixture(scope="module", name="found")
@@ -405,7 +406,7 @@ def all_cases():
 
 def test_every_public_function_has_a_case(found):
     functions = {name for name in jaxnerf.__all__ if name[0].islower() and not name.startswith("register_")}
-    assert {name.split()[0] for name in found} == functions - READS_FILES
+    assert {name.split()[0] for name in found} == functions - READS_FILES - MINIMIZES
 
 
 def total(function, arguments):

@@ -12,6 +12,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from jaxnerf.tools.curve import measure
+from jaxnerf.tools.curve import runs as curve_runs
 from runs import ROOT, run_forked
 from studies import common, study
 
@@ -24,7 +26,7 @@ published = study("speed/published")
 
 def fake_score(job, time_limit, psnr, commit="1234567", *, size=None, when="2026-11-27T01:00:00", **values):
     """Returns what score.json holds of a run with two images, as far as the tables and files need it."""
-    plain = common.plain_config(jobs.at_time(jobs.configuration(jobs.JOBS[job]), time_limit))
+    plain = common.plain_config(measure.at_time(jobs.configuration(jobs.JOBS[job]), time_limit))
     images = [{"name": name, "psnr": psnr + change, "ssim": 0.9} for name, change in (("r_2", 1.0), ("r_10", -1.0))]
     conventions = {"size": size or [800, 800], "background": "white", "factor": 1}
     return {
@@ -44,7 +46,7 @@ def test_every_job_follows_its_protocol_and_compares_with_figures_that_exist():
         config = jobs.configuration(job)
         assert config.data.dir == job.dataset and list(job.seconds) == sorted(job.seconds), name
         assert set(job.beside) <= kinds, name
-        assert jobs.at_time(config, 7).train.max_seconds == 7.0
+        assert measure.at_time(config, 7).train.max_seconds == 7.0
 
 
 def test_options_that_contradict_a_protocol_are_refused():
@@ -131,7 +133,7 @@ time.sleep(60)
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.02)
         with pytest.raises(KeyboardInterrupt):
-            run.run_to_end([sys.executable, "-c", code, str(tmp_path)], {})
+            curve_runs.run_to_end([sys.executable, "-c", code, str(tmp_path)], {})
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, old)

@@ -7,6 +7,7 @@ import pytest
 from captures import orbit, shoot, write_transforms
 from jaxnerf.core.sampling import inverse_cdf
 from jaxnerf.fields.hash_grid import harmonics
+from jaxnerf.tools.curve import measure
 from jaxnerf.training import workdir
 from jaxnerf.training.config import read_config
 from studies import common, study
@@ -39,11 +40,11 @@ def test_a_curve_ends_where_its_run_does_if_max_steps_is_inferred(monkeypatch, t
 
     names = ("psnr", "ssim", "seconds_per_frame", "views", "parameters", "rays_seen", "compile_seconds")
     scores = {**dict.fromkeys(names, 1.0), "step": step, "training_seconds": 2.0}
-    monkeypatch.setattr(training, "train_and_evaluate", train)
-    monkeypatch.setattr(training, "restore_run", lambda where: None)
-    monkeypatch.setattr(training, "score_run", lambda run, where, overwrite: scores)
-    monkeypatch.setattr(common, "matrix_gflops", lambda: 2 * common.REFERENCE_GFLOPS)
-    point = training.run_to(3, config, tmp_path)
+    monkeypatch.setattr(measure, "train_and_evaluate", train)
+    monkeypatch.setattr(measure, "restore_run", lambda where: None)
+    monkeypatch.setattr(measure, "score_run", lambda run, where, overwrite: scores)
+    monkeypatch.setattr(measure.machine, "matrix_gflops", lambda: 2 * common.REFERENCE_GFLOPS)
+    point = measure.run_to(3, config, tmp_path)
     assert (point["ended"], point["seconds"], point["comparable"]) == (ended, 2.0, 4.0)
 
 

@@ -336,7 +336,7 @@ def _composite(function, scene, rays, placed, *, rule, longest, median_depth=Fal
         median = places.at[first].get(mode="fill", fill_value=jnp.inf)
     return _Sums(
         transmittance=jnp.exp(-sums[:, 0]),
-        opacity=-jnp.expm1(-sums[:, 0]),
+        opacity=volume_rendering.absorbed(sums[:, 0]),
         rgb=sums[:, 1:-2],
         depth=sums[:, -2],
         disparity=sums[:, -1],

@@ -88,12 +88,13 @@ def export_run(
     views = refined_views(run, run.experiment.load_split("train", images=None), "train", variables[0])
     target.parent.mkdir(exist_ok=True)
     with partial_folder(target) as partial:
-        if any(views.file_origin):  # in float32, which the formats hold, the sum would be rounded
+        relative = any(views.file_origin) and not exporter.is_absolute
+        if relative:  # in float32, which the formats hold, the sum would be rounded
             say(f"positions are relative to {views.file_origin} of the dataset's files, see file_origin.json")
         if isinstance(options, ExportOptions):
             options = options.relative_to(views.file_origin)
         exporter.export(ExportSource(run, step, variables, views, options, say), partial)
-        if any(views.file_origin):
+        if relative:
             (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
     return target
 

@@ -132,3 +132,8 @@ class WebOptions(Options):
     """The options of the exporter "web"."""
 
     split: bool = option(False, "whether the scene's data is in a file beside the page, for hosting")
+
+
+@dataclasses.dataclass(frozen=True)
+class CamerasOptions(Options):
+    """The options of the exporter "cameras": none."""

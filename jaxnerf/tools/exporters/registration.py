@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from jaxnerf.options import Options
 from jaxnerf.registry import Registry, checked_options
 from jaxnerf.tools.exporters.options import (
+    CamerasOptions,
     ExportOptions,
     MeshOptions,
     PointsOptions,
@@ -23,11 +24,13 @@ class Exporter(NamedTuple):
         export: (ExportSource, folder) -> None.
         check: raises a ValueError for a TrainedRun that cannot be exported; None: all can.
         options: the class of `ExportSource.settings`.
+        is_absolute: whether what it writes is relative to the origin of the dataset's files, however far away that is.
     """
 
     export: Callable[..., None]
     check: Callable[..., Any] | None = None
     options: type[Options] = SurfaceOptions
+    is_absolute: bool = False
 
 
 def _on_demand(module, name):
@@ -43,6 +46,9 @@ EXPORTERS = Registry(
         "points": Exporter(_on_demand("points", "export_points"), options=PointsOptions),
         "depth": Exporter(_on_demand("depth", "export_depth"), options=ExportOptions),
         "splats": Exporter(_on_demand("splats", "export_splats"), options=SplatsOptions),
+        "cameras": Exporter(
+            _on_demand("cameras", "export_cameras"), _on_demand("cameras", "check_refined"), CamerasOptions, True
+        ),
         "web": Exporter(_on_demand("web", "export_web"), _on_demand("web", "network_of"), WebOptions),
     },
 )

@@ -10,7 +10,6 @@ import pathlib
 import pprint
 import shlex
 import statistics
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +19,8 @@ from jaxtyping import UInt8
 
 from jaxnerf.core.views import Views
 from jaxnerf.evaluation.output_images import to_8_bits
-from jaxnerf.runtime.atomic_files import partial_file, write_text
+from jaxnerf.runtime.atomic_files import write_text
+from jaxnerf.tools.curve import drawing
 from jaxnerf.tools.needs.study import LEAN, Outcome, Row, Settings
 from jaxnerf.tools.needs.trial import stride
 from jaxnerf.tools.needs.variants import COMPLETE
@@ -38,7 +38,7 @@ HEADS = (
     "frame, s",
     "verdict",
 )
-_BAR = 40  # characters of the curve in a terminal
+_TITLE = "PSNR of held-out views after a run of so many seconds"  # of the curves
 _SIDE = 320  # px of an image on the page, at most
 
 
@@ -63,10 +63,10 @@ def write(
     print()
     print("\n".join(text_table(outcome)))
     print()
-    print("\n".join(curve_lines(outcome)))
+    print("\n".join(drawing.lines(outcome.curve, _TITLE)))
     write_text(folder / "lean.py", config_file(asked, lean, outcome))
     write_text(folder / "curve.csv", curve_csv(outcome))
-    plot = _plot(folder, outcome)
+    plot = drawing.save(outcome.curve, folder / "curve.png", ylabel="PSNR of held-out views, dB")
     images = _images(folder, outcome, held_out)
     write_text(folder / "page.html", _page(outcome, settings, asked, plot, images))
     write_text(folder / "results.json", json.dumps(results(outcome, settings), indent=1) + "\n")
@@ -155,37 +155,13 @@ def text_table(outcome: Outcome) -> list[str]:
     return ["  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def knee(points: Sequence[tuple[float, float]]) -> int:
-    """Returns the index of the point of a curve that lies highest above the chord from its first to its last one.
-
-    The abscissa is the time itself (Kneedle, Satopaa et al., ICDCS workshops 2011).
-    """
-    seconds, scores = (np.asarray(each, float) for each in zip(*points, strict=True))
-    spans = np.ptp(seconds) or 1.0, np.ptp(scores) or 1.0
-    above = (scores - scores[0]) / spans[1] - (seconds - seconds[0]) / spans[0]
-    return int(np.argmax(above))
-
-
-def curve_lines(outcome: Outcome) -> list[str]:
-    """Returns the lines of the curves in a terminal."""
-    everything = [score for points in outcome.curve.values() for _, score in points]
-    low, high = min(everything), max(everything)
-    lines = ["PSNR of held-out views after a run of so many seconds; * marks the knee"]
-    for name, points in outcome.curve.items():
-        marked = knee(points)
-        for index, (seconds, score) in enumerate(points):
-            bar = "#" * round(1 + (_BAR - 1) * (score - low) / max(high - low, 1e-9))
-            lines.append(f"{name:9} {seconds:7.1f} s  {score:6.2f} dB  {bar}{' *' if index == marked else ''}")
-    return lines
-
-
 def curve_csv(outcome: Outcome) -> str:
     """Returns the curves as CSV."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(("model", "seconds", "psnr", "knee"))
     for name, points in outcome.curve.items():
-        marked = knee(points)
+        marked = drawing.knee(points)
         for index, (seconds, score) in enumerate(points):
             writer.writerow((name, f"{seconds:.3f}", f"{score:.4f}", int(index == marked)))
     return file.getvalue()
@@ -282,28 +258,6 @@ def _lean_lines(outcome):
     ]
 
 
-def _plot(folder, outcome):
-    """Writes curve.png and returns its path; None without matplotlib."""
-    try:
-        from jaxnerf.runtime.plotting import Figure
-    except ImportError as error:
-        print(f"curve.png     none: matplotlib is unavailable ({error}); `pip install matplotlib`", file=sys.stderr)
-        return None
-    figure = Figure(figsize=(7, 4), dpi=100, layout="constrained")
-    axes = figure.subplots()
-    for name, points in outcome.curve.items():
-        (line,) = axes.plot(*zip(*points, strict=True), "o-", label=name)
-        marked = points[knee(points)]
-        axes.plot(*marked, "D", markersize=11, fillstyle="none", color=line.get_color(), label=f"knee of {name}")
-    axes.set(xlabel="seconds of training", ylabel="PSNR of held-out views, dB", xscale="log")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    path = folder / "curve.png"
-    with partial_file(path) as partial:
-        figure.savefig(partial, format="png")
-    return path
-
-
 def _images(folder, outcome, held_out):
     """Returns for each variant that was tried the view where it differs most: (name, PNG bytes of three images)."""
     base, found = _kept(folder, COMPLETE, outcome), []
@@ -362,7 +316,7 @@ def _page(outcome, settings, asked, plot, images):
         "this page is its config, of the original length.</p>",
         "<h2>What each second buys</h2>",
         _embedded(plot.read_bytes()) if plot else "",
-        f"<pre>{html.escape(chr(10).join(curve_lines(outcome)))}</pre>",
+        f"<pre>{html.escape(chr(10).join(drawing.lines(outcome.curve, _TITLE)))}</pre>",
         "<h2>Where each part shows</h2><p>The held-out view where the models differ most: the image, the complete "
         "model, and the model with the change.</p>",
         *(

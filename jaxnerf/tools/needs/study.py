@@ -147,7 +147,9 @@ class Study:
         self.by_slug = {each.slug: each for each in [complete(), *variants]}
         self._done: dict[tuple[str, int, float], Result] = {}
         self.failed: dict[str, str] = {}
-        self._pose, self._full_pose = any(each.aligned == "pose" for each in variants), False
+        posed = [each for each in variants if each.aligned == "pose"]
+        self._posed = {slug for each in posed for slug in (each.slug, each.reference or COMPLETE)}
+        self._full_pose = False
         (folder / "trials").mkdir(exist_ok=True)
 
     def search(self) -> Outcome:
@@ -221,8 +223,7 @@ class Study:
 
     def _run_trial(self, variant, seed, length, path, full):
         steps = 0 if full else round(self.plan.steps * length / self.plan.length)
-        pose = variant.aligned == "pose" or (variant.slug == COMPLETE and self._pose)
-        pose = self._full_pose if full else pose  # it takes seconds, and longer in fog
+        pose = self._full_pose if full else variant.slug in self._posed  # it takes seconds, and longer in fog
         try:
             trainer = self._full_trainer if full else self._trainer
             result, images = trainer.run(variant.values, seed, length, steps=steps, pose=pose)
@@ -236,7 +237,13 @@ class Study:
             with partial_file(path.with_suffix(".npz"), ".tmp.npz") as partial:
                 np.savez_compressed(partial, *images)
         write_text(path, json.dumps(result._asdict()) + "\n")
-        self._say_trial(variant, (f"{_FULL}{COMPLETE}" if full else COMPLETE, seed, length), result)
+        base = f"{_FULL}{COMPLETE}" if full else self._base(variant).slug
+        self._say_trial(variant, (base, seed, length), result)
+
+    def _base(self, variant):
+        """Returns the variant that another is compared with."""
+        reference = variant.reference if variant.reference not in self.failed else ""
+        return self.by_slug.get(reference, complete())
 
     def _say_trial(self, variant, key, result):
         base, seed = self._done.get(key), key[1]
@@ -268,7 +275,7 @@ class Study:
 
     def differences(self, variant: Variant) -> Float[np.ndarray, "S V"]:
         """Returns what the part of a variant contributes, dB [seeds, views]."""
-        base, found = self.results(complete()), self.results(variant)
+        base, found = self.results(self._base(variant)), self.results(variant)
         return np.stack([self._contribution(variant, base[seed], found[seed]) for seed in found if seed in base])
 
     def effects(self) -> dict[str, Effect]:
@@ -289,6 +296,7 @@ class Study:
             most = _MOST_OF_TWO if seed < racing.LOOKS[0] else _MOST
             if self.spent + cost > most * self.settings.budget:
                 return
+            self.trial(self._base(self.by_slug[slug]), seed, self.plan.length)
             self.trial(self.by_slug[slug], seed, self.plan.length)
 
     def _open(self, done):

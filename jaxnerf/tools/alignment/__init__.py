@@ -1,0 +1,1 @@
+"""Aligns scored views to a trained scene."""
