@@ -85,8 +85,6 @@ class Ablation(NamedTuple):
         more: adds it, or about doubles it.
         aligned: what of the scored views is fitted to the scene first, as they have no trained parameters: "colors",
             "pose", or nothing.
-        excludes: {"section.option": value} of what a run cannot have with the part. Both models of a comparison then
-            have these values, so that it shows the part alone.
     """
 
     part: str
@@ -94,7 +92,6 @@ class Ablation(NamedTuple):
     less: Any = None
     more: Any = None
     aligned: str = ""
-    excludes: Mapping[str, Any] = {}
 
 
 def half(value: int, *_: Any) -> int | None:

@@ -41,9 +41,7 @@ class CameraOptions(Options):
         False,
         "Whether each pose is corrected, by turns and moves about what the cameras look at. Alpha then does not bound "
         "the scene, as outlines seen from wrong poses cut matter away.",
-        ablations=(
-            Ablation("refined poses", without=False, more=True, aligned="pose", excludes={"scene.use_alpha": False}),
-        ),
+        ablations=(Ablation("refined poses", without=False, more=True, aligned="pose"),),
     )
     refine_focal: bool = option(False, "with `refine`: whether the focal length, common to all images, is, too")
     refine_lr: float = option(

@@ -171,9 +171,7 @@ def _chosen(variants, parts):
     wrong = [part for part in parts if part not in known]
     if wrong:
         raise ValueError(f"--parts has {wrong[0]!r}, expected some of {', '.join(known)}; correct it")
-    chosen = [each for each in variants if not parts or each.part in parts]
-    compared = {each.reference for each in chosen}
-    return [each for each in variants if each in chosen or each.slug in compared]
+    return [each for each in variants if not parts or each.part in parts]
 
 
 def _kept_factor(folder):

@@ -147,9 +147,7 @@ class Study:
         self.by_slug = {each.slug: each for each in [complete(), *variants]}
         self._done: dict[tuple[str, int, float], Result] = {}
         self.failed: dict[str, str] = {}
-        posed = [each for each in variants if each.aligned == "pose"]
-        self._posed = {slug for each in posed for slug in (each.slug, each.reference or COMPLETE)}
-        self._full_pose = False
+        self._pose, self._full_pose = any(each.aligned == "pose" for each in variants), False
         (folder / "trials").mkdir(exist_ok=True)
 
     def search(self) -> Outcome:
@@ -223,7 +221,8 @@ class Study:
 
     def _run_trial(self, variant, seed, length, path, full):
         steps = 0 if full else round(self.plan.steps * length / self.plan.length)
-        pose = self._full_pose if full else variant.slug in self._posed  # it takes seconds, and longer in fog
+        pose = variant.aligned == "pose" or (variant.slug == COMPLETE and self._pose)
+        pose = self._full_pose if full else pose  # it takes seconds, and longer in fog
         try:
             trainer = self._full_trainer if full else self._trainer
             result, images = trainer.run(variant.values, seed, length, steps=steps, pose=pose)
@@ -237,13 +236,7 @@ class Study:
             with partial_file(path.with_suffix(".npz"), ".tmp.npz") as partial:
                 np.savez_compressed(partial, *images)
         write_text(path, json.dumps(result._asdict()) + "\n")
-        base = f"{_FULL}{COMPLETE}" if full else self._base(variant).slug
-        self._say_trial(variant, (base, seed, length), result)
-
-    def _base(self, variant):
-        """Returns the variant that another is compared with."""
-        reference = variant.reference if variant.reference not in self.failed else ""
-        return self.by_slug.get(reference, complete())
+        self._say_trial(variant, (f"{_FULL}{COMPLETE}" if full else COMPLETE, seed, length), result)
 
     def _say_trial(self, variant, key, result):
         base, seed = self._done.get(key), key[1]
@@ -275,7 +268,7 @@ class Study:
 
     def differences(self, variant: Variant) -> Float[np.ndarray, "S V"]:
         """Returns what the part of a variant contributes, dB [seeds, views]."""
-        base, found = self.results(self._base(variant)), self.results(variant)
+        base, found = self.results(complete()), self.results(variant)
         return np.stack([self._contribution(variant, base[seed], found[seed]) for seed in found if seed in base])
 
     def effects(self) -> dict[str, Effect]:
@@ -296,7 +289,6 @@ class Study:
             most = _MOST_OF_TWO if seed < racing.LOOKS[0] else _MOST
             if self.spent + cost > most * self.settings.budget:
                 return
-            self.trial(self._base(self.by_slug[slug]), seed, self.plan.length)
             self.trial(self.by_slug[slug], seed, self.plan.length)
 
     def _open(self, done):

@@ -23,7 +23,6 @@ class Variant(NamedTuple):
         values: {"section.option": value} that differ.
         before: {"section.option": value} of the complete model.
         aligned: see `Ablation`.
-        reference: slug of the variant that it is compared with; "": the complete model.
     """
 
     part: str
@@ -31,7 +30,6 @@ class Variant(NamedTuple):
     values: Mapping[str, Any]
     before: Mapping[str, Any] = {}
     aligned: str = ""
-    reference: str = ""
 
     @property
     def name(self) -> str:
@@ -69,7 +67,6 @@ def find_variants(config: RunConfig, facts: Facts) -> list[Variant]:
         facts: about its dataset.
     """
     found: dict[tuple[str, str], Variant] = {}
-    excluded: dict[tuple[str, str], Mapping[str, Any]] = {}
     for key, value, options, ablation in _ablations(config):
         for change in CHANGES:
             new = getattr(ablation, change)
@@ -78,15 +75,7 @@ def find_variants(config: RunConfig, facts: Facts) -> list[Variant]:
                 continue
             before = found.get((ablation.part, change), Variant(ablation.part, change, {}, {}, ablation.aligned))
             values, old = {**before.values, key: new}, {**before.before, key: value}
-            if ablation.excludes:
-                excluded[ablation.part, change] = ablation.excludes
             found[ablation.part, change] = before._replace(values=values, before=old)
-    for name, values in excluded.items():
-        if name[1] == MORE:
-            same = [each.slug for each in found.values() if each.values == values]
-            found[name] = found[name]._replace(reference="".join(same[:1]))
-        else:
-            found[name] = found[name]._replace(values={**found[name].values, **values})
     return sorted(found.values(), key=_order)
 
 

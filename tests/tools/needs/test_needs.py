@@ -19,7 +19,6 @@ from jaxnerf.tools.needs.study import Settings, Study
 from jaxnerf.tools.needs.trial import Result
 from jaxnerf.tools.needs.variants import Variant, find_variants
 from jaxnerf.training.config import changed, read_config
-from runs import PACKED
 
 VIEWS = 8
 RNG_OF_VIEWS = np.random.default_rng(1).normal(size=VIEWS)
@@ -300,20 +299,3 @@ def test_the_page_holds_everything(tmp_path, capsys):
     assert {"page.html", "lean.py", "curve.csv", "curve.png", "results.json"} <= names
     printed = capsys.readouterr().out
     assert "needed, and not there" in printed and "lean " in printed and "*" in printed
-
-
-def test_what_excludes_another_part_is_compared_without_it(tmp_path):
-    config = changed(read_config(smoke.get_config()), {"sampler": "occupancy", "field": "hash_grid", **PACKED})
-    box = {"scene.lower": (-1.0, -1.0, -1.0), "scene.upper": (1.0, 1.0, 1.0), "scene.contracted": False}
-    config = changed(config, {**box, "scene.background": (), "hash_grid.prefilter": False})
-    bounded = {each.name: each for each in find_variants(config, FACTS._replace(has_alpha=True))}
-    poses = bounded["refined poses, more"]
-    assert poses.reference == bounded["visual hull, without"].slug
-    unbounded = {each.name: each for each in find_variants(config, FACTS)}
-    assert unbounded["refined poses, more"].reference == ""
-    # Without the hull the score is better, and refined poses add nothing to that.
-    chosen = [bounded["visual hull, without"], poses._replace(values={"cameras.refine": True})]
-    trials = Trials({"scene.use_alpha": 1.0, "cameras.refine": 1.0})
-    outcome, lines = run_study(tmp_path / "a", trials, variants=chosen)
-    assert verdicts(outcome) == {"visual hull": "not needed", "refined poses": "not needed"}
-    assert outcome.rows[1].effect.mean == pytest.approx(0, abs=0.1)
