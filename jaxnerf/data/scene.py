@@ -86,17 +86,22 @@ class SceneOptions(Options):
         return tuple(self.background)
 
 
+def outlined_by_alpha(scene: SceneOptions, views: Views, *, ndc: bool) -> bool:
+    """Returns whether alpha shows that nothing surrounds a scene. Normalised device coordinates hold what cameras see."""
+    return scene.use_alpha and views.pixels.shape[-1] == 4 and not ndc
+
+
 def bounded_by_alpha(scene: SceneOptions, views: Views, *, ndc: bool, refined: bool) -> bool:
     """Returns whether alpha bounds a scene.
 
     It does not if the scene moves: no image then shows where all of it ever is. Nor does it where poses are refined:
-    the outlines of wrong poses cut matter away. Normalised device coordinates hold what the cameras see.
+    the outlines of wrong poses cut matter away.
     """
-    return scene.use_alpha and views.pixels.shape[-1] == 4 and not ndc and views.time is None and not refined
+    return outlined_by_alpha(scene, views, ndc=ndc) and views.time is None and not refined
 
 
 def resolve_scene(
-    scene: SceneOptions, views: Views, *, ndc: bool, world: str, has_alpha: bool
+    scene: SceneOptions, views: Views, *, ndc: bool, world: str, outlined: bool, has_alpha: bool
 ) -> tuple[SceneOptions, list[str]]:
     """Infers the box and whether it holds all of space, from what the cameras look at and what alpha leaves.
 
@@ -105,6 +110,7 @@ def resolve_scene(
         views: of the split "train".
         ndc: whether rays are in normalised device coordinates.
         world: see `DataOptions`.
+        outlined: whether alpha shows that nothing surrounds the scene.
         has_alpha: whether alpha bounds the box.
 
     Returns:
@@ -113,7 +119,7 @@ def resolve_scene(
     Raises:
         ValueError: if the box is empty.
     """
-    contracted, why = _contracted(views, has_alpha, ndc=ndc, world=world)
+    contracted, why = _contracted(views, outlined, ndc=ndc, world=world)
     line = f"contraction   {'on' if contracted else 'off'}: {why}"
     scene, lines = infer(scene, contracted=(contracted, line))
     if scene.box is None:
@@ -158,7 +164,7 @@ def resolve_background(
     return scene, []
 
 
-def _contracted(views, has_alpha, *, ndc, world):
+def _contracted(views, outlined, *, ndc, world):
     """Returns whether the box holds all of space, and why."""
     if ndc:
         return False, "normalised device coordinates hold everything in view"
@@ -168,7 +174,7 @@ def _contracted(views, has_alpha, *, ndc, world):
         side = float(np.max(np.asarray(views.box[1]) - np.asarray(views.box[0])))
         if side <= _MAX_STATED_BOX * 4 * LookAt(views).inner_half_side:
             return False, "the dataset states the scene's bounds"
-    if has_alpha:
+    if outlined:
         return False, "alpha bounds the object"
     return True, "nothing bounds the surroundings"
 

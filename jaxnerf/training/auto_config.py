@@ -9,7 +9,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.facts import dataset_facts
 from jaxnerf.data.readers.base import TIME_UNUSED
-from jaxnerf.data.scene import bounded_by_alpha, resolve_background, resolve_scene
+from jaxnerf.data.scene import bounded_by_alpha, outlined_by_alpha, resolve_background, resolve_scene
 from jaxnerf.options import Changes, Device, Facts, changing, is_auto, replaced
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.runtime.processes import Detail
@@ -66,7 +66,10 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
     has_alpha = bounded_by_alpha(config.scene, views, ndc=data.ndc, refined=config.cameras.refine)
     # A box only for rendering holds all that cameras see.
     has_alpha &= config.has_box
-    scene, found = resolve_scene(config.scene, views, ndc=data.ndc, world=data.world, has_alpha=has_alpha)
+    outlined = config.has_box and outlined_by_alpha(config.scene, views, ndc=data.ndc)
+    scene, found = resolve_scene(
+        config.scene, views, ndc=data.ndc, world=data.world, outlined=outlined, has_alpha=has_alpha
+    )
     if config.has_box or config.eval.bake_occupancy:
         lines += map(Detail, found)
     facts = dataset_facts(

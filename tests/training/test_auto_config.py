@@ -515,18 +515,26 @@ def test_images_get_more_samples_than_training(views):
     assert got.eval.sample_multiplier == 1.5 and "images        1.5 times the samples of training" in lines
 
 
-def test_alpha_does_not_bound_the_box_of_a_scene_that_moves(views):
-    """Each image shows the bodies where they are at one time; the intersection of all would cut them off."""
+def test_alpha_does_not_bound_the_box_of_a_scene_that_moves_or_whose_poses_are_refined(views):
+    """Each image shows bodies where they are at one time, or where a wrong pose has them: an intersection cuts them.
 
-    def box(views, **options):
-        scene = resolve(auto_config(contracted=False, **options), views).config.scene
+    Alpha still shows that nothing is around them.
+    """
+
+    def box(views, refine=False, **options):
+        config = auto_config(**options)
+        config.cameras.refine = refine
+        scene = resolve(config, views).config.scene
+        assert not scene.contracted
         return scene.lower, scene.upper
 
     pixels = views.pixels.reshape(-1, 24, 24, 4).copy()
     pixels[:, :9], pixels[:, 15:], pixels[:, :, :9], pixels[:, :, 15:] = 0, 0, 0, 0
     views = dataclasses.replace(views, pixels=pixels.reshape(-1, 4))
     moving = dataclasses.replace(views, time=np.linspace(0, 1, len(views.size), dtype=np.float32))
-    assert box(moving, use_alpha=True) == box(views, use_alpha=False) != box(views, use_alpha=True)
+    whole = box(views, use_alpha=False, contracted=False)
+    assert box(moving) == whole != box(views)
+    assert box(views, refine=True) == whole
     both = [resolve(auto_config(), each).lines for each in (views, moving)]
     still, line = ([each for each in lines if each.startswith("time  ")] for lines in both)
     assert not still and "images state one, which is not used: the scene is trained as static" in line[0]
