@@ -20,6 +20,7 @@ AGAIN = (
     "render_rays, gauss",
     "render_image",
 )
+MINIMIZES = {"estimate_pose"}  # what has no formula to compare with; its covariance states its error
 
 
 def _largest(row, count=32):
@@ -47,7 +48,7 @@ def test_every_public_function_of_core_has_a_row():
         for name, value in public.items()
         if inspect.isfunction(value) and value.__module__.startswith("jaxnerf.core.")
     }
-    assert {row.name for row in ROWS} == functions
+    assert {row.name for row in ROWS} == functions - MINIMIZES
     assert len(set(NAMES)) == len(NAMES) and set(records.read()) == set(NAMES)
 
 

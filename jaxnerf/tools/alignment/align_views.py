@@ -29,7 +29,7 @@ from jaxnerf.runtime import stages
 PARTS = ("pose", "exposure")
 NONE = "none"
 _METRICS = ("psnr", "ssim", "lpips")
-_NUM_PIXELS, _MAX_ITERATIONS = 8192, 15
+_NUM_PIXELS, _MAX_ITERATIONS = 4096, 12
 _TOLERANCE = 1e-4  # fraction of the squared error that a further step may remove: 0.0004 dB
 _CHUNK = 8  # derivatives need so many times the memory of colours
 

@@ -1,8 +1,8 @@
 """Exports a trained run for other programs: jaxnerf-export --workdir=DIR --kind=mesh.
 
 It writes DIR/exports/KIND-STEP/, in the units and axes of the dataset's files: a mesh with colours or a texture, points
-with normals, depth images with cameras, Gaussian splats, or a web page. All but the page need scikit-image, scipy and
-trimesh: pip install 'jaxnerf[export]'.
+with normals, depth images with cameras, Gaussian splats, a web page, or refined cameras. All but these two need
+scikit-image, scipy and trimesh: pip install 'jaxnerf[export]'.
 """
 
 import sys
