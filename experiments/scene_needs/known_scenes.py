@@ -51,6 +51,7 @@ class Known(NamedTuple):
         sizes: sides of the images, px; view i has the side i modulo their number.
         rays: along each side of a pixel, whose colour is their mean.
         behind: "alpha": transparent; "black"; "sky": a textured sphere.
+        has_box: whether the file states a box around the scene, so that nothing is inferred from alpha or the cameras.
         stops: standard deviation of the training images' exposures.
         degrees: standard deviation of the training poses' rotations about each axis.
         noise: standard deviation of the sensor's noise; values are in [0, 1].
@@ -63,6 +64,7 @@ class Known(NamedTuple):
     sizes: tuple[int, ...] = (48,)
     rays: int = 1
     behind: str = "alpha"
+    has_box: bool = False
     stops: float = 0.0
     degrees: float = 0.0
     noise: float = 0.02
@@ -72,7 +74,6 @@ class Known(NamedTuple):
 _VIEWS, _EXPOSURES, _POSES = "view dependence, without", "exposures, more", "refined poses, more"
 _SPACE, _FOOTPRINTS, _RAYS = "contraction of space, without", "footprints of pixels", "several rays a pixel, more"
 _SAME_EXPOSURE = {_EXPOSURES: (NOT_NEEDED, "all images have the same exposure")}
-_EXACT_POSES = {_POSES: (NOT_NEEDED, "all poses are exact")}
 _POINTS = {_RAYS: (NOT_NEEDED, "a pixel shows a point, which is one ray")}
 SCENES = {
     "matt": Known(
@@ -80,13 +81,12 @@ SCENES = {
         {_VIEWS: (NOT_NEEDED, "no colour depends on the direction")}
         | {f"{_FOOTPRINTS}, more": (NOT_NEEDED, "all pixels have one size")}
         | _SAME_EXPOSURE
-        | _EXACT_POSES
         | _POINTS,
         noise=0.05,
     ),
     "iridescent": Known(
         "colours that change with the direction",
-        {_VIEWS: (NEEDED, "the same surface has another colour from another side")} | _EXACT_POSES,
+        {_VIEWS: (NEEDED, "the same surface has another colour from another side")},
         tint=0.3,
     ),
     "exposed": Known(
@@ -97,7 +97,15 @@ SCENES = {
     "turned": Known(
         "poses that are wrong by half a degree",
         {_POSES: (NEEDED, "rays miss what their pixels show, by 0.6 pixels about each axis")},
+        behind="black",
+        has_box=True,
         degrees=0.5,
+    ),
+    "exact": Known(
+        "the same with exact poses",
+        {_POSES: (NOT_NEEDED, "all poses are exact")} | _SAME_EXPOSURE,
+        behind="black",
+        has_box=True,
     ),
     "scales": Known(
         "pixels of three sizes",
@@ -158,6 +166,7 @@ def write(known: Known, folder: pathlib.Path) -> pathlib.Path:
         frames.append({"file_path": path, "w": size, "h": size, **focal, "transform_matrix": matrix})
     paths = [frame["file_path"] for frame in frames]
     content = {"camera_model": "PINHOLE", "frames": frames}
+    content |= {"aabb_scale": 1} if known.has_box else {}  # of instant-ngp: from -1.5 to 1.5
     content |= {"train_filenames": paths[:NUM_TRAIN], "test_filenames": paths[NUM_TRAIN:]}
     write_text(folder / "transforms.json", json.dumps(content, indent=1) + "\n")
     return folder

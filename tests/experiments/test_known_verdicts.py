@@ -83,10 +83,10 @@ def results_of(name, **verdicts):
 
 
 def test_a_wrong_verdict_is_counted_and_an_open_one_is_open():
-    changed = {"exposures": "needed", "refined poses": "cannot tell"}
+    changed = {"exposures": "needed", "footprints of pixels": "cannot tell"}
     found = known_verdicts.compared("matt", known_scenes.SCENES["matt"], results_of("matt", **changed))
     grades = {each.change: each.grade for each in found}
-    assert grades.pop("exposures, more") == "WRONG" and grades.pop("refined poses, more") == "open"
+    assert grades.pop("exposures, more") == "WRONG" and grades.pop("footprints of pixels, more") == "open"
     assert set(grades.values()) == {"right"}
     lines = known_verdicts.table(found)
     assert lines[0] == f"{len(found) - 2} of {len(found)} right, 1 open, 1 wrong."

@@ -72,6 +72,6 @@ class PacedClock:
         own = self._clock() - self._since
         if self._pacer is None or own < _BLOCK:
             return
-        speed = self._pacer.speed()
-        self._total += own * (self._speed + speed) / 2
-        self._speed, self._since = speed, self._clock()
+        # The seconds so far stay: if they jumped, a trial could end before its learning rate is low.
+        self._total += own * self._speed
+        self._speed, self._since = self._pacer.speed(), self._clock()

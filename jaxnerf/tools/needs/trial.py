@@ -36,7 +36,6 @@ _MOST_PIXELS = 2**14  # of a view that are scored
 _LEAST_MSE = 1e-10  # of an image that is exact; 100 dB
 _MOST_NONFINITE = 20  # steps in a row
 _MOST_FITTED = 6  # views whose poses are fitted
-_CHECK_EVERY = 8  # steps between readings of the clock
 
 
 def seconds() -> float:
@@ -227,10 +226,9 @@ class _Compiled:
             state, metrics = take(state, pace.data_of(done + 1))
             done += 1
             state, metrics = reinitialize(done, state, metrics)
-            if done % _CHECK_EVERY == 0:
-                jax.block_until_ready(metrics)
-                clock.probe()
-        jax.block_until_ready(state)
+            # Queued steps would all have the learning rate of the moment when they were queued.
+            jax.block_until_ready(state)
+            clock.probe()
         if metrics is not None and int(metrics["nonfinite_in_a_row"]) >= _MOST_NONFINITE:
             raise ValueError(f"the gradient of {int(metrics['nonfinite_in_a_row'])} steps in a row is not finite")
         return state, done, clock.seconds()

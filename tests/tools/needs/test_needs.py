@@ -286,6 +286,17 @@ def test_a_slower_machine_does_not_change_the_steps_of_a_trial(tmp_path):
     assert again.nominal == pacer.nominal, "a resumed study keeps the nominal speed"
 
 
+def test_seconds_do_not_jump_when_the_speed_is_measured(tmp_path):
+    machine = FakeMachine(slower_from=4.0, factor=1.7)
+    pacer = pacing.Pacer(machine.take, machine.clock, tmp_path / "pace.json")
+    clock = pacing.PacedClock(machine.clock, pacer)
+    for _ in range(300):
+        machine.take(1, cost=0.02)
+        before = clock.seconds()
+        clock.probe()
+        assert clock.seconds() == pytest.approx(before), "the learning rate of a trial has to reach its end"
+
+
 def test_the_page_holds_everything(tmp_path, capsys):
     folder = tmp_path / "a"
     outcome, _ = run_study(folder, Trials(EFFECTS))
