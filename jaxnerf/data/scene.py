@@ -87,7 +87,7 @@ class SceneOptions(Options):
 
 
 def outlined_by_alpha(scene: SceneOptions, views: Views, *, ndc: bool) -> bool:
-    """Returns whether alpha shows that nothing surrounds a scene. Normalised device coordinates hold what cameras see."""
+    """Returns whether alpha shows that nothing surrounds a scene."""
     return scene.use_alpha and views.pixels.shape[-1] == 4 and not ndc
 
 

@@ -267,7 +267,7 @@ def test_other_flags_that_a_beginner_gets_wrong(tmp_path):
         (
             "export",
             "--workdir=x",
-            "--kind is missing: what to export: mesh, points, depth, splats, web, or a",
+            "--kind is missing: what to export: mesh, points, depth, splats, cameras, web, or a",
         ),
         ("train", "--max_steps=3", "--max_steps: no such flag; did you mean --config.train.max_steps?"),
         ("train", "--train.lr_init=1", "--train.lr_init: no such flag; did you mean --config.train.lr_init?"),

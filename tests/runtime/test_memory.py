@@ -147,7 +147,7 @@ def test_training_with_pixels_on_the_host_is_bit_exact(compiled_once, tmp_path, 
         monkeypatch.setattr(compiled_step, "_stay_on_host", lambda pixels, kind=kind: kind == "host")
         (tmp_path / kind).mkdir()
         for steps in ends:
-            experiment = smoke_experiment(max_steps=steps)._replace(model=toy_model())
+            experiment = dataclasses.replace(smoke_experiment(max_steps=steps), model=toy_model())
             views = experiment.load_split("train")
             views = dataclasses.replace(views, mask=np.arange(len(views.pixels)) % 3 > 0)
             assert loop.run_training(experiment, views, tmp_path / kind)

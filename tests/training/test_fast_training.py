@@ -307,7 +307,7 @@ def test_resumed_run_is_bit_exact_with_its_grid(toy, unoptimized, tmp_path):
     def train(folder, max_steps):
         folder.mkdir(exist_ok=True)
         config = changed(toy.config, {"train.max_steps": max_steps})
-        assert loop.run_training(toy._replace(config=config), views, folder)
+        assert loop.run_training(dataclasses.replace(toy, config=config), views, folder)
         return jax.device_get(Checkpoints(folder).load(max_steps, template))
 
     whole = train(tmp_path / "whole", 12)
