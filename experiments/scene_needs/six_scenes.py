@@ -1,7 +1,8 @@
 """Shows what six scenes need side by side, and scores the lean model of each beside the complete one on test views.
 
     taskset -c 0 python experiments/scene_needs/six_scenes.py --out=DIR [--scenes=lego,mic,fern,fox,can,trex]
-        [--budget=10min] [--seconds=60] [--config=capture] [--page=docs/results/scene_needs.md]
+        [--budget=10min] [--seconds=60] [--config=capture]
+        [--parts=PART,...] [--page=docs/results/scene_needs.md]
 
 Runs jaxnerf-needs on each scene, which reads no test view. Then the complete model and the lean one train for as many
 seconds each, on all training views and at the size of the config, and are scored on the test views once. On one core,
@@ -11,7 +12,7 @@ seconds are CPU time of the process. What DIR holds of an earlier start is not r
 import importlib.util
 import pathlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from absl import flags
@@ -26,7 +27,10 @@ MODELS = ("complete", "lean")
 _OUT = flags.DEFINE_string("out", None, "Folder of all results.", required=True)
 _SCENES = flags.DEFINE_list("scenes", ["lego", "mic", "fern", "fox", "can", "trex"], "Folders below $JAXNERF_SCENES.")
 _BUDGET = flags.DEFINE_string("budget", "10min", "Of the program, for each scene.")
-_SECONDS = flags.DEFINE_float("seconds", 60.0, "Training of a model that is scored on test views.", lower_bound=1.0)
+_PARTS = flags.DEFINE_list("parts", [], "Parts that are tried; all if none is named.")
+_SECONDS = flags.DEFINE_float(
+    "seconds", 60.0, "Training of a model that is scored on test views; 0: none is.", lower_bound=0.0
+)
 _CONFIG = flags.DEFINE_string("config", "capture", "Config of the complete model.")
 
 
@@ -34,16 +38,32 @@ def main(argv: list[str]) -> None:
     """Runs everything and prints the tables."""
     del argv
     out, needs, scores = pathlib.Path(_OUT.value), {}, {}
+    parts = [f"--parts={','.join(_PARTS.value)}"] if _PARTS.value else []
     for scene in _SCENES.value:
-        folder = out / scene
-        needs[scene] = run_program(scene, folder / "needs", _BUDGET.value, f"--config={_CONFIG.value}")
-        scores[scene] = score(scene, folder)
-        tables = parts_table(needs, _BUDGET.value), lean_table(needs, scores, _SECONDS.value), common.provenance()
-        common.publish([line for table in tables for line in (*table, "")][:-1], "six")
+        arguments = [f"--config={_CONFIG.value}", *parts]
+        needs[scene] = run_program(scene, out / scene / "needs", _BUDGET.value, *arguments)
+        publish(needs, scores)
+    for scene in _SCENES.value if _SECONDS.value else ():
+        scores[scene] = score(scene, out / scene, needs[scene]["lean"]["parts"])
+        publish(needs, scores)
 
 
-def score(scene: str, folder: pathlib.Path) -> dict[str, dict[str, float]]:
-    """Returns what the complete and the lean model reach on the test views, by model."""
+def publish(needs: Mapping[str, dict[str, Any]], scores: Mapping[str, dict[str, Any]]) -> None:
+    """Prints the tables of the scenes so far, and writes them to the page."""
+    tables = [parts_table(needs, _BUDGET.value)]
+    tables += [lean_table(needs, scores, _SECONDS.value)] if scores else []
+    tables += [common.provenance()]
+    common.publish([line for table in tables for line in (*table, "")][:-1], "six")
+
+
+def score(scene: str, folder: pathlib.Path, changed: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Returns what the complete and the lean model reach on the test views, by model.
+
+    Args:
+        scene: name.
+        folder: of its results.
+        changed: the parts in which the lean model differs; without one it is the complete model.
+    """
     from jaxnerf.tools.needs.trial import Trainer
     from jaxnerf.training import auto_config
 
@@ -51,6 +71,9 @@ def score(scene: str, folder: pathlib.Path) -> dict[str, dict[str, float]]:
     found = common.read_json(path)
     for model in MODELS:
         if model in found:
+            continue
+        if model == "lean" and not changed:
+            found[model] = found["complete"]
             continue
         base = common.configuration(_CONFIG.value) if model == "complete" else config_of(folder / "needs" / "lean.py")
         changes = {"data.dir": scene, "data.hold_out": 0, "train.max_seconds": _SECONDS.value}
