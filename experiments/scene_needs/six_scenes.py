@@ -2,7 +2,7 @@
 
     taskset -c 0 python experiments/scene_needs/six_scenes.py --out=DIR [--scenes=lego,mic,fern,fox,can,trex]
         [--budget=10min] [--seconds=60] [--config=capture]
-        [--parts=PART,...] [--page=docs/results/scene_needs.md]
+        [--parts=PART,...] [--trial=0] [--page=docs/results/scene_needs.md]
 
 Runs jaxnerf-needs on each scene, which reads no test view. Then the complete model and the lean one train for as many
 seconds each, on all training views and at the size of the config, and are scored on the test views once. On one core,
@@ -29,7 +29,10 @@ _SCENES = flags.DEFINE_list("scenes", ["lego", "mic", "fern", "fox", "can", "tre
 _BUDGET = flags.DEFINE_string("budget", "10min", "Of the program, for each scene.")
 _PARTS = flags.DEFINE_list("parts", [], "Parts that are tried; all if none is named.")
 _SECONDS = flags.DEFINE_float(
-    "seconds", 60.0, "Training of a model that is scored on test views; 0: none is.", lower_bound=0.0
+    "seconds", 60.0, "Training of a model that is scored on test views; 0: no lean model.", lower_bound=0.0
+)
+_TRIAL = flags.DEFINE_float(
+    "trial", 0.0, "Seconds of training of each trial; 0: as the budget allows.", lower_bound=0.0
 )
 _CONFIG = flags.DEFINE_string("config", "capture", "Config of the complete model.")
 
@@ -38,9 +41,11 @@ def main(argv: list[str]) -> None:
     """Runs everything and prints the tables."""
     del argv
     out, needs, scores = pathlib.Path(_OUT.value), {}, {}
-    parts = [f"--parts={','.join(_PARTS.value)}"] if _PARTS.value else []
+    options = [f"--parts={','.join(_PARTS.value)}"] if _PARTS.value else []
+    options += [f"--seconds={_TRIAL.value}"] if _TRIAL.value else []
+    options += [] if _SECONDS.value else ["--nolean"]
     for scene in _SCENES.value:
-        arguments = [f"--config={_CONFIG.value}", *parts]
+        arguments = [f"--config={_CONFIG.value}", *options]
         needs[scene] = run_program(scene, out / scene / "needs", _BUDGET.value, *arguments)
         publish(needs, scores)
     for scene in _SCENES.value if _SECONDS.value else ():
