@@ -43,9 +43,9 @@ def make_rays(camera: jaxnerf.Camera) -> jaxnerf.Rays:
 
 
 def find_pose(camera: jaxnerf.Camera) -> Array:
-    image, options = jnp.zeros((16, 16, 3)), {"num_pixels": 64}
+    image = jnp.zeros((16, 16, 3))
     found: jaxnerf.PoseEstimate = jaxnerf.estimate_pose(
-        scene, image, camera, camera.to_world, near=2.0, far=6.0, background=(1.0, 1.0, 1.0), with_gains=True, **options
+        scene, image, camera, camera.to_world, near=2.0, far=6.0, num_pixels=64, with_gains=True
     )
     return found.covariance
 

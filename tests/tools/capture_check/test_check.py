@@ -476,7 +476,8 @@ def test_the_program_reports_and_does_not_touch_the_dataset(folders, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["check-llff.png"]
     assert sorted(folders.rglob("*")) == before
     bad = run(f"--data_dir={folders / 'llff'}", "--near=200", "--far=600", cwd=tmp_path)  # over its own plot
-    assert bad.returncode == 1 and "ERROR   near 200" in bad.stdout and not bad.stderr
+    assert bad.returncode == 1 and "ERROR   near 200" in bad.stdout
+    assert all(line.startswith("working") for line in bad.stderr.splitlines()), bad.stderr  # on a busy machine
     inside = run(f"--data_dir={folders / 'llff'}", f"--out={folders / 'llff' / 'x.png'}", cwd=tmp_path)
     assert inside.returncode == 1 and "choose another path with --out" in inside.stderr
 
