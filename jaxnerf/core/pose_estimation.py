@@ -80,7 +80,8 @@ def estimate_pose(
         camera: of the image, with its focal length, center and lens; its own pose does not count.
         start: [3, 4] a pose near the true one, camera to world.
         near, far: see `rays_from_pixels`.
-        num_samples, background: see `render_rays`.
+        num_samples: see `render_rays`.
+        background: see `render_rays`.
         render: (scene, rays [N]) -> Rendering [N], which has derivatives in forward mode, in place of render_rays; of a
             run: lambda _, rays: render(rays), with the function that `load_scene` returns.
         key: of the choice of pixels; None: a fixed one.
