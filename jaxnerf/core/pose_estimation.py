@@ -79,7 +79,8 @@ def estimate_pose(
         image: [H, W, 3] in [0, 1].
         camera: of the image, with its focal length, center and lens; its own pose does not count.
         start: [3, 4] a pose near the true one, camera to world.
-        near, far: see `rays_from_pixels`.
+        near: see `rays_from_pixels`.
+        far: see `rays_from_pixels`.
         num_samples: see `render_rays`.
         background: see `render_rays`.
         render: (scene, rays [N]) -> Rendering [N], which has derivatives in forward mode, in place of render_rays; of a
