@@ -58,7 +58,8 @@ def in_todays_names(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[st
     """Returns a config's content in today's names; and by "section.option" the values that are gone and were not off.
 
     Raises:
-        ValueError: if an option has different values under both names, and neither is the default.
+        ValueError: if an option has different values under both names, and neither is the default; or if poses were
+            refined as they no longer are.
     """
     content = {name: dict(part) if isinstance(part, Mapping) else part for name, part in content.items()}
     for old, (new, default) in RENAMED.items():
@@ -70,6 +71,14 @@ def in_todays_names(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[st
             part[option] = value
         elif value not in (part[option], default):
             raise ValueError(f"--config.{old} is now {new}, and they have different values; drop the first")
+    cameras = content.get("cameras")
+    if isinstance(cameras, dict) and "refine_focal" not in cameras:
+        if cameras.get("refine"):
+            raise ValueError(
+                "--config.cameras.refine_focal is missing, so the run turned each camera about itself, and today's turn "
+                f"about what they look at; {_DROP}, or train again"
+            )
+        cameras["refine_focal"] = False
     found = {name: value for name in GONE if (value := _pop(content, name)) is not _ABSENT}
     return content, {name: value for name, value in found.items() if as_tuples(value) not in GONE[name].off}
 

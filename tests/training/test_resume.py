@@ -153,6 +153,19 @@ def test_a_run_that_used_an_option_that_is_gone_is_reported(earlier, tmp_path):
         read_config(content)
 
 
+@pytest.mark.parametrize("refine", [False, True])
+def test_a_run_from_before_refined_cameras_turned_about_what_they_look_at(trained, tmp_path, refine):
+    saved = json.loads((trained / "config.json").read_text())
+    saved["cameras"]["refine"] = refine
+    del saved["cameras"]["refine_focal"]
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    if refine:
+        with pytest.raises(ValueError, match="refine_focal is missing, so the run turned each camera about itself"):
+            workdir.load_config(tmp_path)
+    else:
+        assert workdir.load_config(tmp_path) == workdir.load_config(trained)
+
+
 @pytest.mark.slow
 def test_resumed_run_does_not_exceed_its_limit_of_seconds(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
