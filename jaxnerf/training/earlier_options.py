@@ -75,8 +75,8 @@ def in_todays_names(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[st
     if isinstance(cameras, dict) and "refine_focal" not in cameras:
         if cameras.get("refine"):
             raise ValueError(
-                "--config.cameras.refine_focal is missing, so the run turned each camera about itself, and today's turn "
-                f"about what they look at; {_DROP}, or train again"
+                "--config.cameras.refine_focal is missing, so the run turned each camera about itself, and today's "
+                f"turn about what they look at; {_DROP}, or train again"
             )
         cameras["refine_focal"] = False
     found = {name: value for name in GONE if (value := _pop(content, name)) is not _ABSENT}
