@@ -20,9 +20,9 @@ from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
 from jaxnerf.data.geometry import visual_hull
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.scene import SceneOptions
-from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO
 from jaxnerf.registry import FIELDS, Part
+from jaxnerf.tools.embedded_scene import still_life
 from jaxnerf.training import workdir
 from jaxnerf.training.auto_config import device_fields, fill_from, resolve, resolve_for_device
 from jaxnerf.training.build import build
