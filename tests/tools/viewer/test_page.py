@@ -41,3 +41,10 @@ def test_a_frame_is_requested_where_the_last_one_does_not_hold_the_mode(mode, un
     page._request, page._redraw = (lambda name=name: calls.append(name) for name in ("request", "redraw"))
     Page._change_mode(page)
     assert calls == ["request"] * requests or (calls == ["redraw"] and not requests)
+
+
+@pytest.mark.parametrize("travels, distance", [(False, 3.0), (True, 0.08)])
+def test_a_view_turns_about_what_cameras_look_at_or_about_its_own_place_on_a_walk(travels, distance):
+    page = SimpleNamespace(_travels=travels, _size=4.0, _target=np.zeros(3))
+    pose = np.column_stack([np.eye(3), [0.5, 0, 3]])
+    np.testing.assert_allclose(Page._look_at(page, pose), [0.5, 0, 3 - distance])
