@@ -56,7 +56,7 @@ if _typing.TYPE_CHECKING:
     from jaxnerf.evaluation.restore import TrainedRun, load_scene, restore_run
     from jaxnerf.fields.hash_grid import hash_grid_field
     from jaxnerf.fields.mlp import mlp_field
-    from jaxnerf.fields.still_life import still_life
+    from jaxnerf.tools.embedded_scene.still_life import still_life
     from jaxnerf.tools.exporters.registration import register_exporter
     from jaxnerf.tools.uncertainty.registration import register_estimator
 
@@ -67,7 +67,7 @@ _ON_DEMAND = {
     "draw_batch": "jaxnerf.data.ray_batches",
     "mlp_field": "jaxnerf.fields.mlp",
     "hash_grid_field": "jaxnerf.fields.hash_grid",
-    "still_life": "jaxnerf.fields.still_life",
+    "still_life": "jaxnerf.tools.embedded_scene.still_life",
     "load_scene": "jaxnerf.evaluation.restore",
     "restore_run": "jaxnerf.evaluation.restore",
     "TrainedRun": "jaxnerf.evaluation.restore",

@@ -24,8 +24,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import bounds
 from jaxnerf.data.images.load_images import load_capture
 from jaxnerf.data.readers import blender
-from jaxnerf.fields import still_life
-from jaxnerf.tools.embedded_scene import render
+from jaxnerf.tools.embedded_scene import render, still_life
 
 WHITE = (1.0, 1.0, 1.0)
 SKY = 30.0  # radius of the textured sphere around an unbounded dataset, world units

@@ -26,8 +26,8 @@ from scipy.spatial import cKDTree
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
-from jaxnerf.fields.still_life import BODIES
 from jaxnerf.runtime import cli
+from jaxnerf.tools.embedded_scene.still_life import BODIES
 from jaxnerf.tools.exporters import mesh as mesh_exporter
 from jaxnerf.tools.exporters.base import export_run
 

@@ -25,8 +25,8 @@ from jaxnerf.core.pose_estimation import estimate_pose, moved
 from jaxnerf.core.poses import look_at
 from jaxnerf.core.rendering import render_rays
 from jaxnerf.core.types import Camera
-from jaxnerf.fields.still_life import still_life
 from jaxnerf.runtime import cli
+from jaxnerf.tools.embedded_scene.still_life import still_life
 
 _TRIALS = flags.DEFINE_integer("trials", 100, "Images.", lower_bound=10)
 

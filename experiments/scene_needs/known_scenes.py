@@ -72,7 +72,7 @@ class Known(NamedTuple):
 
 # Names of parts and changes are those of jaxnerf-needs. "more" of a part that is off: needed if it pays.
 _VIEWS, _EXPOSURES, _POSES = "view dependence, without", "exposures, more", "refined poses, more"
-_SPACE, _FOOTPRINTS, _RAYS = "contraction of space, without", "footprints of pixels", "several rays a pixel, more"
+_SPACE, _FOOTPRINTS, _RAYS = "contraction of space", "footprints of pixels", "several rays a pixel, more"
 _SAME_EXPOSURE = {_EXPOSURES: (NOT_NEEDED, "all images have the same exposure")}
 _POINTS = {_RAYS: (NOT_NEEDED, "a pixel shows a point, which is one ray")}
 SCENES = {
@@ -123,12 +123,12 @@ SCENES = {
     ),
     "sky": Known(
         "a textured sphere behind the scene",
-        {_SPACE: (NEEDED, "the sphere is far outside of any box around the cameras")},
+        {f"{_SPACE}, without": (NEEDED, "the sphere is far outside of any box around the cameras")},
         behind="sky",
     ),
     "black": Known(
         "nothing behind the scene, and no alpha",
-        {_SPACE: (NOT_NEEDED, "outside of the box there is nothing, and black is behind it")},
+        {f"{_SPACE}, more": (NOT_NEEDED, "outside of the box there is nothing, and black is behind it")},
         behind="black",
     ),
     "fog": Known(

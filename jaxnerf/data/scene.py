@@ -17,6 +17,11 @@ BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 _MAX_INNER_BOX = 3.0
 # Times twice the side of the cube that most images show; a stated box that is larger is no better than contraction.
 _MAX_STATED_BOX = 3.0
+# How much the colour around an object may differ within an image and between images, and the least fraction of the
+# border's pixels that have it. Of what some image shows, at least the last fraction has this colour in the mean image:
+# the border of a fish-eye image is as black, but at the same pixels everywhere.
+_PLAIN, _PLAIN_BORDER, _PLAIN_FRACTION = 0.1, 0.9, 0.1
+_PLAIN_VIEWS, _PLAIN_PIXELS = 32, 64  # that are looked at: views, and pixels along a side
 
 
 def _wrong_color(color):
@@ -56,7 +61,8 @@ class SceneOptions(Options):
     background: tuple[float, ...] = option(
         AUTO,
         "The colour behind the scene where `data.background` is `none`: red, green, blue in [0, 1], or () for black. "
-        "auto: the mean of the training images where space is contracted and empty cells are skipped, otherwise black.",
+        "auto: the colour around the object where all images have the same one there; the mean of the training images "
+        "where space is contracted and empty cells are skipped; otherwise black.",
         auto=True,
         check=_wrong_color,
         ablations=(Ablation("colour behind the scene", without=()),),
@@ -152,6 +158,11 @@ def resolve_background(
     """
     color = scene.background
     if is_auto(color):
+        around = None if behind_alpha != "none" or scene.contracted else plain_border(views)
+        if around is not None:
+            return replaced(scene, background=around), [
+                f"behind        {around}, which surrounds the object in all images"
+            ]
         if behind_alpha != "none" or not fills_space:
             return replaced(scene, background=()), []
         color = tuple(round(value, 3) for value in mean_color(views))
@@ -176,7 +187,37 @@ def _contracted(views, outlined, *, ndc, world):
             return False, "the dataset states the scene's bounds"
     if outlined:
         return False, "alpha bounds the object"
+    if plain_border(views) is not None:
+        return False, "one colour surrounds the object in all images"
     return True, "nothing bounds the surroundings"
+
+
+def plain_border(views: Views) -> tuple[float, ...] | None:
+    """Returns the colour around an object in images without alpha, as renderings and cut-out images have it.
+
+    Args:
+        views: of the split "train".
+
+    Returns:
+        Red, green and blue in [0, 1]; None where images have alpha or a mask, where their borders have no single
+        colour, or where the pixels of this colour are the same in all images.
+    """
+    if views.pixels.shape[-1] == 4 or views.mask is not None:
+        return None
+    found, color, largest = [], None, np.iinfo(views.pixels.dtype).max
+    for index in np.unique(np.linspace(0, len(views.size) - 1, _PLAIN_VIEWS).astype(int)):
+        (height, width), first = views.size[index], views.offset[index]
+        image = np.asarray(views.pixels[first : first + height * width]).reshape(height, width, 3)
+        border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]) / largest
+        color = np.median(border, axis=0) if color is None else color
+        if (np.abs(border - color) < _PLAIN).all(axis=-1).mean() < _PLAIN_BORDER:
+            return None
+        rows, columns = (np.linspace(0, side - 1, _PLAIN_PIXELS).astype(int) for side in (height, width))
+        found.append((np.abs(image[np.ix_(rows, columns)] / largest - color) < _PLAIN).all(axis=-1))
+    somewhere = ~np.all(found, axis=0)
+    if not somewhere.any() or np.mean(found, axis=0)[somewhere].mean() < _PLAIN_FRACTION:
+        return None
+    return tuple(round(float(value), 3) for value in color)
 
 
 def _box(views, has_alpha, *, ndc, contracted):

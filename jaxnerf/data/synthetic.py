@@ -1,4 +1,4 @@
-"""The embedded dataset: views of `fields.still_life`, so that nothing is downloaded. Those of the demo ship with the
+"""The embedded dataset: views of `jaxnerf.still_life`, so that nothing is downloaded. Those of the demo ship with the
 package, rendered by experiments/embedded/write_images.py; others are rendered on first use, by a tool.
 """
 

@@ -9,9 +9,9 @@ import pytest
 from helpers import assert_same, compiled
 from jaxnerf.data import active_pixels, synthetic
 from jaxnerf.data.active_pixels import active_region, find_active_pixels, valid_cells
-from jaxnerf.fields import still_life
 from jaxnerf.models.grid_schedule import make_grid_schedule
 from jaxnerf.runtime import cores
+from jaxnerf.tools.embedded_scene import still_life
 
 BOX = (-1.5, -1.5, -1.0), (1.5, 1.5, 1.3)  # contains the embedded scene
 

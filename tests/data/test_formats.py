@@ -20,8 +20,8 @@ from jaxnerf.data import dataset
 from jaxnerf.data.active_pixels import unmasked_pixels
 from jaxnerf.data.dataset import DataOptions
 from jaxnerf.data.ray_batches import view_rays
-from jaxnerf.fields import still_life
 from jaxnerf.options import replaced, values_of
+from jaxnerf.tools.embedded_scene import still_life
 from jaxnerf.training import workdir
 from jaxnerf.training.config import read_config
 

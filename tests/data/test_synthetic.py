@@ -8,8 +8,7 @@ from PIL import Image
 
 from jaxnerf.core import cameras, rendering
 from jaxnerf.data import synthetic
-from jaxnerf.fields import still_life
-from jaxnerf.tools.embedded_scene import render
+from jaxnerf.tools.embedded_scene import render, still_life
 
 
 @pytest.fixture(scope="session")

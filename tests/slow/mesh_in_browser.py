@@ -36,7 +36,7 @@ from viewer_in_browser import check, chromium
 from export_sources import TO_FILE, source_of
 from jaxnerf import Camera, look_at, pixel_grid, psnr, rays_from_pixels, render_image, render_rays
 from jaxnerf.data.geometry.world import poses_in_file
-from jaxnerf.fields import still_life
+from jaxnerf.tools.embedded_scene import still_life
 from jaxnerf.tools.exporters.mesh import export_mesh
 
 THREE = "three@0.187.0"

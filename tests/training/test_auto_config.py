@@ -20,9 +20,9 @@ from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
 from jaxnerf.data.geometry import visual_hull
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.scene import SceneOptions
-from jaxnerf.fields import still_life
 from jaxnerf.options import AUTO
 from jaxnerf.registry import FIELDS, Part
+from jaxnerf.tools.embedded_scene import still_life
 from jaxnerf.training import workdir
 from jaxnerf.training.auto_config import device_fields, fill_from, resolve, resolve_for_device
 from jaxnerf.training.build import build
@@ -239,6 +239,27 @@ def test_otherwise_black_or_the_color_behind_alpha_is_behind_the_scene(views, ba
     else:
         with pytest.raises(ValueError, match="set data.background to 'none', or scene.background to"):
             resolve(given, views)
+
+
+def test_one_color_around_an_object_bounds_its_scene(views):
+    """As in images whose alpha was composited before they were written, with a sensor's noise."""
+    color, given = np.float32([0.2, 0.4, 0.6]), auto_config()
+    given.data.background, given.data.world = "none", "around"
+    rgb, alpha = np.split(views.pixels / np.iinfo(views.pixels.dtype).max, [3], axis=-1)
+    shown = alpha * rgb + (1 - alpha) * color + np.random.default_rng(0).normal(0, 0.02, rgb.shape)
+
+    def resolved(pixels, **changes):
+        pixels = np.uint8(np.rint(255 * np.clip(pixels, 0, 1)))
+        return resolve(given, dataclasses.replace(views, pixels=pixels, **changes)).config.scene
+
+    scene = resolved(shown)
+    assert not scene.contracted
+    np.testing.assert_allclose(scene.background, color, atol=0.01)
+    circle = np.hypot(*(np.mgrid[:24, :24] - 11.5)) < 11
+    lens = np.where(np.tile(circle.reshape(-1, 1), (len(views.size), 1)), shown * 0.5 + 0.5, 0)
+    assert resolved(lens).contracted, "black at the same pixels of all images is the lens"
+    assert resolved(shown, mask=np.ones(len(shown), bool)).contracted, "what a mask includes says nothing"
+    assert resolved(np.full_like(shown, 0.5)).contracted, "nothing is in images of one colour"
 
 
 def test_the_mean_color_of_many_pixels_is_that_of_all_that_the_mask_includes(views):

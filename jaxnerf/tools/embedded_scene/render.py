@@ -16,11 +16,11 @@ from jaxnerf.core import cameras
 from jaxnerf.core.types import Camera, Rays
 from jaxnerf.data.images import image_files
 from jaxnerf.data.images.pixel_cache import num_workers
-from jaxnerf.fields import portable_math, still_life
-from jaxnerf.fields.portable_math import exp
-from jaxnerf.fields.still_life import BODIES, WIDTH
 from jaxnerf.runtime import stages
 from jaxnerf.runtime.fingerprint import fingerprint
+from jaxnerf.tools.embedded_scene import portable_math, still_life
+from jaxnerf.tools.embedded_scene.portable_math import exp
+from jaxnerf.tools.embedded_scene.still_life import BODIES, WIDTH
 
 _logger = logging.getLogger(__name__)
 _MANY_SECONDS, _RAYS_PER_SECOND = 5, 100_000  # from which on people wait; on a core of two AMD EPYC

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
+from jaxnerf.data.images.downscaled_copies import factor_for
 from jaxnerf.registry import needs_folder
 from jaxnerf.runtime.atomic_files import read_json, write_text
 from jaxnerf.tools.needs import page
@@ -63,7 +64,7 @@ def find_needs(request: Request, out: str | os.PathLike) -> Outcome:
     factor = request.shrink or _kept_factor(pathlib.Path(out)) or shrink_factor(views, request.settings.budget)
     trainer = full
     if factor > 1:
-        trainer = Trainer(*_shrunk(config, factor))
+        trainer = Trainer(*_shrunk(config, views, factor))
         resolved = trainer.resolved({})
     held_out = trainer.held_out()
     _check_images(held_out, config)
@@ -74,7 +75,7 @@ def find_needs(request: Request, out: str | os.PathLike) -> Outcome:
         _check_origin(folder, request, resolved.config, factor)
         if jax.default_backend() == "cpu":  # other programs seldom use an accelerator
             trainer.pacer = full.pacer = trainer.make_pacer(folder / "pace.json")
-        _say(_images_line(trainer.views, held_out, factor))
+        _say(_images_line(views, trainer.views, held_out))
         study = Study(
             folder,
             request.settings,
@@ -91,9 +92,10 @@ def find_needs(request: Request, out: str | os.PathLike) -> Outcome:
     return outcome
 
 
-def _images_line(views, held_out, factor):
+def _images_line(full, views, held_out):
     sides = sorted({f"{width} x {height} px" for height, width in views.size.tolist()})
-    shrunk = f", shrunk by {factor}; the curve is of those that are not" if factor > 1 else ""
+    factor = full.size.max() / views.size.max()
+    shrunk = f", shrunk by {factor:.3g}; the curve is of those that are not" if factor > 1 else ""
     sizes = " and ".join(sides[:3]) + (f" and {len(sides) - 3} other sizes" if len(sides) > 3 else "")
     return f"images        {len(views.size)} for training, {len(held_out.size)} held out, {sizes}{shrunk}"
 
@@ -130,11 +132,12 @@ def shrink_factor(views: Views, budget: float) -> int:
     return max(min(factor, int(side // _LEAST_SIDE)), 1)
 
 
-def _shrunk(config, factor):
-    """Returns the config with images that are shrunk by a further factor, and its Views."""
+def _shrunk(config, views, factor):
+    """Returns the config with images that are shrunk by about a further factor, and its Views."""
     if needs_folder(config.data.format):
-        data, _, _ = dataset.resolve(config.data)
-        config = changed(config, {"data.factor": data.factor * factor})
+        _, _, capture = dataset.resolve(config.data)
+        nearest, _ = factor_for(capture, max(int(views.size[:, 1].max()) // factor, 1))
+        config = changed(config, {"data.factor": nearest})
     else:
         config = changed(config, {"data.size": max(config.data.size // factor, 1)})
     return config, auto_config.resolve(config).views

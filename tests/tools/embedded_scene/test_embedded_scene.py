@@ -10,9 +10,8 @@ import pytest
 
 from jaxnerf.core import rendering
 from jaxnerf.data import synthetic
-from jaxnerf.fields import portable_math
-from jaxnerf.fields.still_life import still_life
-from jaxnerf.tools.embedded_scene import render
+from jaxnerf.tools.embedded_scene import portable_math, render
+from jaxnerf.tools.embedded_scene.still_life import still_life
 
 CHECKSUMS = {  # SHA-256 of two test views of 24 px, by finish
     "usual": "f23365e7db10496c13017d8999e0d3dfc04ca98a87da3ee98ea2a0c7f3b90fb7",

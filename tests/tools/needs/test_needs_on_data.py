@@ -13,6 +13,8 @@ from jaxnerf.tools.needs import run
 from jaxnerf.tools.needs.run import Request, find_needs
 from jaxnerf.tools.needs.study import Settings
 from jaxnerf.tools.needs.trial import Result
+from jaxnerf.training import auto_config
+from jaxnerf.training.config import read_config
 from runs import PACKED, as_flags, start
 
 SETTINGS = Settings(60.0, 0.1)
@@ -71,6 +73,15 @@ def test_images_shrink_with_the_budget():
     assert run.shrink_factor(views, 600.0) == 1
     assert run.shrink_factor(views, 75.0) == 2
     assert run.shrink_factor(views, 1.0) == 4, "no side is shorter than 50 px"
+
+
+def test_rendered_images_shrink_by_a_divisor_of_their_size(tmp_path):
+    captures.write_blender(tmp_path, captures.noise(captures.orbit(6, height=24, width=40)))
+    config = read_config(config_of(tmp_path))
+    views = auto_config.resolve(config).views
+    shrunk, smaller = run._shrunk(config, views, 3)
+    assert shrunk.data.factor == 4, "3 does not divide 24 x 40"
+    assert smaller.size.tolist() == [[6, 10]] * 6
 
 
 @pytest.mark.slow

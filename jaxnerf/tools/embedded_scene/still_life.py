@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.types import check_shapes
-from jaxnerf.fields import portable_math
+from jaxnerf.tools.embedded_scene import portable_math
 
 _LIGHT = (0.48, -0.36, 0.80)  # the direction that it comes from
 WIDTH = 0.015  # world units, over which a body's density falls at its outline
