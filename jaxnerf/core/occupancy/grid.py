@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from jaxnerf.core import contraction, volume_rendering
+from jaxnerf.core import contraction, types, volume_rendering
 from jaxnerf.core.loops import vary_like
 from jaxnerf.core.safe_math import at_least_float32
 from jaxnerf.core.sampling import ONE_KEY, typed_key
@@ -23,8 +23,7 @@ _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 _ABSORBED = 0.01  # the fraction of light that matter of the threshold's density absorbs between samples
 _LEAST_LIGHT = 1e-30  # transmitted by any cell, so that density_mean is finite
 _SMALLEST_THRESHOLD = 1e-30  # 1 / world unit, so that a threshold of 0 has a spacing
-# Updates of a cell, one after the other, evaluate a scene that moves once in each of so many equal parts of [0, 1), in
-# an order in which neighbours in time are far apart.
+# Updates of a cell in a row evaluate a scene that moves once in each of so many parts of [0, 1), and jump between them.
 NUM_TIMES, _TIME_STRIDE = 50, 31
 
 
@@ -132,9 +131,8 @@ def update_grid(
         radii: [2] world units, above 0, the smallest and the largest radius for which the scene is rendered where
             space is not contracted; that of a cell is drawn between them, uniform in its logarithm. None: see
             `cell_inputs`.
-        index: int32, how often these cells were updated before, for scenes that ask for time: any NUM_TIMES updates in
-            a row then have one time in each part [k, k + 1) / NUM_TIMES, with the same offset for a cell, so that none
-            misses matter that fills a cell for 1 / NUM_TIMES of the time. None: times are random.
+        index: int32, how often these cells were updated before, for scenes that ask for time: NUM_TIMES updates in a
+            row then are 1 / NUM_TIMES apart, and find what fills a cell for so long. None: times are random.
 
     Returns:
         OccupancyGrid. Cells that are not valid stay empty. The update is not meant to be differentiated.
@@ -154,9 +152,8 @@ def update_grid(
     length = _spacings(grid, threshold, spacing)[cells] if needs_of(scene) else None
     radius = None
     if radii is not None and "radius" in needs_of(scene):
-        # Another key than those of place and time.
         smallest, largest = jnp.log(radii)
-        at = jax.random.uniform(jax.random.fold_in(key, 2), x.shape[:-1])
+        at = jax.random.uniform(jax.random.fold_in(key, 2), x.shape[:-1])  # another key than those of place and time
         radius = _stretch(grid, x) * jnp.exp(smallest + (largest - smallest) * at)
     time = _cell_times(key, cells, index) if "time" in needs_of(scene) else 0.0
     inputs = cell_inputs("update_grid", scene, grid, x, length=length, radius=radius, time=time)
@@ -182,10 +179,8 @@ def update_grid(
 
 def _cell_times(key, cells, index):
     """Returns the time of each cell [M] in [0, 1), see update_grid."""
-    # Another key than that of the places in the cells, which thus do not depend on what the scene asks for.
-    within = jax.random.uniform(jax.random.fold_in(key, 1), cells.shape)
-    if index is None:
-        return within
+    if index is None:  # another key than that of the places, which do not depend on what the scene asks for
+        return jax.random.uniform(jax.random.fold_in(key, 1), cells.shape)
     offset = (jnp.asarray(cells, jnp.uint32) * jnp.uint32(2654435769) >> 8) / jnp.float32(2**24)  # Fibonacci hashing
     return (jnp.asarray(index) % NUM_TIMES * _TIME_STRIDE % NUM_TIMES + offset) / NUM_TIMES
 
@@ -230,8 +225,7 @@ def grid_from_scene(
     key = typed_key(key, ONE_KEY)
     grid = create_grid(lower, upper, jnp.ones(shape, bool), initial_density=0.0, contracted=contracted)
     cells = jnp.arange(grid.valid.size)
-    if "time" in needs_of(scene):
-        num_updates = max(num_updates, NUM_TIMES)
+    num_updates = max(num_updates, NUM_TIMES * ("time" in needs_of(scene)))
 
     def update(index, grid):
         options = {"threshold": threshold, "decay": 1.0, "smoothing": 1 / (index + 1), "chunk": chunk, "index": index}
@@ -344,7 +338,7 @@ def is_occupied(
     """Returns whether the cell around each x(t) is occupied; True where t or the ray is NaN, so that it is visible."""
     _check_bool("OccupancyGrid", occupied=grid.occupied)
     index, inside = _cells_of(grid, _along_rays(grid, rays, t))
-    return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t) | has_nan(rays)[..., None]
+    return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t) | types.has_nan(rays)[..., None]
 
 
 def near_occupied(
@@ -391,11 +385,6 @@ def _check_bool(function, **cells):
             raise ValueError(f"{function}: {name} has type {array.dtype}, expected bool; compare it with a threshold")
 
 
-def has_nan(rays: Rays) -> Bool[Array, "*batch"]:
-    """Returns whether the origin, the direction, near or far of each ray is NaN."""
-    return jnp.isnan(rays.origins.sum(axis=-1) + rays.directions.sum(axis=-1) + rays.near + rays.far)
-
-
 def estimate_optical_depth(
     grid: OccupancyGrid, rays: Rays, samples: Samples
 ) -> tuple[Bool[Array, "*batch samples"], Float[Array, "*batch samples"]]:
@@ -420,7 +409,7 @@ def estimate_optical_depth(
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
     # The bound keeps sums finite: the mean of a cell of an older checkpoint may be infinite.
     optical_depth = jnp.where(mean > 0, jnp.minimum(mean * samples.delta * size, volume_rendering.OPAQUE), 0)
-    unknown = jnp.isnan(samples.t) | (has_length & has_nan(rays)[..., None])
+    unknown = jnp.isnan(samples.t) | (has_length & types.has_nan(rays)[..., None])
     return ~(mean < 0) | unknown, optical_depth
 
 

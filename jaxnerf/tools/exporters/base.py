@@ -85,13 +85,7 @@ def export_run(
     atomic_files.check_tree(target.parent)
     if target.exists() and not overwrite:
         raise ValueError(f"{target}: exists already; give --overwrite to replace it, or another --name")
-    moves, has_grid = "time" in run.experiment.model.needs, run.experiment.model.grid_schedule is not None
-    if moves:
-        say("the scene moves, and the export shows time 0; --time=T selects another from 0 to 1")
-        time = 0.0
-    if moves or not has_grid:  # whole rays through a dense network would take hours
-        baked = {} if has_grid else {"bake_occupancy": True}
-        run = restore_run(workdir, data_dir=data_dir, settings=baked, time=time)
+    run = _one_instant(run, workdir, data_dir, time, say)
     variables = cleaned(run, workdir, max_uncertainty).variables(step)
     views = refined_views(run, run.experiment.load_split("train", images=None), "train", variables[0])
     target.parent.mkdir(exist_ok=True)
@@ -105,6 +99,17 @@ def export_run(
         if relative:
             (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
     return target
+
+
+def _one_instant(run, workdir, data_dir, time, say):
+    """Returns the run with an occupancy grid, and at a time if its scene moves."""
+    moves, has_grid = "time" in run.experiment.model.needs, run.experiment.model.grid_schedule is not None
+    if moves:
+        say("the scene moves, and the export shows time 0; --time=T selects another from 0 to 1")
+    if has_grid and not moves:
+        return run
+    baked = {} if has_grid else {"bake_occupancy": True}  # whole rays through a dense network would take hours
+    return restore_run(workdir, data_dir=data_dir, settings=baked, time=0.0 if moves else time)
 
 
 def can_be_scored(source: ExportSource) -> bool:

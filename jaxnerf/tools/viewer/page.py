@@ -118,8 +118,8 @@ class Page:
         elif delivery.frames_per_second is None:
             kind = pace = "refining"
         else:
-            kind, pace = "moving", f"{delivery.frames_per_second:.0f} frames/s"
-        if kind != "moving" or kind != self._kind or now - self._reported > _STATUS_EVERY:
+            kind, pace = "in motion", f"{delivery.frames_per_second:.0f} frames/s"
+        if kind != "in motion" or kind != self._kind or now - self._reported > _STATUS_EVERY:
             self._kind = kind
             score = f" · {self._viewer.score}" if self._viewer.score else ""
             self.report(f"**step {delivery.step:,}**{score}\n\n{pace} · {camera.width} × {camera.height} px")
