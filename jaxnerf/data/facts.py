@@ -42,6 +42,7 @@ def dataset_facts(
         upper=box[1],
         contracted=contracted,
         skips_empty_cells=skips_empty_cells,
+        has_times=views.time is not None,
         **others,
     )
 
