@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxnerf.data.geometry import path_poses
-from jaxnerf.data.geometry.poses import axis_of, gaze_center
+from jaxnerf.data.geometry.poses import axis_of, gaze_center, travel
 from jaxnerf.data.geometry.world import direction_in_run
 from jaxnerf.evaluation.paths.render_path import Frames, Output, render_path
 from jaxnerf.evaluation.restore import newest_step, restore_run
