@@ -106,11 +106,7 @@ class Registry:
 FIELDS = Registry(
     "field",
     "jaxnerf.register_field",
-    {
-        "mlp": "jaxnerf.fields.mlp:FIELD",
-        "hash_grid": "jaxnerf.fields.hash_grid:FIELD",
-        "moving": "jaxnerf.fields.moving:FIELD",
-    },
+    {"mlp": "jaxnerf.fields.mlp:FIELD", "hash_grid": "jaxnerf.fields.hash_grid:FIELD"},
 )
 SAMPLERS = Registry(
     "sampler",

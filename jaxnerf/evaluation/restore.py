@@ -13,7 +13,6 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.image_renderer import image_renderer
-from jaxnerf.fields.base import at_time
 from jaxnerf.models.base import Model
 from jaxnerf.options import AUTO, Changes, changing, is_auto, replaced
 from jaxnerf.registry import needs_folder
@@ -61,7 +60,6 @@ def restore_run(
     *,
     data_dir: str | None = None,
     settings: dict[str, Any] | None = None,
-    time: float | None = None,
 ) -> TrainedRun:
     """Restores the run in a workdir. Checkpoints are read when `variables` is called.
 
@@ -70,16 +68,14 @@ def restore_run(
         config: in place of the workdir's own; its "auto" fields have the values of the workdir's.
         data_dir: the dataset's folder in place of the config's.
         settings: fields of the config's section `eval` to replace, by name.
-        time: in [0, 1], at which a scene that moves is shown, whatever the time of rays; None: at theirs.
 
     Returns:
         TrainedRun.
 
     Raises:
-        ValueError: if there is no run, or no dataset in data_dir, names the folder; if there is a time and the scene
-            does not move.
+        ValueError: if there is no run, or no dataset in data_dir; names the folder.
     """
-    return _restore(workdir, config, data_dir, settings or {}, crop=True, time=time)
+    return _restore(workdir, config, data_dir, settings or {}, crop=True)
 
 
 def restore_with_grid(
@@ -92,7 +88,7 @@ def restore_with_grid(
     return _restore(workdir, None, data_dir, {**(settings or {}), "bake_occupancy": True}, crop=False)
 
 
-def _restore(workdir, config, data_dir, settings, *, crop, time=None):
+def _restore(workdir, config, data_dir, settings, *, crop):
     """Returns what `restore_run` describes; crop: see `bake_occupancy`."""
     if config is None:
         config = load_config(workdir)
@@ -103,11 +99,7 @@ def _restore(workdir, config, data_dir, settings, *, crop, time=None):
         config = replaced(config, data=dataset.resolve(config.data)[0])
     config = _with_settings(config, settings)
     config, _ = auto_config.resolve_for_device(config, training=False)
-    at_rest = None
-    if time is not None:
-        check_moves(build.build_model(config), time)
-        at_rest = functools.partial(at_time, time=time)
-    experiment = build.render_parts(config, at_rest)
+    experiment = build.render_parts(config)
     read = functools.partial(_load_split, workdir, config, bool(data_dir), experiment.load_split)
     experiment = dataclasses.replace(experiment, load_split=read)
     checkpoints = Checkpoints(workdir)
@@ -136,8 +128,7 @@ def _restore(workdir, config, data_dir, settings, *, crop, time=None):
 
     def model_with(settings, wrap=None):
         other = _with_settings(config, settings)
-        both = wrap and at_rest and (lambda field: wrap(at_rest(field)))
-        model = build.build_model(other, both or wrap or at_rest)
+        model = build.build_model(other, wrap)
         return build.bake_model(other, model, lambda count: None)[0] if bake else model
 
     def cull(variables, rays, **options):
@@ -161,15 +152,8 @@ def _restore(workdir, config, data_dir, settings, *, crop, time=None):
         render_image,
         variables_of,
         model_with,
-        {name: getattr(options, name) for name in changing(options, Changes.IMAGES)}
-        | ({} if time is None else {"time": time}),
+        {name: getattr(options, name) for name in changing(options, Changes.IMAGES)},
     )
-
-
-def check_moves(model: Model, time: Any) -> None:
-    """Raises a ValueError if a time was given and a model's scene does not move."""
-    if "time" not in model.needs:
-        raise ValueError(f"time is {time}, and the scene of this run does not move, expected none; drop it")
 
 
 def _load_split(workdir, config, is_elsewhere, read, split, *, images=True, **options):
