@@ -29,6 +29,7 @@ def dataset_facts(views: Views, **known: Any) -> Facts:
         footprint=2 / float(np.max(views.size[:, 1])) if known["ndc"] else LookAt(views).footprint,
         footprint_spread=footprint_spread(views),
         mean_alpha=float(sample_pixels(views)[:, 3].mean()) if known["has_alpha"] else 1.0,
+        has_times=views.time is not None,
         **known,
     )
 

@@ -65,13 +65,14 @@ def required(entries: Mapping[str, Any], key: str, source: Any) -> Any:
 def read_times(frames: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[float | None]:
     """Returns the "time" of each frame of a JSON file, or None for all of them if none states one.
 
-    Times are fractions of the sequence in [0, 1], as in the format of D-NeRF (arXiv:2011.13961).
+    They are fractions of the sequence in [0, 1], as in the format of D-NeRF (arXiv:2011.13961), or other numbers, such
+    as those of a video's frames, which `read_capture` scales.
 
     Args:
         frames: (where, entries of the frame); where: for the message.
 
     Raises:
-        ValueError: if some frames state a time and others do not, or one is no number in [0, 1].
+        ValueError: if some frames state a time and others do not, or one is no number.
     """
     without = [where for where, frame in frames if "time" not in frame]
     if len(without) == len(frames):
@@ -79,10 +80,10 @@ def read_times(frames: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[float | 
     if without:
         raise ValueError(f"{without[0]}: has no time, other frames have; expected all or none; complete them")
     for where, frame in frames:
-        if not is_number(frame["time"]) or not 0 <= frame["time"] <= 1:
+        if not is_number(frame["time"]):
             raise ValueError(
-                f"{where}: time is {short_repr(frame['time'])}, expected a number in [0, 1], the fraction of the "
-                "sequence; divide all times by the last, or remove them if nothing moves"
+                f"{where}: time is {short_repr(frame['time'])}, expected a number; correct it, or remove all times if "
+                "nothing moves"
             )
     return [float(frame["time"]) for _, frame in frames]
 
