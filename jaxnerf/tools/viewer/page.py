@@ -24,7 +24,7 @@ RESOLUTIONS = ("100", "200", "400", "800", "1600")  # px of the longer side
 _AXES = {"+x": (1, 0, 0), "+y": (0, 1, 0), "+z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 _MAX_FRUSTUMS, _THUMBNAIL, _BESIDE = 120, 64, 400  # views, px, px
 _NARROW = 0.75  # width over height of a window, below which the controls are folded at first: a phone's
-_AHEAD = 0.02  # of the scene's size, from a camera to the point about which its view turns
+_AHEAD = 0.05  # of the scene's size, from a camera to the nearest point about which its view turns
 _MAX_WAITING = 32  # uses of controls that wait for their turn; later ones are dropped
 _PLAY_EVERY = 0.1  # s between times while time runs
 _STATUS_EVERY = 0.25  # s between changes of the status while the camera moves
@@ -46,7 +46,6 @@ class Page:
         self._target = gaze_center(self._poses)
         distance = np.median(np.linalg.norm(self._poses[:, :, 3] - self._target, axis=1))
         self._size = float(distance) if 0 < distance < np.inf else 1.0  # of the scene, world units
-        self._travels = travel(self._poses)
         self._keyframes, self._frustums, self._cells = [], None, None
         self._closed, self._playing = threading.Event(), threading.Event()
         self._delivery, self._reported, self._kind = None, 0.0, None
@@ -266,15 +265,9 @@ class Page:
         return [[float(f"{value:.6g}") for value in end] for end in ends]
 
     def _look_at(self, pose):
-        """Returns the point about which the mouse turns the view.
-
-        It is on the camera's axis, nearest to what all cameras look at, or just ahead where cameras travel: the view
-        then turns as a head does, and the keys W, A, S and D walk.
-        """
-        if self._travels:
-            return pose[:, 3] - pose[:, 2] * (_AHEAD * self._size)
-        along = float((pose[:, 3] - self._target) @ pose[:, 2])
-        return pose[:, 3] - pose[:, 2] * (along if along > 0.05 * self._size else self._size)
+        """Returns the point about which a view turns, nearest to what all look at; just ahead where cameras travel."""
+        along = _AHEAD * self._size if travel(self._poses) else float((pose[:, 3] - self._target) @ pose[:, 2])
+        return pose[:, 3] - pose[:, 2] * (along if along >= _AHEAD * self._size else self._size)
 
     def _go_to(self, pose, fov, up):
         camera = self._client.camera
