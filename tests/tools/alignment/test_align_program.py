@@ -13,8 +13,8 @@ from runs import SMOKE_FLAGS, as_flags, run_forked
 
 pytest_plugins = ["run_fixtures"]
 
-OPTIONS = {"data.format": "transforms", "cameras.refine": True, "cameras.refine_start_step": 0, "cameras.refine_lr": 1e-2}
-OPTIONS |= {"eval.split": "test", "cameras.exposure": True, "sampling.num_fine": 0, "train.lr_steps": 10}
+OPTIONS = {"data.format": "transforms", "eval.split": "test", "sampling.num_fine": 0, "train.lr_steps": 10}
+OPTIONS |= {"cameras.exposure": True, "cameras.refine": True, "cameras.refine_start_step": 0, "cameras.refine_lr": 1e-2}
 
 
 def ran(program, *flags):
