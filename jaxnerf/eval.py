@@ -53,6 +53,7 @@ def main(argv):
     from jaxnerf.evaluation import evaluate
     from jaxnerf.runtime import shards
     from jaxnerf.tools.alignment import align_views
+    from jaxnerf.tools.uncertainty import predict
 
     shard = shards.parse(_SHARD.value)
     _check_flags(is_sharded=shard != shards.WHOLE)
@@ -81,8 +82,8 @@ def main(argv):
         print(f"shard {_SHARD.value} is done; views of other shards are missing")
         return
     print(evaluate.summary(results))
-    if aligned := align_views.line(results):
-        print(aligned)
+    for line in filter(None, (align_views.line(results), predict.line(results))):
+        print(line)
 
 
 def _check_flags(is_sharded):

@@ -106,7 +106,11 @@ class Registry:
 FIELDS = Registry(
     "field",
     "jaxnerf.register_field",
-    {"mlp": "jaxnerf.fields.mlp:FIELD", "hash_grid": "jaxnerf.fields.hash_grid:FIELD"},
+    {
+        "mlp": "jaxnerf.fields.mlp:FIELD",
+        "hash_grid": "jaxnerf.fields.hash_grid:FIELD",
+        "moving": "jaxnerf.fields.moving:FIELD",
+    },
 )
 SAMPLERS = Registry(
     "sampler",

@@ -17,15 +17,15 @@ _RUN = run_flags.RunFlags(
 _PATH = flags.DEFINE_string(
     "path",
     None,
-    "turntable, arc, spiral, ellipse, interpolate, or FILE.json. When it is not given, the program selects the kind "
-    "that stays where the views' cameras are: a turntable only if they surround the object, otherwise an arc, or a "
-    "spiral if all look one way.",
+    "turntable, arc, spiral, ellipse, interpolate, still (the first view's camera), or FILE.json. When it is not "
+    "given, the program selects the kind that stays where the views' cameras are: a turntable only if they surround "
+    "the object, otherwise an arc, or a spiral if all look one way.",
 )
 _FRAMES = flags.DEFINE_integer(
     "frames",
     None,
-    "The number of frames. When it is not given, a turntable has 48, an arc 96, a spiral or ellipse 120, interpolate "
-    "6 for each view, but at most 240.",
+    "The number of frames. When it is not given, a turntable or a still camera has 48, an arc 96, a spiral or ellipse "
+    "120, interpolate 6 for each view, but at most 240.",
     lower_bound=1,
     upper_bound=100_000,
 )
@@ -51,6 +51,19 @@ _MAX_RAYS = flags.DEFINE_integer(
     lower_bound=1,
     upper_bound=4096,
 )
+_TIME = flags.DEFINE_string(
+    "time",
+    None,
+    "Of a scene that moves: one time from 0 to 1, or FIRST:LAST, between which it runs. When it is not given, those of "
+    "the path's file, or 0:1.",
+)
+_SECONDS = flags.DEFINE_float(
+    "seconds",
+    None,
+    "The duration of the video. Without --frames it has 24 frames per second.",
+    lower_bound=0.01,
+    upper_bound=1e5,
+)
 _FPS = flags.DEFINE_float(
     "fps", None, "Frames per second. When it is not given, those of the path, or 24.", lower_bound=0.1, upper_bound=1e3
 )
@@ -69,6 +82,19 @@ _SHARD = flags.DEFINE_string(
 )
 
 
+def _times(text):
+    """Returns the first and the last time of a flag; None without it."""
+    if text is None:
+        return None
+    try:
+        times = [float(part) for part in text.split(":")]
+    except ValueError:
+        times = []
+    if not (0 < len(times) <= 2 and all(0 <= time <= 1 for time in times)):
+        raise ValueError(f"--time is {text!r}, expected a number from 0 to 1, or two as FIRST:LAST; correct it")
+    return times[0], times[-1]
+
+
 def main(argv):
     del argv
     # Imported after the flags are parsed, so that a wrong flag is reported at once.
@@ -83,6 +109,8 @@ def main(argv):
         up=_UP.value,
         width=_WIDTH.value,
         height=_HEIGHT.value,
+        time=_times(_TIME.value),
+        seconds=_SECONDS.value,
         max_rays_per_pixel=_MAX_RAYS.value,
     )
     output = Output(

@@ -42,6 +42,7 @@ def main(argv):
         raise ValueError("--seconds, --compare and --config belong to --curve=DATASET; give it, or omit them")
     from jaxnerf.evaluation import run_report
     from jaxnerf.runtime.atomic_files import write_text
+    from jaxnerf.tools.curve import run_files
 
     csv, plot = (_new_file(flag) for flag in (_CSV, _PLOT))
     if plot is not None and plot.suffix.lower() not in _FORMATS:
@@ -49,14 +50,14 @@ def main(argv):
     if plot is not None and csv == plot:
         raise ValueError(f"--csv and --plot both name {plot}; correct one of them")
     if plot is not None:
-        run_report.require_matplotlib()
+        run_files.require_matplotlib()
     runs = run_report.read_runs(argv[1:])
     print(run_report.table(runs))
     if csv is not None:
-        write_text(csv, run_report.to_csv(runs))
+        write_text(csv, run_files.to_csv(runs))
         print(f"csv: {csv}")
     if plot is not None:
-        run_report.save_plot(runs, plot)
+        run_files.save_plot(runs, plot)
         print(f"plot: {plot}")
 
 

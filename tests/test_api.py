@@ -54,7 +54,7 @@ SURFACE = {
     "render_image": "render rays | chunk map",
     "create_grid": "lower upper valid | initial_density contracted=False",
     "update_grid": "key grid scene cells | threshold spacing=None decay=0.6 smoothing=0.2 spread=True chunk=8192 "
-    "radii=None",
+    "radii=None index=None",
     "grid_from_scene": "key scene lower upper shape | threshold contracted=False num_updates=4 chunk=8192",
     "mask_scene": "scene grid |",
     "render_packed": "scene grid rays samples | max_samples early_stop_eps=0.0 background=None median_depth=False",
@@ -71,7 +71,7 @@ SURFACE = {
     "hash_grid_field": "| **options",
     "still_life": "x viewdirs |",
     "load_scene": "workdir |",
-    "restore_run": "workdir config=None | data_dir=None settings=None",
+    "restore_run": "workdir config=None | data_dir=None settings=None time=None",
     "train_and_evaluate": "config workdir | views=None observe=None",
     "train_many": "configs workdirs |",
     "register_field": "name make | options=None",

@@ -28,6 +28,7 @@ RANKS = {
 # Packages of one rank do not import each other, apart from these.
 ALLOWED = {
     ("models", "fields"),
+    ("tools.capture_check", "tools.curve"),
     ("tools.capture_check", "tools.next_images"),
     ("tools.needs", "tools.curve"),
     ("tools.viewer", "tools.exporters"),
@@ -42,6 +43,7 @@ HANDS_OVER = {
     ("jaxnerf.eval", "tools.alignment"),
     ("jaxnerf.eval", "tools.predictions"),
     ("jaxnerf.eval", "tools.quality_search"),
+    ("jaxnerf.eval", "tools.uncertainty"),
     ("jaxnerf.report", "tools.curve"),
     ("jaxnerf.data.synthetic", "tools.embedded_scene"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),

@@ -16,6 +16,7 @@ MANY_PARAMETERS = {
     "core/occupancy/grid.py:grid_from_scene": CONTRACT,
     "data/ray_batches.py:draw_batch": CONTRACT,
     "evaluation/evaluate.py:score_run": "each is a flag of jaxnerf-eval",
+    "tools/exporters/base.py:export_run": "each is a flag of jaxnerf-export",
     "options.py:option": "each names a property of a declaration, and most declarations have two or three",
     "models/grid_schedule.py:make_grid_schedule": "its keywords are options of samplers, those of plug-ins, too",
     "models/occupancy.py:render_with_grid": "it adds the grid's steps to what render_packed takes",

@@ -1,6 +1,6 @@
-"""Writes a capture of the embedded room: images with lens, a hand-held path, far novel views, and the ground truth.
+"""Writes a capture of the embedded room or house: images with lens, a hand-held path, far views, ground truth.
 
-    python experiments/room/make_room.py --out=DIR [--nolens] [--exposure=0.25] [--white_balance=0.08]
+    python experiments/room/make_room.py --out=DIR [--place=house] [--nolens] [--exposure=0.25] [--white_balance=0.08]
         [--pose_noise=0.3] [--width=200] [--height=150] [--views=70] [--points=4000] [--image_format=png] [--seed=0]
 
 Then `jaxnerf-train --config=capture --data_dir=DIR --workdir=W`, and score_room.py with the same folders.
@@ -17,6 +17,7 @@ from jaxnerf.runtime import cli
 from test_scenes import synthetic_capture
 
 _OUT = flags.DEFINE_string("out", None, "Folder of the capture, missing or empty.", required=True)
+_PLACE = flags.DEFINE_enum("place", "room", list(synthetic_capture.PLACES), "The room, or a walk through the house.")
 _LENS = flags.DEFINE_bool("lens", True, "Whether the lens distorts as a phone's.")
 _EXPOSURE = flags.DEFINE_float("exposure", 0.0, "Standard deviation of the exposure, stops.", lower_bound=0.0)
 _WHITE_BALANCE = flags.DEFINE_float(
@@ -51,6 +52,7 @@ def main(argv: list[str]) -> None:
         num_points=_POINTS.value,
         image_format=_FORMAT.value,
         seed=_SEED.value,
+        place=_PLACE.value,
     )
     found = f"{len(truth.names)} views, {len(truth.points)} points, {time.perf_counter() - started:.0f} s"
     print(f"wrote {_OUT.value}: {found}")

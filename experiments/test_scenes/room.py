@@ -39,33 +39,54 @@ class Hits(NamedTuple):
     normal: Float[np.ndarray, "*batch 3"]
 
 
-def render(origins: _Values, directions: _Values) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch"]]:
+class Place(NamedTuple):
+    """A box of walls with bodies in it.
+
+    Attributes:
+        lower, upper: [3] world units, the inner corners of the walls.
+        bodies: function of no arguments that returns all bodies.
+        walls: {sign of the inward normal * (axis + 1): function (x, y, z) -> (channels, emission)}.
+        lamps: x [N, 3] -> [N, 3] or [3], where the light comes from at each place.
+    """
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    bodies: Callable[[], tuple]
+    walls: dict[int, Callable]
+    lamps: Callable[[np.ndarray], np.ndarray]
+
+
+def render(
+    origins: _Values, directions: _Values, place: Place | None = None
+) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch"]]:
     """Computes the colour and the depth of the first surface along rays that begin in free space.
 
     Args:
         origins: [..., 3] world units.
         directions: [..., 3] world units per t, of any length > 0.
+        place: None: the room.
 
     Returns:
         rgb [..., 3] in [0, 1]; and depth [...] in t.
     """
-    hits = trace(origins, directions)
+    hits = trace(origins, directions, place)
     directions = np.asarray(directions, np.float64)
     x = np.asarray(origins, np.float64) + hits.t[..., None] * directions
-    return surface_colors(x, _unit(directions), hits), hits.t
+    return surface_colors(x, _unit(directions), hits, place), hits.t
 
 
-def trace(origins: _Values, directions: _Values) -> Hits:
+def trace(origins: _Values, directions: _Values, place: Place | None = None) -> Hits:
     """Computes the first surface along rays; origins must be in free space, see `is_matter`."""
+    place = place or _ROOM
     shape = np.shape(origins)
     o, d = (np.asarray(values, np.float64).reshape(-1, 3) for values in (origins, directions))
     with np.errstate(divide="ignore", invalid="ignore"):
-        exits = np.where(d == 0, np.inf, (np.where(d > 0, UPPER, LOWER) - o) / d)
+        exits = np.where(d == 0, np.inf, (np.where(d > 0, place.upper, place.lower) - o) / d)
     axis, rows = exits.argmin(axis=-1), np.arange(len(o))
     t, body, normal = exits[rows, axis], np.full(len(o), -1), np.zeros_like(o)
     normal[rows, axis] = -np.sign(d[rows, axis])
     square = (d * d).sum(axis=-1)
-    for index, each in enumerate(_bodies()):
+    for index, each in enumerate(place.bodies()):
         offset = each.center - o
         along = (offset * d).sum(axis=-1)
         # Only rays that come near the body's centre can hit it.
@@ -82,36 +103,40 @@ def trace(origins: _Values, directions: _Values) -> Hits:
     return Hits(t.reshape(shape[:-1]), body.reshape(shape[:-1]), normal.reshape(shape))
 
 
-def surface_colors(x: _Values, viewdirs: _Values, hits: Hits) -> Float[np.ndarray, "*batch 3"]:
+def surface_colors(
+    x: _Values, viewdirs: _Values, hits: Hits, place: Place | None = None
+) -> Float[np.ndarray, "*batch 3"]:
     """Computes the colours of surfaces.
 
     Args:
         x: [..., 3] world units, on the surfaces of `hits`.
         viewdirs: [..., 3] unit length, from the camera to x.
         hits: Hits [...], of which t is not used.
+        place: None: the room.
 
     Returns:
         [..., 3] in [0, 1].
     """
+    place = place or _ROOM
     shape = np.shape(x)
     x, viewdirs, normal = (np.asarray(v, np.float64).reshape(-1, 3) for v in (x, viewdirs, hits.normal))
     albedo, emission, gloss = np.zeros_like(x), np.zeros(len(x)), np.zeros(len(x))
     for index in np.unique(hits.body):
         chosen = np.flatnonzero(hits.body.reshape(-1) == index)
         if index < 0:
-            channels, emission[chosen] = _wall_material(x[chosen], normal[chosen])
+            channels, emission[chosen] = _wall_material(place.walls, x[chosen], normal[chosen])
         else:
-            each = _bodies()[index]
+            each = place.bodies()[index]
             channels, emission[chosen] = each.material((x[chosen] - each.center) @ each.rotation)
             gloss[chosen] = each.gloss
         for axis, channel in enumerate(channels):
             albedo[chosen, axis] = channel
-    to_lamp = np.asarray(_LAMP) - x
+    to_lamp = place.lamps(x) - x
     towards = _unit(to_lamp)
     facing = (normal * towards).sum(axis=-1)
     lit = facing > 0
     # A hit is exact to about 1e-15, so an offset of 1e-9 prevents that a surface shadows itself.
-    lit[lit] = trace(x[lit] + 1e-9 * normal[lit], to_lamp[lit]).t >= 1
+    lit[lit] = trace(x[lit] + 1e-9 * normal[lit], to_lamp[lit], place).t >= 1
     diffuse = np.where(lit, facing, 0.25 * facing * (facing < 0))  # a hint of the shape on the dark side
     light = np.clip(_AMBIENT + (1 - _AMBIENT) * diffuse, 0, 1)
     mirrored = viewdirs - 2 * (viewdirs * normal).sum(axis=-1, keepdims=True) * normal
@@ -120,11 +145,12 @@ def surface_colors(x: _Values, viewdirs: _Values, hits: Hits) -> Float[np.ndarra
     return np.clip(rgb + highlight[:, None] * (1 - rgb), 0, 1).reshape(shape)
 
 
-def is_matter(x: _Values) -> Bool[np.ndarray, "*batch"]:
+def is_matter(x: _Values, place: Place | None = None) -> Bool[np.ndarray, "*batch"]:
     """Returns whether positions [..., 3] are inside a body, or beyond the walls."""
+    place = place or _ROOM
     x = np.asarray(x, np.float64)
-    inside = ((x < LOWER) | (x > UPPER)).any(axis=-1)
-    for each in _bodies():
+    inside = ((x < place.lower) | (x > place.upper)).any(axis=-1)
+    for each in place.bodies():
         local = np.abs((x - each.center) @ each.rotation) / each.half
         inside |= _size(each.shape, local) < 1
     return np.asarray(inside)
@@ -372,13 +398,13 @@ def _shade(p):
     return _mix((0.95, 0.80, 0.50), (0.85, 0.62, 0.34), ribs), 0.8
 
 
-def _wall_material(x, normal):
+def _wall_material(walls, x, normal):
     channels, emission = np.zeros((3, len(x))), np.zeros(len(x))
     for axis in range(3):
         for sign in (-1, 1):
             chosen = np.flatnonzero(sign * normal[:, axis] > 0.5)  # normals point inwards
             if len(chosen):
-                color, emission[chosen] = _WALLS[sign * (axis + 1)](*x[chosen].T)
+                color, emission[chosen] = walls[sign * (axis + 1)](*x[chosen].T)
                 for channel, value in zip(channels, color, strict=True):
                     channel[chosen] = value
     return channels, emission
@@ -454,6 +480,7 @@ def _window(x, y, z):
 
 # {sign of the inward normal * (axis + 1): material}
 _WALLS = {1: _wallpaper, -1: _plaster, 2: _bricks, -2: _window, 3: _floor, -3: _ceiling}
+_ROOM = Place(LOWER, UPPER, _bodies, _WALLS, lambda x: np.asarray(_LAMP))
 
 
 def _painting(color, u, v, middle, half, seed):

@@ -1,6 +1,7 @@
-"""Captures of the embedded room as a phone makes them, written as a dataset with its ground truth beside it.
+"""Captures of the embedded room or house as a phone makes them, written as a dataset with its ground truth beside it.
 
-A camera is carried around the table and looks roughly at it. Further views, which no training view is close to, measure
+In the room a camera is carried around the table and looks roughly at it; through the house it is carried along a path
+and looks around. Further views, which no training view is close to, measure
 the reconstruction of free space and depth. ground_truth.npz holds what is unknown for a real capture: poses, exposures,
 the depth of every pixel, and how many training views see its surface.
 """
@@ -9,6 +10,7 @@ import json
 import math
 import os
 import pathlib
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -20,7 +22,7 @@ from jaxnerf.core.cameras import pixel_grid, undistort
 from jaxnerf.core.types import Camera
 from jaxnerf.runtime.atomic_files import open_regular, partial_file, write_text
 from jaxnerf.tools.exporters.points import write_ply
-from test_scenes import room
+from test_scenes import house, room
 
 PHONE_LENS = (-0.08, 0.03, 0.001, -0.0008)  # k1, k2, p1, p2
 GROUND_TRUTH = "ground_truth.npz"
@@ -99,8 +101,9 @@ def write_capture(
     repetition: float = 0.0,
     image_format: str = "png",
     seed: int = 0,
+    place: str = "room",
 ) -> GroundTruth:
-    """Writes a capture of the embedded room in nerfstudio's format: transforms.json, images/, and GROUND_TRUTH.
+    """Writes a capture of the room or house in nerfstudio's format: transforms.json, images/, and GROUND_TRUTH.
 
     Each pixel is a single ray through its center, as the pixels of a trained model are. Cameras depend on the
     seed and the numbers of views alone, so captures that differ in exposure, noise or lens show the same views.
@@ -123,6 +126,7 @@ def write_capture(
             colours. Matches between such images are ambiguous.
         image_format: "png", or "jpg" with quality 95.
         seed: of everything random.
+        place: of PLACES.
 
     Returns:
         GroundTruth, as `read_ground_truth` reads it.
@@ -133,12 +137,12 @@ def write_capture(
     """
     folder = pathlib.Path(folder)
     _check(folder, (num_views, num_held_out, num_far), width, height, image_format)
-    lens = _Lens.make(width, height, distortion)
-    path = _path_poses(num_views, num_held_out, seed)
-    rgb, depth = _render_all(lens, path)
+    lens, tour = _Lens.make(width, height, distortion), PLACES[place]
+    path = _path_poses(tour, num_views, num_held_out, seed)
+    rgb, depth = _render_all(tour.place, lens, path)
     train = path[:num_views], depth[:num_views]
-    far = _far_poses(num_far, lens, *train, seed)
-    far_rgb, far_depth = _render_all(lens, far)
+    far = _far_poses(tour, num_far, lens, *train, seed)
+    far_rgb, far_depth = _render_all(tour.place, lens, far)
     poses, rgb, depth = (np.concatenate(pair) for pair in ((path, far), (rgb, far_rgb), (depth, far_depth)))
     if repetition:
         surfaces = (_surface(lens, *view) for view in zip(poses, depth, strict=True))
@@ -218,12 +222,12 @@ class _Lens(NamedTuple):
         return cls(width, height, focal, center, distortion, np.stack([x, -y, -np.ones_like(x)], axis=-1))
 
 
-def _render_all(lens, poses):
+def _render_all(place, lens, poses):
     """Returns the colours [V, H, W, 3] and depths [V, H, W] of views."""
     images = []
     for pose in poses:
         directions = lens.slopes @ pose[:, :3].T
-        images.append(room.render(np.broadcast_to(pose[:, 3], directions.shape), directions))
+        images.append(room.render(np.broadcast_to(pose[:, 3], directions.shape), directions, place))
     rgb, depth = zip(*images, strict=True) if images else ((), ())
     form = (len(poses), lens.height, lens.width)
     return np.reshape(rgb, (*form, 3)), np.reshape(depth, form)
@@ -261,7 +265,55 @@ def _seen_by(x, lens, poses, depths):
     return seen
 
 
-def _path_poses(num_views, num_held_out, seed):
+class _Tour(NamedTuple):
+    """How a camera is carried through a place.
+
+    Attributes:
+        place: None: the room.
+        path: (progress in [0, 1], [5] values of smooth random functions) -> eye [3], target [3].
+        far: (random numbers, fraction of the views) -> eye [3], target [3] of a view apart from the path.
+    """
+
+    place: room.Place | None
+    path: Callable[..., tuple[np.ndarray, np.ndarray]]
+    far: Callable[..., tuple[np.ndarray, np.ndarray]]
+
+
+def _around_table(progress, waves):
+    distance, height, *aim = waves
+    eye = _around(math.radians(_ARC * (2 * progress - 1)), 1.85 + 0.18 * distance, 1.45 + 0.22 * height)
+    return eye, 0.12 * np.array(aim) + [0, 0, room.TABLE_TOP + 0.05]
+
+
+def _far_from_table(rng, fraction):
+    eye = _around(math.radians(_FAR_ARC * (2 * fraction - 1)), rng.uniform(0.9, 3.0), rng.uniform(0.6, 2.7))
+    return eye, np.array([0, 0, room.TABLE_TOP])
+
+
+def _through_house(progress, waves):
+    """Returns a place on the path at eye height, and one straight ahead of it, or up to 130 degrees to its sides."""
+    _, height, turn, pitch, _ = waves
+    before, at, after = house.along_path(np.clip([progress - 0.005, progress, progress + 0.005], 0, 1))
+    yaw = math.atan2(*(after - before)[::-1]) + math.radians(130) * math.sin(60 * progress + turn)
+    ahead = [math.cos(yaw), math.sin(yaw), 0.2 * pitch - 0.15]
+    eye = np.array([*at, house.FLOOR + 1.5 + 0.1 * height])
+    return eye, eye + ahead
+
+
+def _beside_path(rng, fraction):
+    at, height = house.along_path(np.array([fraction]))[0], house.FLOOR + rng.uniform(0.9, 2.0)
+    eye = np.array([*(at + rng.uniform(-1.2, 1.2, 2)), height])
+    yaw = rng.uniform(-math.pi, math.pi)
+    return eye, eye + 3 * np.array([math.cos(yaw), math.sin(yaw), rng.uniform(-0.4, 0.1)])
+
+
+PLACES = {
+    "room": _Tour(None, _around_table, _far_from_table),
+    "house": _Tour(house.HOUSE, _through_house, _beside_path),
+}
+
+
+def _path_poses(tour, num_views, num_held_out, seed):
     """Returns the poses of the training views along a hand-held path, and of views between them."""
     rng = np.random.default_rng([seed, 0])
     waves = [_wave(rng) for _ in range(6)]
@@ -270,37 +322,38 @@ def _path_poses(num_views, num_held_out, seed):
     between = (np.floor(between * (num_views - 1)) + 0.5) / (num_views - 1)
     poses = []
     for progress, shake in ((np.linspace(0, 1, num_views), 0.02), (between, 0.05)):
-        distance, height, *aim, roll = (wave(progress) for wave in waves)
-        for k, along in enumerate(progress):
-            azimuth, target = math.radians(_ARC * (2 * along - 1)), 0.12 * np.array([part[k] for part in aim])
+        *along, roll = (wave(progress) for wave in waves)
+        for k, at in enumerate(progress):
+            eye, target = tour.path(at, [part[k] for part in along])
 
-            def draw(azimuth=azimuth, k=k, distance=distance, height=height, shake=shake):
-                eye = _around(azimuth, 1.85 + 0.18 * distance[k], 1.45 + 0.22 * height[k])
+            def draw(eye=eye, shake=shake):
                 return eye + shake * rng.normal(size=3)
 
-            target += [0, 0, room.TABLE_TOP + 0.05] + 0.03 * rng.normal(size=3)
-            poses.append(_look_at(_in_free_space(draw), target, math.radians(2.5 * roll[k] + rng.normal())))
+            target = target + 0.03 * rng.normal(size=3)
+            eye = _in_free_space(tour.place, draw)
+            poses.append(_look_at(eye, target, math.radians(2.5 * roll[k] + rng.normal())))
     return np.array(poses)
 
 
-def _far_poses(count, lens, poses, depths, seed):
+def _far_poses(tour, count, lens, poses, depths, seed):
     """Returns the poses of views that are apart from the training views and mostly show what those see."""
     rng, chosen = np.random.default_rng([seed, 1]), []
     coarse = lens._replace(slopes=lens.slopes[:: max(lens.height // 12, 1), :: max(lens.width // 16, 1)])
     for index in range(count):
+        aim = {}
 
-        def draw(index=index):
-            azimuth = math.radians(_FAR_ARC * (2 * (index + rng.uniform()) / count - 1))
-            return _around(azimuth, rng.uniform(0.9, 3.0), rng.uniform(0.6, 2.7))
+        def draw(index=index, aim=aim):
+            eye, aim["target"] = tour.far(rng, (index + rng.uniform()) / count)
+            return eye
 
         for _ in range(300):
-            eye = _in_free_space(draw)
-            target = [0, 0, room.TABLE_TOP] + 0.2 * rng.normal(size=3)
+            eye = _in_free_space(tour.place, draw)
+            target = aim["target"] + 0.2 * rng.normal(size=3)
             pose = _look_at(eye, target, math.radians(3 * rng.normal()))
             if np.linalg.norm(poses[:, :, 3] - eye, axis=-1).min() < _APART:
                 continue
             directions = coarse.slopes @ pose[:, :3].T
-            depth = room.trace(np.broadcast_to(pose[:, 3], directions.shape), directions).t
+            depth = room.trace(np.broadcast_to(pose[:, 3], directions.shape), directions, tour.place).t
             if depth.min() < _NEAREST:
                 continue
             seen = _seen_by(_surface(coarse, pose, depth), lens, poses, depths).sum(axis=0)
@@ -314,13 +367,13 @@ def _far_poses(count, lens, poses, depths, seed):
     return np.reshape(chosen, (count, 3, 4))
 
 
-def _in_free_space(draw):
+def _in_free_space(place, draw):
     """Returns the first position that draw() returns with free space around it."""
     ball = np.random.default_rng(0).normal(size=(64, 3))
     ball *= _CLEARANCE / np.linalg.norm(ball, axis=-1, keepdims=True)
     for _ in range(1000):
         eye = draw()
-        if not room.is_matter(np.concatenate([eye + ball, eye + ball / 2, [eye]])).any():
+        if not room.is_matter(np.concatenate([eye + ball, eye + ball / 2, [eye]]), place).any():
             return eye
     raise ValueError("found no position in free space; expected another seed")
 

@@ -273,6 +273,11 @@ def is_known(condition: object) -> bool:
     return not isinstance(condition, jax.core.Tracer) and bool(condition)
 
 
+def has_nan(rays: Rays) -> Bool[Array, "*batch"]:
+    """Returns whether the origin, the direction, near or far of each ray is NaN."""
+    return jnp.isnan(rays.origins.sum(axis=-1) + rays.directions.sum(axis=-1) + rays.near + rays.far)
+
+
 def check_order(function: str, **bounds: Num[Array, "..."]) -> None:
     """Raises a ValueError if the first of two arrays of bounds, by name, is known to be above the second somewhere."""
     (low, lows), (high, highs) = bounds.items()

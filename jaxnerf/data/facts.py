@@ -9,40 +9,28 @@ from jaxtyping import Float
 from jaxnerf.core.views import Views
 from jaxnerf.data.geometry import poses
 from jaxnerf.data.observations import num_shared
-from jaxnerf.options import Box, Facts
+from jaxnerf.options import Facts
 
 _OUTLIERS = 0.05  # fraction of views whose footprints may be larger than all others, or smaller
 _MEAN_RUNS, _MEAN_RUN = 2**10, 2**10  # of pixels, of whose colours the mean is taken
 
 
-def dataset_facts(
-    views: Views, box: Box, *, ndc: bool, contracted: bool, has_alpha: bool, skips_empty_cells: bool, **others: Any
-) -> Facts:
+def dataset_facts(views: Views, **known: Any) -> Facts:
     """Returns the facts about a dataset.
 
     Args:
         views: of the split "train".
-        box: of the scene.
-        ndc: whether rays are in normalised device coordinates.
-        contracted: whether the box holds all of space.
-        has_alpha: whether alpha bounds the scene.
-        skips_empty_cells: whether the run's sampler does.
-        **others: further attributes of the Facts.
+        **known: the other attributes of the Facts; ndc, contracted, has_alpha and skips_empty_cells are needed.
     """
     return Facts(
         num_views=len(views.size),
-        num_observations=num_shared(views) if contracted and skips_empty_cells else 0,
+        num_observations=num_shared(views) if known["contracted"] and known["skips_empty_cells"] else 0,
         side=float(np.sqrt(np.prod(views.size, axis=1)).mean()),
-        footprint=2 / float(np.max(views.size[:, 1])) if ndc else LookAt(views).footprint,
+        footprint=2 / float(np.max(views.size[:, 1])) if known["ndc"] else LookAt(views).footprint,
         footprint_spread=footprint_spread(views),
-        has_alpha=has_alpha,
-        mean_alpha=float(sample_pixels(views)[:, 3].mean()) if has_alpha else 1.0,
-        ndc=ndc,
-        lower=box[0],
-        upper=box[1],
-        contracted=contracted,
-        skips_empty_cells=skips_empty_cells,
-        **others,
+        mean_alpha=float(sample_pixels(views)[:, 3].mean()) if known["has_alpha"] else 1.0,
+        has_times=views.time is not None,
+        **known,
     )
 
 

@@ -7,18 +7,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
-from jaxnerf.data.geometry.world import poses_of
-from jaxnerf.data.images.image_files import read_image
 from jaxnerf.data.images.load_images import scored_splits, split_indices
 from jaxnerf.data.readers.base import Capture
 
 _SAMPLES, _SAMPLE = 3, 4096  # bytes of files of one size that are compared before the whole files are
-_SAME_POSE = 1e-5  # of the cameras' spread, and of an axis: files may have five digits
-_MAX_DECODED = 64  # test images that are compared with a training image of the same pose
-_THUMBNAIL = 16  # px
-_MEAN, _LARGEST = 0.005, 0.03  # differences of grey thumbnails, in [0, 1], that compression explains
 
 
 class SharedView(NamedTuple):
@@ -27,7 +20,7 @@ class SharedView(NamedTuple):
     Attributes:
         name: of the test view.
         training_name: of the training view.
-        reason: "the same file", "the same bytes" or "the same pose and image".
+        reason: "the same file" or "the same bytes".
     """
 
     name: str
@@ -38,8 +31,8 @@ class SharedView(NamedTuple):
 def shared_views(capture: Capture, split: str, train: Sequence[int] | np.ndarray | None = None) -> list[SharedView]:
     """Returns the views of a split that are training views, too.
 
-    Paths are compared first, then bytes of files of one size, then images of one pose; most datasets end after the
-    first two without reading a file.
+    Only files are compared: `jaxnerf-capture-check` finds equal images of different files, too. Most datasets end
+    without a file being read, since no two have one size.
 
     Args:
         capture: any.
@@ -51,8 +44,7 @@ def shared_views(capture: Capture, split: str, train: Sequence[int] | np.ndarray
     """
     train = split_indices(capture, "train") if train is None else train
     rest, found = list(split_indices(capture, split)), {}
-    searches = {"the same file": _same_file, "the same bytes": _same_bytes, "the same pose and image": _same_pose}
-    for reason, search in searches.items():
+    for reason, search in {"the same file": _same_file, "the same bytes": _same_bytes}.items():
         pairs = search(capture, rest, train)
         found |= {index: (other, reason) for index, other in pairs.items()}
         rest = [index for index in rest if index not in found]
@@ -128,36 +120,3 @@ def _sample(path, size):
             file.seek(place)
             parts.append(file.read(_SAMPLE))
     return b"".join(parts)
-
-
-def _same_pose(capture, rest, train):
-    poses, frames = poses_of(capture), capture.frames
-    spread = np.linalg.norm(np.ptp(poses[:, :, 3], axis=0)) or 1.0
-    poses = np.concatenate([poses[:, :, :3].reshape(-1, 9), (poses[:, :, 3] - poses[0, :, 3]) / spread], axis=1)
-    pairs, decoded = {}, 0
-    for index in rest:
-        near = np.flatnonzero(np.abs(poses[train] - poses[index]).max(axis=1) < _SAME_POSE)
-        others = [train[place] for place in near if frames[train[place]].time == frames[index].time]
-        if others and decoded < _MAX_DECODED:
-            decoded += 1
-            if _same_image(frames[index].image, frames[others[0]].image):
-                pairs[index] = others[0]
-    return pairs
-
-
-def _same_image(*paths):
-    """Returns whether two image files show the same, perhaps at another size or quality; False if one is unreadable."""
-    try:
-        first, second = (_thumbnail(path) for path in paths)
-    except ValueError:
-        return False
-    off = np.abs(first - second)
-    return bool(off.mean() < _MEAN and off.max() < _LARGEST)
-
-
-def _thumbnail(path):
-    pixels = read_image(path, follow_exif=False)
-    values = np.float32(pixels) / np.iinfo(pixels.dtype).max
-    color = values[..., :3] * values[..., 3:] + 1 - values[..., 3:] if values.shape[-1] == 4 else values
-    grey = Image.fromarray(color @ np.float32([0.299, 0.587, 0.114]))  # compression changes colours more
-    return np.asarray(grey.resize((_THUMBNAIL, _THUMBNAIL), Image.BOX))

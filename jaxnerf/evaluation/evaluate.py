@@ -252,15 +252,7 @@ def summary(results: dict[str, Any]) -> str:
     if any(exact):
         note += f"; note: {sum(exact)} images equal their references in 8 bits, so their PSNR and its mean are infinite"
     paired = "" if results.get("paired_by", "name") == "name" else f", paired by {results['paired_by']}"
-    found = results.get("uncertainty", {})
-    errors = f"; AUSE {found['ause_rmse']:.3f} (RMSE), {found['ause_mae']:.3f} (MAE)" if found else ""
-    if "ause_rmse_object" in found:
-        errors += f", on the object {found['ause_rmse_object']:.3f}, {found['ause_mae_object']:.3f}"
-    if "coverage" in found:
-        errors += (
-            f", {100 * found['coverage']:.1f} % of errors within intervals for {100 * found['target_coverage']:g} %"
-        )
-    return f"{step}{metrics} over {results['views']} views{speed}{errors}{paired}{note}"
+    return f"{step}{metrics} over {results['views']} views{speed}{paired}{note}"
 
 
 def _score_views(run, render, views, sides, folder, shard, tools):

@@ -1,4 +1,4 @@
-"""The metrics of an image against the image of a dataset, in strips where the whole does not fit into memory."""
+"""The metrics of an image against the image of a dataset, in strips of rows, so that large images fit into memory."""
 
 import functools
 
@@ -9,10 +9,10 @@ from jax.typing import ArrayLike
 
 from jaxnerf.core.metrics import align_colors, decibels, mse, round_to_8_bits, ssim
 from jaxnerf.core.views import Views
-from jaxnerf.runtime import memory
 
 _MIN_LPIPS_SIDE = 32  # px; the network halves the image four times
 _SSIM_MARGIN = 10  # rows that a window of SSIM covers below its first
+_STRIP = 2**20  # px
 
 
 def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> dict[str, float]:
@@ -28,22 +28,10 @@ def image_metrics(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = N
             other pixels.
     """
     image, truth = jnp.asarray(image), jnp.asarray(truth)
-    height, width = image.shape[:2]
     aligned = jax.jit(align_colors)(image, truth, mask=mask)
-
-    def attempt(rows):
-        def measure(image):
-            if rows == height:
-                _check_memory(height, width, mask is None)
-                return _whole(image, truth, mask)
-            return _in_strips(image, truth, mask, rows)
-
-        found, with_alignment = measure(image), measure(aligned)
-        return {**found, **{f"{name}_aligned": with_alignment[name] for name in ("psnr", "ssim")}}
-
-    unit = f"rows of an image of {width} x {height} at once"
-    found, _ = memory.back_off(attempt, height, cause="metrics", unit=unit)
-    if (lpips := _lpips()[0]) and min(height, width) >= _MIN_LPIPS_SIDE:
+    found, with_alignment = (_in_strips(each, truth, mask) for each in (image, aligned))
+    found |= {f"{name}_aligned": with_alignment[name] for name in ("psnr", "ssim")}
+    if (lpips := _lpips()[0]) and min(image.shape[:2]) >= _MIN_LPIPS_SIDE:
         kept = image if mask is None else jnp.where(jnp.asarray(mask)[..., None], image, truth)
         found["lpips"] = lpips(kept, truth)
     return {key: float(value) for key, value in found.items()}
@@ -79,19 +67,6 @@ def pixel_mask(views: Views, index: int) -> jax.Array | None:
     return jnp.asarray(views.mask[first : first + height * width]).reshape(height, width)
 
 
-@functools.cache
-def _check_memory(height, width, unmasked):
-    pixels = jax.ShapeDtypeStruct((height, width, 3), jnp.float32)
-    mask = None if unmasked else jax.ShapeDtypeStruct((height, width), bool)
-    memory.check(_whole.lower(pixels, pixels, mask).compile())
-
-
-@jax.jit
-def _whole(image, truth, mask):
-    errors = _mean_square_errors(image, truth, mask)
-    return {name: decibels(error) for name, error in errors.items()} | {"ssim": _similarity(image, truth, mask)}
-
-
 def _roundings(image, truth, mask):
     if mask is not None:
         image = jnp.where(mask[..., None], image, truth)
@@ -99,9 +74,9 @@ def _roundings(image, truth, mask):
     return round_to_8_bits(image), round_to_8_bits(truth), image, truncated
 
 
-def _in_strips(image, truth, mask, rows):
-    """Computes the metrics of `_whole` from strips of so many rows."""
-    errors, similarities = [], []
+def _in_strips(image, truth, mask):
+    """Computes the metrics from strips of rows, of which a program needs 400 bytes a pixel."""
+    errors, similarities, rows = [], [], max(_STRIP // image.shape[1], _SSIM_MARGIN)
     for start in range(0, image.shape[0], rows):
         inner, wide = (
             [None if values is None else values[start:end] for values in (image, truth, mask)]
@@ -110,8 +85,9 @@ def _in_strips(image, truth, mask, rows):
         count = inner[0].size if mask is None else int(inner[2].sum())
         if count:
             errors.append((count, _mean_square_errors(*inner)))
-        if len(wide[0]) > _SSIM_MARGIN:
+        if len(wide[0]) > _SSIM_MARGIN or not start:
             similarities.append((len(wide[0]) - _SSIM_MARGIN, _similarity(*wide)))
+    errors = errors or [(1, _mean_square_errors(*inner))]  # NaN, as the mask is empty
     means = {
         name: np.average([float(part[name]) for _, part in errors], weights=[count for count, _ in errors])
         for name in errors[0][1]

@@ -13,6 +13,7 @@ from jaxnerf.core.views import Views
 from jaxnerf.data import dataset
 from jaxnerf.data.ray_batches import random_rays
 from jaxnerf.evaluation.image_renderer import image_renderer
+from jaxnerf.fields.base import at_time
 from jaxnerf.models.base import Model
 from jaxnerf.options import AUTO, Changes, changing, is_auto, replaced
 from jaxnerf.registry import needs_folder
@@ -60,6 +61,7 @@ def restore_run(
     *,
     data_dir: str | None = None,
     settings: dict[str, Any] | None = None,
+    time: float | None = None,
 ) -> TrainedRun:
     """Restores the run in a workdir. Checkpoints are read when `variables` is called.
 
@@ -68,14 +70,16 @@ def restore_run(
         config: in place of the workdir's own; its "auto" fields have the values of the workdir's.
         data_dir: the dataset's folder in place of the config's.
         settings: fields of the config's section `eval` to replace, by name.
+        time: in [0, 1], at which a scene that moves is shown, whatever the time of rays; None: at theirs.
 
     Returns:
         TrainedRun.
 
     Raises:
-        ValueError: if there is no run, or no dataset in data_dir; names the folder.
+        ValueError: if there is no run, or no dataset in data_dir, names the folder; if there is a time and the scene
+            does not move.
     """
-    return _restore(workdir, config, data_dir, settings or {}, crop=True)
+    return _restore(workdir, config, data_dir, settings or {}, crop=True, time=time)
 
 
 def restore_with_grid(
@@ -88,7 +92,7 @@ def restore_with_grid(
     return _restore(workdir, None, data_dir, {**(settings or {}), "bake_occupancy": True}, crop=False)
 
 
-def _restore(workdir, config, data_dir, settings, *, crop):
+def _restore(workdir, config, data_dir, settings, *, crop, time=None):
     """Returns what `restore_run` describes; crop: see `bake_occupancy`."""
     if config is None:
         config = load_config(workdir)
@@ -99,7 +103,11 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         config = replaced(config, data=dataset.resolve(config.data)[0])
     config = _with_settings(config, settings)
     config, _ = auto_config.resolve_for_device(config, training=False)
-    experiment = build.render_parts(config)
+    at_rest = None
+    if time is not None:
+        check_moves(build.build_model(config), time)
+        at_rest = functools.partial(at_time, time=time)
+    experiment = build.render_parts(config, at_rest)
     read = functools.partial(_load_split, workdir, config, bool(data_dir), experiment.load_split)
     experiment = dataclasses.replace(experiment, load_split=read)
     checkpoints = Checkpoints(workdir)
@@ -128,7 +136,8 @@ def _restore(workdir, config, data_dir, settings, *, crop):
 
     def model_with(settings, wrap=None):
         other = _with_settings(config, settings)
-        model = build.build_model(other, wrap)
+        both = wrap and at_rest and (lambda field: wrap(at_rest(field)))
+        model = build.build_model(other, both or wrap or at_rest)
         return build.bake_model(other, model, lambda count: None)[0] if bake else model
 
     def cull(variables, rays, **options):
@@ -152,8 +161,15 @@ def _restore(workdir, config, data_dir, settings, *, crop):
         render_image,
         variables_of,
         model_with,
-        {name: getattr(options, name) for name in changing(options, Changes.IMAGES)},
+        {name: getattr(options, name) for name in changing(options, Changes.IMAGES)}
+        | ({} if time is None else {"time": time}),
     )
+
+
+def check_moves(model: Model, time: Any) -> None:
+    """Raises a ValueError if a time was given and a model's scene does not move."""
+    if "time" not in model.needs:
+        raise ValueError(f"time is {time}, and the scene of this run does not move, expected none; drop it")
 
 
 def _load_split(workdir, config, is_elsewhere, read, split, *, images=True, **options):

@@ -1,7 +1,5 @@
 """Several runs side by side: what each has reached after how long, and which options differ between them."""
 
-import csv
-import io
 import json
 import math
 import os
@@ -12,8 +10,7 @@ from typing import Any, NamedTuple
 
 from jaxnerf.data.geometry.path_poses import natural_key
 from jaxnerf.evaluation import aggregate
-from jaxnerf.runtime.atomic_files import partial_file
-from jaxnerf.runtime.printed_text import printable, spreadsheet_cell
+from jaxnerf.runtime.printed_text import printable
 from jaxnerf.training import metric_log, workdir
 
 _MAX_COLUMNS, _MAX_WIDTH = 6, 60  # of options that differ, in the table of a terminal
@@ -143,7 +140,7 @@ def table(runs: Sequence[Run]) -> str:
     """Returns the runs as lines of text in columns."""
     differing = differing_options(runs)
     shown = differing[:_MAX_COLUMNS]
-    values = ([_text(run.options.get(name))[:_MAX_WIDTH] for name in shown] for run in runs)
+    values = ([option_text(run.options.get(name))[:_MAX_WIDTH] for name in shown] for run in runs)
     rows = [(*_HEADS, *shown), *((*_cells(run), *row) for run, row in zip(runs, values, strict=True))]
     rows = [[printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -162,67 +159,6 @@ def _cells(run):
     return (run.name, f"{run.steps:,}", f"{run.seconds:,.1f}", *scored, training)
 
 
-def _text(value):
+def option_text(value: Any) -> str:
+    """Returns the value of an option for a table; "-" for None."""
     return "-" if value is None else value if isinstance(value, str) else json.dumps(value)
-
-
-def to_csv(runs: Sequence[Run]) -> str:
-    """Returns the runs as CSV: one row for each, with all options that differ; what is not known is empty."""
-    differing = differing_options(runs)
-    heads = ("run", "workdir", "steps", "seconds", "training_psnr")
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    rows = [(*heads, *(f"scored_{name}" for name in Score._fields), *differing)]
-    for run in runs:
-        score = run.scores[-1] if run.scores else (None,) * len(Score._fields)
-        options = ("" if run.options.get(name) is None else _text(run.options[name]) for name in differing)
-        rows.append((run.name, str(run.folder), run.steps, run.seconds, run.training_psnr, *score, *options))
-    writer.writerows(map(spreadsheet_cell, row) for row in rows)
-    return file.getvalue()
-
-
-def require_matplotlib() -> None:
-    """Raises a ValueError that says how to install matplotlib, if it is missing."""
-    try:
-        from jaxnerf.runtime import plotting  # noqa: F401
-    except ImportError as error:
-        raise ValueError(
-            f"--plot draws with matplotlib, which is unavailable ({error}); install it with `pip install matplotlib`"
-        ) from None
-
-
-def save_plot(runs: Sequence[Run], path: str | os.PathLike) -> None:
-    """Writes a PNG or SVG: PSNR over the time of training and over steps, of batches (lines) and scored views (dots).
-
-    Args:
-        runs: to draw.
-        path: its suffix is the format.
-
-    Raises:
-        ValueError: if matplotlib is missing.
-    """
-    require_matplotlib()
-    from jaxnerf.runtime.plotting import Figure
-
-    path = pathlib.Path(path)
-    figure = Figure(figsize=(13, 5), dpi=100, layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for index, run in enumerate(runs):
-        curve = [(row["seconds"], row["step"], metric_log.final_psnr(row)) for row in run.rows]
-        curve = [point for point in curve if point[2] is not None and math.isfinite(point[2])]
-        dots = [(score.seconds, score.step, score.psnr) for score in run.scores if score.seconds is not None]
-        for column, axis in enumerate(axes):
-            name = printable(run.name)
-            style = {"color": f"C{index % 10}", "label": f" {name}" if name.startswith("_") else name}  # _ hides it
-            axis.plot([point[column] for point in curve], [point[2] for point in curve], linewidth=0.9, **style)
-            style["label"] = None
-            axis.plot([point[column] for point in dots], [point[2] for point in dots], "o", **style)
-    for axis, unit in zip(axes, ("seconds of training", "steps"), strict=True):
-        axis.set(xlabel=unit)
-        axis.grid(alpha=0.3)
-    axes[0].set(ylabel="PSNR, dB")
-    for label in axes[1].legend(fontsize="small").get_texts():
-        label.set_parse_math(False)
-    figure.suptitle("Lines: batches of training. Dots: scored views", fontsize="medium")
-    with partial_file(path) as partial:
-        figure.savefig(partial, format=path.suffix.lower().removeprefix("."))

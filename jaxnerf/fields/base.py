@@ -80,6 +80,16 @@ def contract_field(field: Field, lower: Vector, upper: Vector) -> Field:
     return field._replace(apply=apply, apply_in_fixed_order=None)
 
 
+def at_time(field: Field, time: float) -> Field:
+    """Returns the Field at rest that another one is at a time in [0, 1]; the parameters are the same."""
+
+    @functools.wraps(field.apply)
+    def apply(params, x, viewdirs, *, time, **inputs):
+        return field.apply(params, x, viewdirs, time=jnp.full(x.shape[:-1], time, jnp.float32), **inputs)
+
+    return field._replace(apply=functools.partial(apply, time=time), apply_in_fixed_order=None)
+
+
 def field_scene(field: Field, params: Mapping[str, Any], name: str = "fine", **options: Any) -> SceneFn:
     """Makes the scene of a network: its field with its parameters.
 

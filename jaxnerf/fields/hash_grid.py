@@ -178,7 +178,9 @@ def hash_grid_field(**options: Any) -> Field:
     """Makes a Field of multi-resolution features (after arXiv:2201.05989).
 
     Args:
-        **options: attributes of HashGrid; lower and upper are required.
+        **options: lower and upper, [3] world units, opposite corners of the box; and options of `HashGridOptions`, in
+            place of four levels of 16 to 128 vertices without prefilter. compute_dtype may be a type, too; None: that
+            of the parameters.
 
     Returns:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3]) returns density [..., S] in
@@ -189,23 +191,37 @@ def hash_grid_field(**options: Any) -> Field:
     Raises:
         ValueError: if the box is empty, or a level has fewer than 2 vertices along its longest side.
     """
+    if missing := [repr(name) for name in ("lower", "upper") if name not in options]:
+        names = " and ".join(missing)
+        raise TypeError(f"hash_grid_field() missing {len(missing)} required keyword-only arguments: {names}")
+    box = options.pop("lower"), options.pop("upper")
+    usual = {"resolutions": (16, 32, 64, 128), "prefilter": False, "compute_dtype": None}
     try:
-        network = HashGrid(**options)
+        chosen = HashGridOptions(**{**usual, **options})
     except TypeError as error:
-        raise TypeError(str(error).replace("HashGrid.__init__()", "hash_grid_field()")) from None
-    lower, upper = np.asarray(network.lower, float), np.asarray(network.upper, float)
-    if lower.shape != (3,) or upper.shape != (3,) or not (lower < upper).all():
-        raise ValueError(f"hash_grid_field: the box is {network.lower} to {network.upper}, expected lower < upper")
-    if not network.resolutions or min(network.resolutions) < 2:
+        raise TypeError(str(error).replace("HashGridOptions.__init__()", "hash_grid_field()")) from None
+    return from_options(chosen, box)
+
+
+def from_options(options: HashGridOptions, box: Box | None) -> Field:
+    """Makes the field "hash_grid" from its options, in the scene's box."""
+    if box is None:
         raise ValueError(
-            f"hash_grid_field: resolutions are {network.resolutions}, expected at least one, each at least 2"
+            "scene.lower or scene.upper is 'auto', expected the scene's box; resolve the config, or set both"
         )
+    lower, upper = (np.asarray(corner, float) for corner in box)
+    if lower.shape != (3,) or upper.shape != (3,) or not (lower < upper).all():
+        raise ValueError(f"hash_grid_field: the box is {box[0]} to {box[1]}, expected lower < upper")
+    resolutions = tuple(options.resolutions)
+    if min(resolutions, default=0) < 2:
+        raise ValueError(f"hash_grid_field: resolutions are {resolutions}, expected at least one, each at least 2")
+    network = HashGrid(*box, options)
 
     def init(key):
-        inputs = {"radius": jnp.zeros((1, 1))} if network.prefilter else {}
+        inputs = {"radius": jnp.zeros((1, 1))} if options.prefilter else {}
         return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
-    color_layers = ("view_0",) if network.view_depth else ("rgb",)
+    color_layers = ("view_0",) if options.view_depth else ("rgb",)
     regularizers = {"total_variation": functools.partial(total_variation, levels=network.levels())}
     return Field(
         init,
@@ -230,17 +246,7 @@ def _scene_of(network):
     def apply_to_cones(params, x, viewdirs, *, radius):
         return apply(params, x, viewdirs, radius=jnp.broadcast_to(radius, x.shape[:-1]))
 
-    return apply_to_cones if network.prefilter else apply_to_rays
-
-
-def from_options(options: HashGridOptions, box: Box | None) -> Field:
-    """Makes the field "hash_grid" from its options, in the scene's box."""
-    if box is None:
-        raise ValueError(
-            "scene.lower or scene.upper is 'auto', expected the scene's box; resolve the config, or set both"
-        )
-    values = {**dataclasses.asdict(options), "compute_dtype": _COMPUTE_DTYPES[options.compute_dtype]}
-    return hash_grid_field(lower=box[0], upper=box[1], **values)
+    return apply_to_cones if network.options.prefilter else apply_to_rays
 
 
 FIELD = Part(from_options, HashGridOptions, section="hash_grid")
@@ -280,43 +286,23 @@ class HashGrid(linen.Module):
     Attributes:
         lower: [3] world units, a corner of the box.
         upper: [3] world units, the opposite corner.
-        resolutions: vertices along the longest side, for each level.
-        features_per_level: features of each vertex.
-        table_size: maximal rows per level; a level with more vertices shares rows by a hash.
-        width: features of the density network's hidden layer.
-        view_depth: hidden layers of the colour network.
-        view_width: features of such a layer.
-        use_viewdirs: False: colour does not depend on the direction.
-        prefilter: whether the features of each level are multiplied by its `damping`, which is an input, too.
-        compute_dtype: of the inputs of both networks' layers; parameters, interpolation and outputs keep the
-            precision of the table. None: that of the table for all.
+        options: its sizes. With prefilter the features of each level are multiplied by its `damping`, and the radius is
+            an input, too. Parameters, interpolation and outputs keep the precision of the table.
         fixed_order: see `interpolate`.
     """
 
     lower: Sequence[float]
     upper: Sequence[float]
-    resolutions: Sequence[int] = (16, 32, 64, 128)
-    features_per_level: int = 4
-    table_size: int = 2**17
-    width: int = 64
-    view_depth: int = 2
-    view_width: int = 128
-    use_viewdirs: bool = True
-    prefilter: bool = False
-    compute_dtype: Any = None
+    options: HashGridOptions
     fixed_order: bool = False
 
     @linen.nowrap
     def levels(self) -> tuple[TableLevel, ...]:
         """Returns the levels of the table."""
         side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
-        sizes = [vertices(side, resolution) for resolution in self.resolutions]
-        ends = np.cumsum([0] + [min(np.prod(size), self.table_size) for size in sizes]).tolist()
+        sizes = [vertices(side, resolution) for resolution in self.options.resolutions]
+        ends = np.cumsum([0] + [min(np.prod(size), self.options.table_size) for size in sizes]).tolist()
         return tuple(TableLevel(size, range(*rows)) for size, rows in zip(sizes, itertools.pairwise(ends), strict=True))
-
-    @linen.nowrap
-    def _rounded(self, value):
-        return value if self.compute_dtype is None else value.astype(self.compute_dtype)
 
     @linen.compact
     def __call__(
@@ -326,32 +312,37 @@ class HashGrid(linen.Module):
         radius: Float[ArrayLike, "*batch samples"] | None = None,
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N]."""
-        shape = x.shape[:-1]
+        options, shape = self.options, x.shape[:-1]
+        dtype = _COMPUTE_DTYPES.get(options.compute_dtype, options.compute_dtype)
+
+        def rounded(value):
+            return value if dtype is None else value.astype(dtype)
+
         side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
         place = stored([(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)])
         levels = self.levels()
         # All levels share a table, so there is only one gradient to clear and one array to update.
-        table = self.param("table", _near_zero, (levels[-1].rows.stop, self.features_per_level))
+        table = self.param("table", _near_zero, (levels[-1].rows.stop, options.features_per_level))
         features = FEATURE_SCALE * interpolate(table, place, levels, fixed_order=self.fixed_order)
-        if self.prefilter:
+        if options.prefilter:
             cells = [float((side / (np.array(level.size) - 1)).max()) for level in levels]
             left = jnp.stack([damping(radius.reshape(-1), cell) for cell in cells], axis=-1)
-            damped = features * jnp.repeat(left, self.features_per_level, axis=-1)
+            damped = features * jnp.repeat(left, options.features_per_level, axis=-1)
             features = jnp.concatenate([damped, left], axis=-1)
-        features = self._rounded(features)
-        kernel = self.param("kernel", _glorot, (features.shape[-1], self.width))
-        bias = self.param("bias", linen.initializers.zeros_init(), (self.width,))
-        kernel, bias = self._rounded(kernel), self._rounded(bias)
+        features = rounded(features)
+        kernel = self.param("kernel", _glorot, (features.shape[-1], options.width))
+        bias = self.param("bias", linen.initializers.zeros_init(), (options.width,))
+        kernel, bias = rounded(kernel), rounded(bias)
         hidden = jax.nn.relu(transposed_product(kernel, features) + bias[:, None])
         # The logarithm of a density is up to 15, where bfloat16 has steps of 1/16.
-        outputs = {"dtype": None if self.compute_dtype is None else table.dtype}
+        outputs = {"dtype": None if dtype is None else table.dtype}
         geometry = Dense(1 + GEOMETRY_FEATURES, name="density", **outputs)(hidden)
-        density, hidden = geometry[0], self._rounded(geometry[1:])
-        if self.use_viewdirs:
+        density, hidden = geometry[0], rounded(geometry[1:])
+        if options.use_viewdirs:
             directions = jnp.broadcast_to(harmonics(viewdirs), (*shape, 9))
-            hidden = jnp.concatenate([hidden, self._rounded(directions.reshape(-1, 9).T)])
-        for layer in range(self.view_depth):
-            hidden = jax.nn.relu(Dense(self.view_width, name=f"view_{layer}")(hidden))
+            hidden = jnp.concatenate([hidden, rounded(directions.reshape(-1, 9).T)])
+        for layer in range(options.view_depth):
+            hidden = jax.nn.relu(Dense(options.view_width, name=f"view_{layer}")(hidden))
         rgb = Dense(3, name="rgb", **outputs)(hidden)
         return density.reshape(shape), jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 

@@ -122,7 +122,8 @@ def mlp_field(**options: Any) -> Field:
     """Makes a Field of the paper's network.
 
     Args:
-        **options: attributes of MLP; the defaults are those of the paper, with 595,844 parameters.
+        **options: of `MlpOptions`; the defaults are those of the paper, with 595,844 parameters. compute_dtype may be
+            a type, too.
 
     Returns:
         Field. apply(params, x [..., S, 3], viewdirs [..., 1 or S, 3], key=None, density_noise=0.0)
@@ -135,18 +136,24 @@ def mlp_field(**options: Any) -> Field:
         ValueError: if density_activation is unknown.
     """
     try:
-        network = MLP(**options)
+        network = MlpOptions(**options)
     except TypeError as error:
-        raise TypeError(str(error).replace("MLP.__init__()", "mlp_field()")) from None
-    if network.density_activation not in DENSITY_ACTIVATIONS:
+        raise TypeError(str(error).replace("MlpOptions.__init__()", "mlp_field()")) from None
+    return from_options(network, None)
+
+
+def from_options(options: MlpOptions, box: Box | None) -> Field:
+    """Makes the field "mlp" from its options; it needs no box."""
+    del box
+    if options.density_activation not in DENSITY_ACTIVATIONS:
         raise ValueError(
-            f"mlp_field: density_activation is {network.density_activation!r}, expected one of "
+            f"mlp_field: density_activation is {options.density_activation!r}, expected one of "
             f"{sorted(DENSITY_ACTIVATIONS)}"
         )
-    activation = DENSITY_ACTIVATIONS[network.density_activation]
+    network, activation = MLP(options), DENSITY_ACTIVATIONS[options.density_activation]
 
     def init(key):
-        inputs = dict.fromkeys(("radius", "length"), jnp.zeros((1, 1))) if network.prefilter else {}
+        inputs = dict.fromkeys(("radius", "length"), jnp.zeros((1, 1))) if options.prefilter else {}
         return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
     def apply(params, x, viewdirs, *, key=None, density_noise=0.0):
@@ -160,19 +167,13 @@ def mlp_field(**options: Any) -> Field:
         density, rgb = apply_network(network, params, x, viewdirs, **inputs)
         if key is not None and density_noise:
             density = density + density_noise * normal(key, density.shape)
-        return activation(density + network.density_bias), jax.nn.sigmoid(rgb)
+        return activation(density + options.density_bias), jax.nn.sigmoid(rgb)
 
-    layers = (0, network.skip_layer + 1) if network.skip_layer + 1 < network.depth else (0,)
-    color_layers = ("view",) if network.use_viewdirs else ("rgb",)
-    scene = apply_to_cones if network.prefilter else apply
+    layers = (0, options.skip_layer + 1) if options.skip_layer + 1 < options.depth else (0,)
+    color_layers = ("view",) if options.use_viewdirs else ("rgb",)
+    scene = apply_to_cones if options.prefilter else apply
     input_layers = tuple(f"trunk_{layer}" for layer in layers)
     return Field(init, scene, input_layers, color_layers=color_layers)
-
-
-def from_options(options: MlpOptions, box: Box | None) -> Field:
-    """Makes the field "mlp" from its options; it needs no box."""
-    del box
-    return mlp_field(**{**dataclasses.asdict(options), "compute_dtype": jnp.dtype(options.compute_dtype)})
 
 
 FIELD = Part(from_options, MlpOptions, section="fine")
@@ -182,33 +183,12 @@ class MLP(linen.Module):
     """Fully connected layers with one skip connection from the encoded position, and a small head for colour.
 
     Attributes:
-        depth: layers before the density.
-        width: features of such a layer.
-        skip_layer: the encoded position is concatenated again after the layer of this index.
-        view_width: features of the layer that takes the direction.
-        num_freqs: octaves of the position's encoding.
-        num_view_freqs: octaves of the direction's encoding.
-        encode: False: position and direction enter without positional encoding.
-        prefilter: whether the position's encoding is the `integrated_encoding` over the cone at each sample, of the
-            variance `cone_variance`, followed by the `damping_of_octaves`; radius and length are inputs, too.
-        use_viewdirs: False: colour depends on position alone; there is no bottleneck and no view layer.
-        density_activation: "relu" or "softplus".
-        density_bias: added to the density before its activation.
-        compute_dtype: of the layers; the outputs are at least float32.
+        options: its sizes. With prefilter the position's encoding is the `integrated_encoding` over the cone at each
+            sample, of the variance `cone_variance`, followed by the `damping_of_octaves`; radius and length are inputs,
+            too. Without use_viewdirs there is no bottleneck and no view layer. Outputs are at least float32.
     """
 
-    depth: int = 8
-    width: int = 256
-    skip_layer: int = 4
-    view_width: int = 128
-    num_freqs: int = 10
-    num_view_freqs: int = 4
-    encode: bool = True
-    prefilter: bool = False
-    use_viewdirs: bool = True
-    density_activation: str = "relu"
-    density_bias: float = 0.0
-    compute_dtype: Any = jnp.float32
+    options: MlpOptions
 
     @linen.compact
     def __call__(
@@ -223,28 +203,28 @@ class MLP(linen.Module):
         Arrays inside are [features, N], so that the encoding and all three products of a layer's forward and
         backward pass read memory contiguously. A small network on a CPU gains most from this.
         """
-        shape = x.shape[:-1]
-        num_freqs = self.num_freqs * self.encode
-        variance = planes_of(cone_variance(viewdirs, radius, length)) if self.prefilter else None
+        options, shape, compute_dtype = self.options, x.shape[:-1], jnp.dtype(self.options.compute_dtype)
+        num_freqs = options.num_freqs * options.encode
+        variance = planes_of(cone_variance(viewdirs, radius, length)) if options.prefilter else None
         encoded = encode_planes(planes_of(x), num_freqs=num_freqs, variance=variance)
-        if self.prefilter:
+        if options.prefilter:
             encoded = jnp.concatenate([encoded, damping_of_octaves(variance.mean(axis=0), num_freqs)])
-        encoded = encoded.astype(self.compute_dtype)
+        encoded = encoded.astype(compute_dtype)
         hidden = ()
-        for layer in range(self.depth):
-            joins = layer == 0 or layer == self.skip_layer + 1
+        for layer in range(options.depth):
+            joins = layer == 0 or layer == options.skip_layer + 1
             inputs = ((encoded,) if joins else ()) + hidden
-            hidden = (jax.nn.relu(Dense(self.width, name=f"trunk_{layer}")(*inputs)),)
-        dtype = jnp.promote_types(jnp.float32, self.compute_dtype)
+            hidden = (jax.nn.relu(Dense(options.width, name=f"trunk_{layer}")(*inputs)),)
+        dtype = jnp.promote_types(jnp.float32, compute_dtype)
         density = Dense(1, name="density")(*hidden).astype(dtype).reshape(shape)
-        if self.use_viewdirs:
+        if options.use_viewdirs:
             # The direction is encoded and multiplied once per ray, and broadcast over its samples.
-            directions = encode_planes(planes_of(viewdirs), num_freqs=self.num_view_freqs * self.encode)
-            directions = directions.astype(self.compute_dtype).reshape(len(directions), *viewdirs.shape[:-1])
-            bottleneck = Affine(self.width, name="bottleneck")(self.width)
-            features = hidden[0].reshape(self.width, *shape)
-            view = Dense(self.view_width, name="view")(features, directions, before=bottleneck)
-            hidden = (jax.nn.relu(view).reshape(self.view_width, -1),)
+            directions = encode_planes(planes_of(viewdirs), num_freqs=options.num_view_freqs * options.encode)
+            directions = directions.astype(compute_dtype).reshape(len(directions), *viewdirs.shape[:-1])
+            bottleneck = Affine(options.width, name="bottleneck")(options.width)
+            features = hidden[0].reshape(options.width, *shape)
+            view = Dense(options.view_width, name="view")(features, directions, before=bottleneck)
+            hidden = (jax.nn.relu(view).reshape(options.view_width, -1),)
         rgb = Dense(3, name="rgb")(*hidden).astype(dtype)
         return density, jnp.moveaxis(rgb.reshape(3, *shape), 0, -1)
 

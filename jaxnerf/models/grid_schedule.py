@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnerf.core.loops import is_cpu
-from jaxnerf.core.occupancy.grid import OccupancyGrid, create_grid, update_grid
+from jaxnerf.core.occupancy.grid import NUM_TIMES, OccupancyGrid, create_grid, update_grid
+from jaxnerf.core.scene import needs_of
 from jaxnerf.fields.base import Field, field_scene
 
 Corner = tuple[float, float, float]
@@ -116,7 +117,8 @@ def make_grid_schedule(
     density, spacings = threshold / step_size, _spacings(step_size, shape, contracted)
 
     def create(valid, empty=None):
-        # A cell starts at ten times the threshold, so about half a dozen updates empty it.
+        # A cell starts at ten times the threshold, so about half a dozen updates empty it; NUM_TIMES in a scene that
+        # moves.
         initial = 10 * density if empty is None else jnp.where(jnp.asarray(empty), 0, 10 * density)
         return create_grid(
             jnp.asarray(lower, jnp.float32),
@@ -135,6 +137,10 @@ def make_grid_schedule(
         young = step < initial_passes * update_every
         interval = jnp.where(young, often, update_every)
         num_updates = jnp.where(young, step // often, step // update_every)
+        first = initial_passes * update_every // often // rounds  # of later updates of a cell
+        later = first + (step // update_every - initial_passes) // rounds
+        # What was ten times as dense as the threshold stays occupied until the cell was evaluated at all times.
+        decay = {"decay": 10 ** (-1 / (NUM_TIMES + 1))} if "time" in needs_of(field.apply) else {}
 
         def updated():
             # Whole chunks, as a remainder of another size would have to be compiled, too.
@@ -152,6 +158,8 @@ def make_grid_schedule(
                 spread=young,
                 chunk=update_chunk,
                 radii=radii,
+                index=jnp.where(young, step // often // rounds, later),
+                **decay,
             )
 
         return jax.lax.cond(step % interval == interval - 1, updated, lambda: grid)

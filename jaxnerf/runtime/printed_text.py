@@ -5,21 +5,8 @@ import re
 # Control characters, the marks, embeddings, overrides and isolates of bidirectional text, separators of lines, and
 # halves of surrogate pairs, by which Python stands for bytes of a file name that are not UTF-8.
 _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-_FORMULA = ("=", "+", "-", "@", "\\t", "\\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
 def printable(text: object, keep: str = "") -> str:
     """Returns str(text) with an escape, such as \\n, in place of each unsafe character that is not in `keep`."""
     return _UNSAFE.sub(lambda found: found[0] if found[0] in keep else ascii(found[0])[1:-1], str(text))
-
-
-def spreadsheet_cell(value: object) -> object:
-    """Returns a value for a cell of a CSV file: a text that a spreadsheet would compute begins with an apostrophe."""
-    if not isinstance(value, str):
-        return value
-    text = printable(value)
-    try:
-        float(text)
-    except ValueError:
-        return f"'{text}" if text.lstrip(" ").startswith(_FORMULA) else text
-    return text

@@ -74,7 +74,8 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         lines += map(Detail, found)
     facts = dataset_facts(
         views,
-        scene.box,
+        lower=scene.box[0],
+        upper=scene.box[1],
         ndc=data.ndc,
         contracted=scene.contracted,
         has_alpha=has_alpha,

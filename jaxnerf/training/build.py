@@ -132,14 +132,14 @@ def build(config: Config) -> Experiment:
     )
 
 
-def render_parts(config: Config) -> RenderParts:
-    """Builds the RenderParts that a resolved config describes.
+def render_parts(config: Config, wrap: Callable[[Field], Field] | None = None) -> RenderParts:
+    """Builds the RenderParts that a resolved config describes; wrap: see `build_model`.
 
     Raises:
         ValueError: names the option that holds what cannot be built.
     """
     config = read_config(config)
-    given, model = config.data, build_model(config)
+    given, model = config.data, build_model(config, wrap)
     cameras = build_cameras(config, model.needs)
     if cameras is not None:
         model = cameras.added_to(model)

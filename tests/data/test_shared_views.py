@@ -4,9 +4,7 @@ import json
 import os
 import shutil
 
-import numpy as np
 import pytest
-from PIL import Image
 
 import captures
 from jaxnerf.data import dataset, shared_views
@@ -58,9 +56,9 @@ def test_a_test_file_that_equals_the_training_file(tmp_path, shots):
     assert "(test/000 is train/000, the same file)" in notes[0]
 
 
-def split_in_two(folder, shots, **images):
+def split_in_two(folder, shots):
     """Writes a Blender dataset whose test images, in test/, are copies of the first three training images."""
-    captures.write_blender(folder, shots, **images)
+    captures.write_blender(folder, shots)
     captures.write_blender(folder, shots[:3], split="test")
 
 
@@ -78,38 +76,10 @@ def test_copies_and_links_of_files(tmp_path, shots, copy):
     assert found(tmp_path) == [(f"test/other_{k}", f"train/{k:03d}", reason) for k in range(3)]
 
 
-@pytest.mark.parametrize("change", ["jpeg", "smaller", "other image", "other time", "other pose"])
-def test_images_of_one_pose_that_were_saved_again(tmp_path, shots, change):
-    split_in_two(tmp_path, shots)
-    files = {split: tmp_path / f"transforms_{split}.json" for split in ("train", "test")}
-    contents = {split: json.loads(path.read_text()) for split, path in files.items()}
-    for index, frame in enumerate(contents["test"]["frames"]):
-        path = tmp_path / "test" / f"{index:03d}.png"
-        image = Image.open(path)
-        path.unlink()
-        white = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image).convert("RGB")
-        if change == "smaller":
-            white = white.resize((64, 48), Image.BOX)
-        if change == "other image":
-            white = white.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
-        white.save(tmp_path / "test" / f"{index:03d}.jpg", quality=90)
-        if change == "other pose":
-            frame["transform_matrix"][1][3] += 0.01
-    if change == "other time":
-        for number, content in enumerate(contents.values()):
-            content["frames"] = [frame | {"time": 0.5 * number} for frame in content["frames"]]
-    for split, path in files.items():
-        path.write_text(json.dumps(contents[split]))
-    reason = "the same pose and image"
-    expected = [(f"test/{k:03d}", f"train/{k:03d}", reason) for k in range(3)]
-    assert found(tmp_path) == (expected if change in ("jpeg", "smaller") else [])
-
-
-def test_datasets_without_shared_views_read_no_image(tmp_path, shots, monkeypatch):
+def test_datasets_without_shared_views(tmp_path, shots):
     captures.write_transforms(tmp_path / "a", shots)
     captures.write_blender(tmp_path / "b", shots[:6])
     captures.write_blender(tmp_path / "b", shots[6:], split="test")
-    monkeypatch.setattr(shared_views, "read_image", None)
     for folder in (tmp_path / "a", tmp_path / "b"):
         data, lines, _ = dataset.resolve(options(folder))
         assert found(folder) == [] and not any("training views" in line for line in lines)
@@ -153,10 +123,3 @@ def test_results_record_the_views_of_their_split_only(tmp_path, shots):
         assert all(different) == any(different) == (count > 0)
         results = {"psnr": 30.0, "ssim": 0.9, "views": 2, **recorded}
         assert ("are training views, too" in summary(results)) == (count > 0) and "\n" not in summary(results)
-
-
-def test_thumbnails_of_transparent_images_are_over_white(tmp_path):
-    pixels = np.zeros((8, 8, 4), np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "clear.png")
-    Image.new("RGB", (16, 16), "white").save(tmp_path / "white.png")
-    assert shared_views._same_image(tmp_path / "clear.png", tmp_path / "white.png")

@@ -5,7 +5,7 @@
 encoded time as a fourth coordinate. Write the dataset and train on it by
 
     python moving_bodies.py data/moving
-    jaxnerf-train --plugins=moving_bodies --config=embedded_small --data_dir=data/moving --config.field=moving \\
+    jaxnerf-train --plugins=moving_bodies --config=embedded_small --data_dir=data/moving --config.field=timed_mlp \\
         --config.sampling.num_fine=0 --workdir=runs/moving
 
 where moving_bodies.py is in the current folder or on PYTHONPATH. Any dataset in that format works.
@@ -27,8 +27,8 @@ from jaxnerf.extend import Field, Options, at_least, between, option
 
 
 @dataclasses.dataclass(frozen=True)
-class MovingOptions(Options):
-    """The options of the field: the config's section `moving`."""
+class TimedOptions(Options):
+    """The options of the field: the config's section `timed_mlp`."""
 
     depth: int = option(4, "layers", range=between(1, 64))
     width: int = option(128, "outputs of a layer", range=at_least(1))
@@ -90,10 +90,10 @@ def write_dataset(folder, *, num_train=48, num_test=6, size=32):
         (folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1))
 
 
-def make_moving_field(options, box):
+def make_timed_mlp(options, box):
     """Makes the field from its options; it needs no box."""
     del box
-    network = MovingNetwork(**dataclasses.asdict(options))
+    network = TimedNetwork(**dataclasses.asdict(options))
 
     def init(key):
         return network.init(key, jnp.zeros((1, 1, 3)), jnp.zeros((1, 1)))["params"]
@@ -105,7 +105,7 @@ def make_moving_field(options, box):
     return Field(init, apply)
 
 
-class MovingNetwork(linen.Module):
+class TimedNetwork(linen.Module):
     """A multilayer perceptron on the encoded position and the encoded time."""
 
     depth: int
@@ -127,7 +127,7 @@ class MovingNetwork(linen.Module):
         return jax.nn.softplus(out[..., 0] - 1), jax.nn.sigmoid(out[..., 1:])
 
 
-jaxnerf.register_field("moving", make_moving_field, options=MovingOptions)
+jaxnerf.register_field("timed_mlp", make_timed_mlp, options=TimedOptions)
 
 if __name__ == "__main__":
     write_dataset(pathlib.Path(sys.argv[1]), size=48)

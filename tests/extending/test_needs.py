@@ -20,7 +20,7 @@ def config_of(field, steps, **fields):
     config = smoke_config(max_steps=steps, lr_steps=steps, save_every=steps, log_every=100)
     config.update_from_flattened_dict({"field": field, "sampling.num_fine": 0, "train.batch_size": 256, **fields})
     options = {"skip_layer": 2, "num_freqs": 8, "num_view_freqs": 2}
-    config.cone, config.moving = NETWORK | options, dict(NETWORK)
+    config.cone, config.timed_mlp = NETWORK | options, dict(NETWORK)
     activation = {"view_width": 32, "density_activation": "softplus", "density_bias": -1.0}
     config.fine.update(NETWORK | options | activation)
     return config
@@ -83,7 +83,7 @@ def test_a_moving_scene_is_learned_from_images_with_times(dataset, tmp_path):
     """Unseen views at unseen times; with the time frozen the same network shows the bodies at the wrong places."""
     fields = {"data.format": "blender", "data.dir": str(dataset), "data.near": 2.8, "data.far": 5.2}
     fields |= {"sampling.num_coarse": 32, "train.lr_init": 8e-3}
-    assert jaxnerf.train_and_evaluate(config_of("moving", 400, **fields), tmp_path / "run")
+    assert jaxnerf.train_and_evaluate(config_of("timed_mlp", 400, **fields), tmp_path / "run")
     run = jaxnerf.restore_run(tmp_path / "run")
     test = run.experiment.load_split("test")
     assert len(np.unique(test.time)) == len(test.size) == 6

@@ -13,7 +13,7 @@ from helpers import compiled, full_grid, rays_past_origin
 from jaxnerf import Rays
 from jaxnerf.core.occupancy import ray_marching
 from jaxnerf.core.occupancy.from_scene import crop_grid
-from jaxnerf.core.occupancy.grid import clip_rays_to_box, is_occupied
+from jaxnerf.core.occupancy.grid import NUM_TIMES, clip_rays_to_box, is_occupied
 from jaxnerf.fields.base import Field
 from jaxnerf.models.grid_schedule import make_grid_schedule
 
@@ -66,6 +66,30 @@ def test_cells_are_cubes_along_all_sides():
     schedule = a_schedule(resolution=20)
     assert schedule.shape == (20, 20, 15) and schedule.cell == pytest.approx((0.15, 0.15, 2.3 / 15))
     assert a_schedule(box=((0, 0, 0), (1e-3, 1, 1))).shape == (1, 8, 8)
+
+
+@pytest.mark.parametrize("cells_per_update", [2**18, 100])
+def test_a_body_that_is_there_for_a_fiftieth_of_the_time_is_never_skipped(cells_per_update):
+    """Whenever it is there: its cells are occupied after every update, and those that are always empty become so."""
+    begins = jnp.linspace(0, 0.98, 8)  # of the body in each layer of cells along x
+
+    def apply(params, x, viewdirs, *, time):
+        layer = jnp.clip((x[..., 0] + 1) * 4, 0, 7).astype(int)
+        there = (begins[layer] <= time) & (time < begins[layer] + 1 / NUM_TIMES) & (x[..., 1] < 0)
+        return jnp.where(there, 10.5 * 0.01 / STEP_SIZE, 0.0), x
+
+    box = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
+    options = {"resolution": 8, "step_size": STEP_SIZE, "threshold": 0.01, "update_every": 16}
+    schedule = make_grid_schedule(*box, field=Field(None, apply), cells_per_update=cells_per_update, **options)
+    cells = jnp.arange(8**3)
+
+    def step(grid, index):
+        grid = schedule.update(jax.random.fold_in(KEY, index), index, {"fine": None}, grid, cells)
+        return grid, (grid.occupied[:, :4].all(), grid.occupied[:, 5:].any())
+
+    start = schedule.create(np.ones(schedule.shape, bool))
+    full, others = jax.jit(lambda grid: jax.lax.scan(step, grid, jnp.arange(16 * 700))[1])(start)
+    assert full.all() and others[16 * 40] and not others[-1]
 
 
 def test_half_a_dozen_updates_empty_a_cell_without_density():

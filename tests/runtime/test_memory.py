@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers import assert_same, control_group, out_of_memory, random_rays
+from jaxnerf.core.metrics import psnr
 from jaxnerf.evaluation import metrics
 from jaxnerf.runtime import devices, memory
 from jaxnerf.training import compiled_step, loop
@@ -124,20 +125,16 @@ def test_a_copy_of_the_state_is_kept_only_for_a_step_that_needs_over_half_of_the
 
 @pytest.mark.slow
 @pytest.mark.parametrize("masked", [False, True])
-def test_metrics_that_do_not_fit_are_computed_in_strips(monkeypatch, capsys, masked):
+def test_metrics_of_strips_are_those_of_the_whole_image(monkeypatch, masked):
     rng = np.random.default_rng(0)
     truth = rng.random((37, 20, 3)).astype(np.float32)
     image = np.float32(truth + 0.1 * rng.normal(size=truth.shape))
-    mask = np.arange(37 * 20).reshape(37, 20) > 400 if masked else None
+    mask = jnp.arange(37 * 20).reshape(37, 20) > 400 if masked else None  # some strips have no pixel within it
     expected = metrics.image_metrics(image, truth, mask)
-    monkeypatch.setattr(metrics, "_whole", lambda *_: (_ for _ in ()).throw(out_of_memory()))
-    found = metrics.image_metrics(image, truth, mask)
-    assert found == pytest.approx(expected, rel=1e-5)
-    assert "out of memory in the metrics with 37 rows of an image of 20 x 37 at once" in capsys.readouterr().err
-    if masked:  # some strips have no pixel within the mask
-        assert metrics._in_strips(*map(jnp.asarray, (image, truth, mask)), 5)["ssim"] == pytest.approx(
-            expected["ssim"], rel=1e-5
-        )
+    assert expected["psnr_float"] == pytest.approx(float(psnr(image, truth, mask=mask)), rel=1e-6)
+    monkeypatch.setattr(metrics, "_STRIP", 20 * 12)
+    assert metrics.image_metrics(image, truth, mask) == pytest.approx(expected, rel=1e-5)
+    assert np.isnan(metrics.image_metrics(image, truth, jnp.zeros((37, 20), bool))["psnr"])
 
 
 def test_training_with_pixels_on_the_host_is_bit_exact(compiled_once, tmp_path, monkeypatch):

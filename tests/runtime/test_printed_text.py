@@ -1,14 +1,10 @@
-"""Text of strangers is shown, and never obeyed, by terminals and spreadsheets."""
+"""Text of strangers is shown, and never obeyed, by terminals."""
 
-import csv
 import io
-import os
 import unicodedata
 
-import pytest
-
 from jaxnerf.runtime import signals
-from jaxnerf.runtime.printed_text import printable, spreadsheet_cell
+from jaxnerf.runtime.printed_text import printable
 from runs import run_forked
 
 # Moves the cursor, sets the title of the window, clears the line, and shows what follows from right to left.
@@ -58,17 +54,3 @@ def test_an_encoding_without_a_character_ends_no_program(tmp_path, monkeypatch):
         "from jaxnerf.runtime import cli\ncli.run(lambda argv: print('90 °'))\n"
     )
     assert run_forked(program, folder=tmp_path)[:2] == (0, "90 \\xb0\n")
-
-
-@pytest.mark.parametrize(
-    "text", ["=1+1", "+1+1", "-1+1", "@SUM(1)", "\t=1", "\r=1", " =1", "=cmd|' /C calc'!A0", "\uff1d1"]
-)
-def test_a_spreadsheet_computes_no_text(text):
-    assert spreadsheet_cell(text) == "'" + printable(text)
-
-
-@pytest.mark.parametrize("value", [-1.5, 3, None, "-1.5", "+2e3", "-inf", "run", "a=b", "", os.sep])
-def test_numbers_and_other_texts_stay_as_they_are_in_cells(value):
-    assert spreadsheet_cell(value) == value
-    file = io.StringIO()
-    csv.writer(file).writerow([spreadsheet_cell(value)])

@@ -13,11 +13,9 @@ from jaxnerf.core.loops import vary_like
 from jaxnerf.core.occupancy.grid import OccupancyGrid, cells_around, grid_from_scene, mark_cells
 from jaxnerf.core.occupancy.packed import count_occupied, evaluate_samples, fill_buffer, flattened, occupied_words
 from jaxnerf.core.occupancy.ray_marching import march_rays
-from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Background, Rays, Samples, SceneFn, Vector
 
 _CHUNK = 2**11  # rays
-_NUM_TIMES = 32  # at which the density of a scene that moves is evaluated in each cell
 _MAX_ERROR = 1 / 512  # of a colour: half a step of 8 bits
 _OPAQUE = 1e-3  # transmittance below which a ray counts as opaque
 
@@ -45,7 +43,7 @@ def visible_grid(
     A cell is occupied if the rays need it for colours within half a step of 8 bits, or if it lies between two
     such cells. A network that was trained along whole rays has white fog in front of white surfaces, fog thinner
     than the threshold in front of everything dense, and matter inside objects; none of these is kept. In a scene that
-    asks for time, a cell is dense if it is at one of 32 random times, and visible at the times of the rays.
+    asks for time, a cell is visible if it is at one of the times of the rays.
 
     Args:
         scene: see render_samples.
@@ -58,10 +56,7 @@ def visible_grid(
         background: see render_samples.
     """
     bounds = (jnp.asarray(bound, jnp.float32) for bound in (lower, upper))
-    options = {"threshold": threshold, "contracted": contracted}
-    if "time" in needs_of(scene):
-        options["num_updates"] = _NUM_TIMES
-    grid = grid_from_scene(jax.random.key(0), scene, *bounds, shape, **options)
+    grid = grid_from_scene(jax.random.key(0), scene, *bounds, shape, threshold=threshold, contracted=contracted)
     dense = drop_thin_density(scene, grid, threshold)
     cell = tuple((high - low) / count for low, high, count in zip(lower, upper, shape, strict=True))
 

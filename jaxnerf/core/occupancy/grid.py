@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
-from jaxnerf.core import contraction, volume_rendering
+from jaxnerf.core import contraction, types, volume_rendering
 from jaxnerf.core.loops import vary_like
 from jaxnerf.core.safe_math import at_least_float32
 from jaxnerf.core.sampling import ONE_KEY, typed_key
@@ -23,6 +23,8 @@ _JUST_INSIDE = 2 - 1e-6  # of a box from -2 to 2
 _ABSORBED = 0.01  # the fraction of light that matter of the threshold's density absorbs between samples
 _LEAST_LIGHT = 1e-30  # transmitted by any cell, so that density_mean is finite
 _SMALLEST_THRESHOLD = 1e-30  # 1 / world unit, so that a threshold of 0 has a spacing
+# Updates of a cell in a row evaluate a scene that moves once in each of so many parts of [0, 1), and jump between them.
+NUM_TIMES, _TIME_STRIDE = 50, 31
 
 
 @pytree(static=("contracted",))
@@ -103,6 +105,7 @@ def update_grid(
     spread: Bool[ArrayLike, ""] = True,
     chunk: int = 8192,
     radii: Float[ArrayLike, "2"] | None = None,
+    index: Int[ArrayLike, ""] | None = None,
 ) -> OccupancyGrid:
     """Updates some cells from the density at a random point in each (as in arXiv:2201.05989).
 
@@ -113,8 +116,8 @@ def update_grid(
         key: for the point in each cell.
         grid: OccupancyGrid.
         scene: see render_samples. A scene that asks for more gets what `cell_inputs` computes, with the spacing as
-            length, and a random time for each cell: a cell is occupied if matter is there at any time, or for a cone
-            of any of the radii.
+            length, and a time for each cell: a cell is occupied if matter is there at any time, or for a cone of any
+            of the radii.
         cells: [M] int32, flat indices x first, each at most once; indices past the last cell are ignored.
         threshold: 1 / world unit, a number or [X, Y, Z]; 0.01 over the spacing of samples there empties cells
             that absorb less than 1 % of the light.
@@ -128,6 +131,8 @@ def update_grid(
         radii: [2] world units, above 0, the smallest and the largest radius for which the scene is rendered where
             space is not contracted; that of a cell is drawn between them, uniform in its logarithm. None: see
             `cell_inputs`.
+        index: int32, how often these cells were updated before, for scenes that ask for time: NUM_TIMES updates in a
+            row then are 1 / NUM_TIMES apart, and find what fills a cell for so long. None: times are random.
 
     Returns:
         OccupancyGrid. Cells that are not valid stay empty. The update is not meant to be differentiated.
@@ -147,11 +152,11 @@ def update_grid(
     length = _spacings(grid, threshold, spacing)[cells] if needs_of(scene) else None
     radius = None
     if radii is not None and "radius" in needs_of(scene):
-        # Another key than those of place and time.
         smallest, largest = jnp.log(radii)
-        at = jax.random.uniform(jax.random.fold_in(key, 2), x.shape[:-1])
+        at = jax.random.uniform(jax.random.fold_in(key, 2), x.shape[:-1])  # another key than those of place and time
         radius = _stretch(grid, x) * jnp.exp(smallest + (largest - smallest) * at)
-    inputs = cell_inputs("update_grid", scene, grid, x, length=length, radius=radius, key=key)
+    time = _cell_times(key, cells, index) if "time" in needs_of(scene) else 0.0
+    inputs = cell_inputs("update_grid", scene, grid, x, length=length, radius=radius, time=time)
 
     def density_at(at):
         x, inputs = at
@@ -170,6 +175,14 @@ def update_grid(
     dense = ~(largest <= threshold)  # NaN counts as dense, so that it is visible
     occupied = jnp.where(spread, widen(dense), dense) & grid.valid
     return dataclasses.replace(grid, density_max=largest, density_mean=jnp.where(occupied, mean, -1), occupied=occupied)
+
+
+def _cell_times(key, cells, index):
+    """Returns the time of each cell [M] in [0, 1), see update_grid."""
+    if index is None:  # another key than that of the places, which do not depend on what the scene asks for
+        return jax.random.uniform(jax.random.fold_in(key, 1), cells.shape)
+    offset = (jnp.asarray(cells, jnp.uint32) * jnp.uint32(2654435769) >> 8) / jnp.float32(2**24)  # Fibonacci hashing
+    return (jnp.asarray(index) % NUM_TIMES * _TIME_STRIDE % NUM_TIMES + offset) / NUM_TIMES
 
 
 def _spacings(grid, threshold, spacing):
@@ -202,8 +215,9 @@ def grid_from_scene(
         threshold: see update_grid.
         chunk: see update_grid.
         contracted: see create_grid.
-        num_updates: random points in each cell. A cell is occupied if the density at one of them, or at one of a
-            neighbour's, exceeds the threshold. Matter much thinner than a cell may be missed.
+        num_updates: random points in each cell, at least NUM_TIMES where the scene asks for time, see `update_grid`.
+            A cell is occupied if the density at one of them, or at one of a neighbour's, exceeds the threshold. Matter
+            much thinner than a cell may be missed.
 
     Returns:
         OccupancyGrid.
@@ -211,9 +225,10 @@ def grid_from_scene(
     key = typed_key(key, ONE_KEY)
     grid = create_grid(lower, upper, jnp.ones(shape, bool), initial_density=0.0, contracted=contracted)
     cells = jnp.arange(grid.valid.size)
+    num_updates = max(num_updates, NUM_TIMES * ("time" in needs_of(scene)))
 
     def update(index, grid):
-        options = {"threshold": threshold, "decay": 1.0, "smoothing": 1 / (index + 1), "chunk": chunk}
+        options = {"threshold": threshold, "decay": 1.0, "smoothing": 1 / (index + 1), "chunk": chunk, "index": index}
         return update_grid(jax.random.fold_in(key, index), grid, scene, cells, **options)
 
     return jax.lax.fori_loop(0, num_updates, update, vary_like(grid, jax.eval_shape(update, 0, grid)))
@@ -227,7 +242,7 @@ def cell_inputs(
     *,
     length: Num[ArrayLike, "*batch"] | None = None,
     radius: Num[ArrayLike, "*batch"] | None = None,
-    key: Keys | None = None,
+    time: Num[ArrayLike, "*#batch"] = 0.0,
 ) -> dict[str, Num[Array, "*batch"]]:
     """Computes what a scene asks for at positions that are on no ray, such as those in the cells of a grid.
 
@@ -238,26 +253,21 @@ def cell_inputs(
         x: [..., 3] world units.
         length: [...] world units; None: the size of the cell around x, the cube root of its volume.
         radius: [...] world units; None: half that size.
-        key: of the times; None: all are 0.
+        time: [...], or a number.
 
     Returns:
-        By name, each [...]: radius; length; time, uniform in [0, 1) or 0; image_index, 0.
+        By name, each [...]: radius; length; time; image_index, 0.
 
     Raises:
         ValueError: if the scene asks for progress, which must be bound.
     """
     shape = x.shape[:-1]
-
-    def time():
-        # Another key than that of the places in the cells, which thus do not depend on what the scene asks for.
-        return jnp.zeros(shape) if key is None else jax.random.uniform(jax.random.fold_in(key, 1), shape)
-
     return inputs_of(
         function,
         scene,
         radius=lambda: _cell_sizes(grid, x) / 2 if radius is None else radius,
         length=lambda: _cell_sizes(grid, x) if length is None else length,
-        time=time,
+        time=lambda: jnp.broadcast_to(jnp.asarray(time, jnp.float32), shape),
         image_index=lambda: jnp.zeros(shape, jnp.int32),
     )
 
@@ -328,7 +338,7 @@ def is_occupied(
     """Returns whether the cell around each x(t) is occupied; True where t or the ray is NaN, so that it is visible."""
     _check_bool("OccupancyGrid", occupied=grid.occupied)
     index, inside = _cells_of(grid, _along_rays(grid, rays, t))
-    return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t) | has_nan(rays)[..., None]
+    return (inside & grid.occupied.reshape(-1)[index]) | jnp.isnan(t) | types.has_nan(rays)[..., None]
 
 
 def near_occupied(
@@ -375,11 +385,6 @@ def _check_bool(function, **cells):
             raise ValueError(f"{function}: {name} has type {array.dtype}, expected bool; compare it with a threshold")
 
 
-def has_nan(rays: Rays) -> Bool[Array, "*batch"]:
-    """Returns whether the origin, the direction, near or far of each ray is NaN."""
-    return jnp.isnan(rays.origins.sum(axis=-1) + rays.directions.sum(axis=-1) + rays.near + rays.far)
-
-
 def estimate_optical_depth(
     grid: OccupancyGrid, rays: Rays, samples: Samples
 ) -> tuple[Bool[Array, "*batch samples"], Float[Array, "*batch samples"]]:
@@ -404,7 +409,7 @@ def estimate_optical_depth(
     size = jnp.sqrt(x * x + y * y + z * z)[..., None]
     # The bound keeps sums finite: the mean of a cell of an older checkpoint may be infinite.
     optical_depth = jnp.where(mean > 0, jnp.minimum(mean * samples.delta * size, volume_rendering.OPAQUE), 0)
-    unknown = jnp.isnan(samples.t) | (has_length & has_nan(rays)[..., None])
+    unknown = jnp.isnan(samples.t) | (has_length & types.has_nan(rays)[..., None])
     return ~(mean < 0) | unknown, optical_depth
 
 

@@ -59,11 +59,11 @@ def importance_samples(
         ValueError: on other shapes, another rule, max_samples < 1 or a uniform_fraction outside (0, 1].
     """
     # All sums below are along rays, whose candidates are one row of an array or several.
-    along, axes, shapes = _WholeRays(), "B S", {"near": (rays.near, "B")}
+    along, axes, shapes = _AlongRays(None), "B S", {"near": (rays.near, "B")}
     if isinstance(candidates, SampleRuns):
         shapes |= {"first": (candidates.first, "B"), "count": (candidates.count, "B")}
         shapes["ray_index"] = (candidates.ray_index, "U")
-        candidates, along, axes = candidates.samples, _RaysInRuns(candidates), "U W"
+        candidates, along, axes = candidates.samples, _AlongRays(candidates), "U W"
     check_shapes("importance_samples", **shapes, t=(candidates.t, axes), delta=(candidates.delta, axes))
     if candidates.rule != "segments" or max_samples < 1 or not 0 < uniform_fraction <= 1:
         raise ValueError(
@@ -201,78 +201,53 @@ def _count_up_to(ascending, begin, size, value, most_runs):
     return short_loop(most.bit_length(), search, none)
 
 
-# Candidates are one row of an array for each ray, or several; both have sums along rays.
+class _AlongRays:
+    """Sums along rays of values [U, W] of SampleRuns, 0 of a ray without runs; without runs each ray has one row."""
 
-
-class _WholeRays:
-    """Sums of values [B, S] along rays."""
-
-    most_runs = 1
-
-    def of_rows(self, tree: Any) -> Any:
-        """Returns what belongs to the ray of each row: arrays [B, ...] as they are."""
-        return tree
-
-    def total(self, values: Array) -> Array:
-        """Returns the sum [B] of one value [B] of each row."""
-        return values
-
-    def any(self, values: Bool[Array, " B"]) -> Bool[Array, " B"]:
-        """Returns whether any row of a ray is true."""
-        return values
-
-    def through(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
-        """Returns the running sum along each ray."""
-        return running_sum(values)
-
-    def before(self, values: Float[Array, "B S"]) -> Float[Array, "B S"]:
-        """Returns the sum of what is in front of each value."""
-        return exclusive_sum(values)
-
-    def last(self, sums: Float[Array, "B S"]) -> Float[Array, " B"]:
-        """Returns the last of running sums."""
-        return sums[:, -1]
-
-    def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
-        """Returns the flat index of the first value of each of some rays, and how many values it has."""
-        return ray * width, width
-
-
-class _RaysInRuns:
-    """Does what _WholeRays does, for values [U, W] of SampleRuns; the sums of a ray without runs are 0."""
-
-    def __init__(self, runs: SampleRuns):
-        self._runs, self.most_runs = runs, runs.max_count
-        self._starts = jnp.arange(runs.ray_index.size) == runs.first[runs.ray_index]
-        self._last = jnp.maximum(runs.first + runs.count - 1, 0)
+    def __init__(self, runs: SampleRuns | None):
+        self._runs, self.most_runs = runs, 1 if runs is None else runs.max_count
+        if runs is not None:
+            self._starts = jnp.arange(runs.ray_index.size) == runs.first[runs.ray_index]
+            self._last = jnp.maximum(runs.first + runs.count - 1, 0)
 
     def of_rows(self, tree: Any) -> Any:
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[self._runs.ray_index], tree)
+        """Returns what belongs to the ray of each row, of arrays [B, ...]."""
+        return tree if self._runs is None else jax.tree.map(lambda x: jnp.asarray(x)[self._runs.ray_index], tree)
 
     def total(self, values: Array) -> Array:
+        """Returns the sum [B] of one value [U] of each row."""
         return self._of_last(self._since_start(values))
 
     def any(self, values: Bool[Array, " U"]) -> Bool[Array, " B"]:
+        """Returns whether any row of a ray is true."""
         return self.total(values.astype(jnp.int32)) > 0
 
     def through(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
+        """Returns the running sum along each ray."""
         inside = running_sum(values)
-        return inside + self._in_front(inside)
+        return self._with_rows_before(inside, inside)
 
     def before(self, values: Float[Array, "U W"]) -> Float[Array, "U W"]:
-        return exclusive_sum(values) + self._in_front(running_sum(values))
+        """Returns the sum of what is in front of each value."""
+        return self._with_rows_before(exclusive_sum(values), running_sum(values))
 
     def last(self, sums: Float[Array, "U W"]) -> Float[Array, " B"]:
+        """Returns the last of running sums."""
         return self._of_last(sums[:, -1])
 
     def places_of(self, ray: Int[Array, " K"], width: int) -> tuple[Any, Any]:
-        return self._runs.first[ray] * width, self._runs.count[ray] * width
+        """Returns the flat index of the first value of each of some rays, and how many values it has."""
+        first, count = (ray, 1) if self._runs is None else (self._runs.first[ray], self._runs.count[ray])
+        return first * width, count * width
 
     def _of_last(self, values):
-        return jnp.where(self._runs.count > 0, values[self._last], 0)
+        return values if self._runs is None else jnp.where(self._runs.count > 0, values[self._last], 0)
 
     def _since_start(self, values):
-        return running_sum_since(self._starts, values, self._runs.max_count)
+        return values if self._runs is None else running_sum_since(self._starts, values, self._runs.max_count)
 
-    def _in_front(self, inside):
-        return jnp.where(self._starts, 0, jnp.roll(self._since_start(inside[:, -1]), 1))[:, None]
+    def _with_rows_before(self, sums, inside):
+        """Adds to sums within rows those of the rows before on the same ray."""
+        if self._runs is None:
+            return sums
+        return sums + jnp.where(self._starts, 0, jnp.roll(self._since_start(inside[:, -1]), 1))[:, None]

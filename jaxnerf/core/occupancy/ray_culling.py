@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
 from jaxnerf.core.loops import vary_like
-from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, flat_index, has_nan
-from jaxnerf.core.types import Background, Rays, Rendering, without_samples
+from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, flat_index
+from jaxnerf.core.types import Background, Rays, Rendering, has_nan, without_samples
 
 _COARSE = 2  # cells along a side of a coarse cell
 

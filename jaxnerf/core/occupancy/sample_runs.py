@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, has_nan, near_occupied
+from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box, near_occupied
 from jaxnerf.core.occupancy.ray_marching import num_steps, steps_in_t
 from jaxnerf.core.sampling import edges_after_steps, samples_from_edges
-from jaxnerf.core.types import Rays, Samples, check_shapes, pytree
+from jaxnerf.core.types import Rays, Samples, check_shapes, has_nan, pytree
 from jaxnerf.core.volume_rendering import running_sum
 
 WIDTH = 8  # steps of a run; march_rays has a multiple of 32 of them

@@ -23,7 +23,7 @@ _ARC_PART = 0.9  # of the covered azimuth
 _LIFT = 0.5  # how far an arc rises and descends, in standard deviations of the cameras' elevation
 _DIRECTIONS = 2048  # in which the hull of the cameras is bounded
 _FRAMES = {"turntable": 48, "arc": 96, "spiral": 120, "ellipse": 120}
-KINDS = (*_FRAMES, "interpolate")
+KINDS = (*_FRAMES, "interpolate", "still")
 
 _look_at = jax.jit(jax.vmap(core_poses.look_at, in_axes=(0, 0, None)))
 _mean_pose = jax.jit(core_poses.mean_pose)
@@ -170,7 +170,7 @@ def make_poses(
     cameras' positions by no more than half the median distance between neighbours.
 
     Args:
-        kind: one of KINDS but "interpolate", see `poses_through`.
+        kind: one of KINDS but "interpolate", see `poses_through`, and "still".
         poses: of the cameras.
         num_frames: N; None: 48 for a turntable, 96 for an arc, 120 for a spiral or ellipse.
         up: unit vector; None: `up_of`. A spiral keeps the mean camera's.

@@ -19,7 +19,7 @@ from jaxnerf.registry import READERS
 from jaxnerf.runtime.atomic_files import files_below
 from jaxnerf.runtime.fingerprint import fingerprint as content_fingerprint
 
-TIME_UNUSED = "images state one, which is not used: the scene is trained as static; see docs/extending/moving_scene.md"
+TIME_UNUSED = "images state one, which is not used: the scene is trained as if nothing moved; --config=moving uses it"
 _FAR_AWAY = 100.0  # distance of cameras from an origin over how far they are apart
 _MASK_FOLDERS = ("images_mask", "images_masks", "masks")
 
@@ -38,7 +38,8 @@ class Frame(NamedTuple):
         bounds: nearest and farthest matter along the camera's axis, world units; None: not known.
         seen: [M] indices into the Capture's points that this image shows; None: not known.
         seen_at: [M, 2] px, where it shows them.
-        time: in [0, 1], when it was taken in a scene that moves; None: not stated, which holds for all frames or none.
+        time: when it was taken in a scene that moves, in [0, 1] once `read_capture` has scaled it; None: not stated,
+            which holds for all frames or none.
         ignored: an existing image; pixels are ignored where it is not black, too. None: none is.
         crop_radius: px of the camera, around the image's middle, beyond which pixels are ignored, too; None: none is.
     """
@@ -98,6 +99,7 @@ class Capture(NamedTuple):
             from points and cameras.
         bounds_reason: why the bounds are not those that the format usually has; "": they are.
         files: how the files state the cameras.
+        time_range: the first and the last time of all splits, where the frames are those of one; None: as they state.
     """
 
     format: str
@@ -114,6 +116,7 @@ class Capture(NamedTuple):
     bounds: tuple[float, float] | None = None
     bounds_reason: str = ""
     files: CameraFiles = CameraFiles()
+    time_range: tuple[float, float] | None = None
 
 
 def fingerprint(capture: Capture) -> str:
@@ -171,7 +174,8 @@ def read_capture(folder: str | os.PathLike, format: str = "auto", *, split: str 
     """Reads the Capture in a folder, in a given format or in the first that is detected.
 
     If the cameras are far from the origin of the files' world, as in geographic coordinates, the Capture has another
-    origin near them, see `origin_near`: float32, in which Views are, does not hold such positions.
+    origin near them, see `origin_near`: float32, in which Views are, does not hold such positions. Times that
+    are not all in [0, 1], such as the numbers of frames, are scaled to it.
 
     Args:
         folder: of the dataset.
@@ -196,8 +200,8 @@ def read_capture(folder: str | os.PathLike, format: str = "auto", *, split: str 
         raise wrong[0]
     read = READERS.get(format).read
     if has_split_files(format):
-        return _with_ignored(read(Path(folder), split=split))
-    return moved_near(_with_masks(_with_ignored(read(Path(folder))), Path(folder)))
+        return _with_scaled_times(_with_ignored(read(Path(folder), split=split)))
+    return moved_near(_with_masks(_with_ignored(_with_scaled_times(read(Path(folder)))), Path(folder)))
 
 
 def has_split_files(format: str) -> bool:
@@ -252,6 +256,20 @@ def _moved(frame, origin):
     pose = np.array(frame.camera.to_world, np.float64)
     pose[:, 3] -= origin
     return frame._replace(camera=dataclasses.replace(frame.camera, to_world=pose))
+
+
+def _with_scaled_times(capture):
+    """Returns the Capture with times in [0, 1], of all splits alike, and a line that says so if they were not."""
+    times = [frame.time for frame in capture.frames if frame.time is not None]
+    first, last = capture.time_range or (min(times, default=0), max(times, default=1))
+    if 0 <= first and last <= 1:
+        return capture
+    line = f"times from {first:g} to {last:g}, those of all splits, are scaled to [0, 1]"
+    frames = tuple(
+        frame if frame.time is None else frame._replace(time=(frame.time - first) / ((last - first) or 1.0))
+        for frame in capture.frames
+    )
+    return capture._replace(frames=frames, choices=(*capture.choices, line))
 
 
 def _with_ignored(capture):

@@ -64,6 +64,7 @@ def read_capture(folder: str | os.PathLike, *, split: str | None = None) -> Capt
         bounds=bounds,
         bounds_reason=reason,
         files=_FILES,
+        time_range=json_frames.time_range(folder) if frames[0].time is not None else None,
     )
     return base.moved_near(capture, poses[:, :, 3])
 

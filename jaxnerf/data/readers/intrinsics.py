@@ -21,7 +21,7 @@ _OTHERS = ("camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy")
 STATED = ("fl_x", "fl_y", "cx", "cy", "camera_model", "is_fisheye", *_COEFFICIENTS, "distortion_params", *_UNSUPPORTED)
 _UNUSED = {  # facts of other programs: why they are not used
     **dict.fromkeys(("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew"), "no lens of jaxnerf has that term"),
-    **dict.fromkeys(("timestamp", "fid", "time_id", "timestep", "timestep_index"), "time, from 0 to 1, is read"),
+    **dict.fromkeys(("timestamp", "fid", "time_id", "timestep", "timestep_index"), "time is read"),
     "rolling_shutter": "all pixels of an image have one pose",
     **dict.fromkeys(("transform_matrix_start", "transform_matrix_end"), "transform_matrix is the pose"),
     **dict.fromkeys(("K", "intrinsics", "intrinsic_matrix"), "fl_x, fl_y, cx and cy are read"),

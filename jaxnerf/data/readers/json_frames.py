@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxnerf.core.types import Camera
 from jaxnerf.data.geometry.poses import check_pose
 from jaxnerf.data.readers.intrinsics import STATED, ignored_facts, read_camera, wrong_value
-from jaxnerf.data.readers.validation import read_json, required
+from jaxnerf.data.readers.validation import is_number, read_json, required
 
 SPLITS = ("train", "val", "test")
 # What no file of the NeRF paper's Blender renders has: it shows that the cameras are those of another program.
@@ -93,6 +93,18 @@ def split_files(folder: str | os.PathLike) -> dict[str, Path]:
     paths = {split: Path(folder) / f"transforms_{split}.json" for split in SPLITS}
     found = {split: path for split, path in paths.items() if path.is_file()}
     return found if "train" in found else {}
+
+
+def time_range(folder: str | os.PathLike) -> tuple[float, float] | None:
+    """Returns the first and the last time that the files of all splits in a folder state; None if they state none."""
+    times = []
+    for path in split_files(folder).values():
+        try:
+            frames = listed_frames(read_json(path), path)
+        except ValueError:  # reported where that split is read
+            continue
+        times += [entries["time"] for _, entries in frames if is_number(entries.get("time"))]
+    return (min(times), max(times)) if times else None
 
 
 def full_cameras(folder: str | os.PathLike) -> str:

@@ -1,11 +1,10 @@
 """Checks of arguments, and readers of JSON and .npy files of unknown origin."""
 
-import math
 import os
 import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
@@ -44,34 +43,14 @@ def read_npy(path: Path, expected: str) -> Shaped[np.ndarray, "..."]:
         ValueError: if the file is missing, truncated or holds no plain array; names the file.
     """
     try:
-        with atomic_files.open_regular(path, "rb") as file:
-            shape, fortran, dtype = read_npy_header(file)
-            if dtype.hasobject:
-                raise ValueError("Python objects, which are never unpickled")
-            size = math.prod(shape) * dtype.itemsize
-            # Compared before the allocation: a flipped bit in the header may ask for gigabytes.
-            available = path.stat().st_size - file.tell()
-            if size != available:
-                raise ValueError(f"{available} bytes of data, its header says {size}")
-            content = file.read(size)
-        return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
+        with atomic_files.open_regular(path, "rb"):  # no pipe, for which numpy would wait
+            # Mapped, since a flipped bit in the header may ask for gigabytes.
+            return np.array(np.lib.format.open_memmap(path, mode="r"))
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file, expected {expected}; correct the folder") from None
     except Exception as error:  # numpy parses the header as Python, so a damaged one raises almost any exception
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path}: unreadable ({reason}), expected {expected}; export it again") from None
-
-
-def read_npy_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Returns shape, whether the order is Fortran's, and dtype; the file's position is then the data's start.
-
-    Raises:
-        Exception: of almost any type, on a damaged header.
-    """
-    version = np.lib.format.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version}")
-    return getattr(np.lib.format, f"read_array_header_{version[0]}_0")(file)
 
 
 def required(entries: Mapping[str, Any], key: str, source: Any) -> Any:
@@ -86,13 +65,14 @@ def required(entries: Mapping[str, Any], key: str, source: Any) -> Any:
 def read_times(frames: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[float | None]:
     """Returns the "time" of each frame of a JSON file, or None for all of them if none states one.
 
-    Times are fractions of the sequence in [0, 1], as in the format of D-NeRF (arXiv:2011.13961).
+    They are fractions of the sequence in [0, 1], as in the format of D-NeRF (arXiv:2011.13961), or other numbers, such
+    as those of a video's frames, which `read_capture` scales.
 
     Args:
         frames: (where, entries of the frame); where: for the message.
 
     Raises:
-        ValueError: if some frames state a time and others do not, or one is no number in [0, 1].
+        ValueError: if some frames state a time and others do not, or one is no number.
     """
     without = [where for where, frame in frames if "time" not in frame]
     if len(without) == len(frames):
@@ -100,10 +80,10 @@ def read_times(frames: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[float | 
     if without:
         raise ValueError(f"{without[0]}: has no time, other frames have; expected all or none; complete them")
     for where, frame in frames:
-        if not is_number(frame["time"]) or not 0 <= frame["time"] <= 1:
+        if not is_number(frame["time"]):
             raise ValueError(
-                f"{where}: time is {short_repr(frame['time'])}, expected a number in [0, 1], the fraction of the "
-                "sequence; divide all times by the last, or remove them if nothing moves"
+                f"{where}: time is {short_repr(frame['time'])}, expected a number; correct it, or remove all times if "
+                "nothing moves"
             )
     return [float(frame["time"]) for _, frame in frames]
 

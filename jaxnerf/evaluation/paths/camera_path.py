@@ -23,6 +23,7 @@ from jaxnerf.runtime.fingerprint import fingerprint
 _SHEPARD = 4  # the exponent of the distance in weights: the nearest cameras dominate
 _FAR_AWAY = 1.1  # times as far as the farthest view, from where frames have bounds of their own
 _MAX_FRAMES, _MAX_PIXELS = 100_000, 16_384
+_STILL = 48  # frames of a still camera
 _FPS = {"above": 0.01, "below": 1000}
 
 
@@ -38,6 +39,7 @@ class CameraPath(NamedTuple):
         width: px.
         height: px.
         fps: frames per second, where a file states them.
+        time: [N] in [0, 1], of a scene that moves; None: not known.
     """
 
     name: str
@@ -48,6 +50,7 @@ class CameraPath(NamedTuple):
     width: int
     height: int
     fps: float | None = None
+    time: np.ndarray | None = None
 
 
 def make_path(
@@ -62,10 +65,10 @@ def make_path(
 
     Args:
         kind: "turntable", "arc", "spiral" or "ellipse", see `path_poses.make_poses`; "interpolate", through the
-            views in the natural order of their names; or a file, see `read_path_file`.
+            views in the natural order of their names; "still", the first view's; or a file, see `read_path_file`.
         views: Views, for their cameras.
-        num_frames: N; when None 48 for a turntable, 96 for an arc, 120 for a spiral or ellipse, 6 from view to view
-            but at most 240.
+        num_frames: N; when None 48 for a turntable or a still camera, 96 for an arc, 120 for a spiral or ellipse, 6
+            from view to view but at most 240.
         closed: whether "interpolate" returns from the last view to the first.
         up: the axis of the dataset's files that is up in a turntable, an arc or an ellipse, such as "+z"; None: as the
             cameras are held.
@@ -83,6 +86,8 @@ def make_path(
     if kind == "interpolate":
         poses, focal = _through_views(views, num_frames, closed)
         return through_first_lens(kind, poses, views)._replace(focal=focal)
+    if kind == "still":
+        return through_first_lens(kind, np.repeat(views.cameras.to_world[:1], num_frames or _STILL, axis=0), views)
     poses = path_poses.make_poses(kind, views.cameras.to_world, num_frames, up_direction(up, views))
     return through_first_lens(kind, poses, views)
 
@@ -114,8 +119,8 @@ def posed_views(views: Views, path: CameraPath) -> Views:
     """Returns Views without pixels, in the poses of a CameraPath, all with the first view's pinhole.
 
     NDC depend on a camera's focal length and size, so no frame's own may replace them; see `path_pixels`. Near and
-    far are those of the views nearby, see `frame_bounds`. For a scene that asks for them, all frames have the time 0,
-    if the views have a time, and the image_index 0: a path shows one instant.
+    far are those of the views nearby, see `frame_bounds`. For a scene that asks for them, frames have the time of
+    the path, or 0, if the views have a time; and the image_index 0.
     """
     count = len(path.poses)
     near, far = frame_bounds(path.poses, views)
@@ -137,7 +142,7 @@ def posed_views(views: Views, path: CameraPath) -> Views:
         far=far,
         mask=None,
         names=tuple(f"{index:04d}" for index in range(count)),
-        time=None if views.time is None else np.zeros(count, np.float32),
+        time=None if views.time is None else np.float32(np.zeros(count) if path.time is None else path.time),
         image_index=np.zeros(count, np.int32),
     )
 
@@ -196,7 +201,7 @@ def _from_file(file, views):
     is_stated = np.isfinite(found.focal)
     middle = np.where(is_stated, [same.width / 2, same.height / 2], same.center)
     focal, center = np.where(is_stated, found.focal, same.focal), found.center
-    return same._replace(focal=focal, center=np.where(np.isfinite(center), center, middle))
+    return same._replace(focal=focal, center=np.where(np.isfinite(center), center, middle), time=found.time)
 
 
 def _through_views(views, num_frames, closed):
@@ -220,6 +225,7 @@ class PathFile(NamedTuple):
         width: px.
         height: px.
         fps: frames per second.
+        time: [N] in [0, 1]; None: not stated by all frames.
     """
 
     poses: np.ndarray
@@ -228,13 +234,15 @@ class PathFile(NamedTuple):
     width: int | None
     height: int | None
     fps: float | None
+    time: np.ndarray | None = None
 
 
 def read_path_file(path: str | os.PathLike) -> PathFile:
     """Reads the PathFile that a JSON file holds, in one of two formats.
 
-    A list of frames: {"frames": [{"transform_matrix": 4 x 4, fl_x, fl_y, cx, cy}]}, camera to world, x right,
-    y up, looking along -z. Beside frames, w, h, fl_x, fl_y, cx, cy, camera_angle_x and fps apply to all.
+    A list of frames: {"frames": [{"transform_matrix": 4 x 4, fl_x, fl_y, cx, cy, time}]}, camera to world, x right,
+    y up, looking along -z; a time in [0, 1] is that of a scene that moves. Beside frames, w, h, fl_x, fl_y, cx, cy,
+    camera_angle_x and fps apply to all.
 
     nerfstudio's: {"camera_path": [{"camera_to_world": 16 numbers, row by row, "fov": vertical, degrees}],
     "render_height", "render_width", "fps", "seconds"}. Its numbers are in the dataset's world only if
@@ -267,7 +275,7 @@ def _read_frames(content, frames, path):
     elif angle:
         raise ValueError(f"{path}: has camera_angle_x but no w, expected both; add w, or give fl_x")
     fallback.update({key: content[key] for key in ("fl_x", "fl_y", "cx", "cy") if key in content})
-    poses, focal, center = [], [], []
+    poses, focal, center, times = [], [], [], []
     for index, frame in enumerate(frames):
         source = f"{path}, frames[{index}]"
         poses.append(check_pose(_required(frame, "transform_matrix", source), source=source))
@@ -281,7 +289,9 @@ def _read_frames(content, frames, path):
             raise ValueError(f"{source}: has fl_y but no fl_x, expected both or fl_x alone; add fl_x")
         focal.append([x, y])
         center.append([_number(frame, key, source, above=-math.inf) for key in ("cx", "cy")])
-    return _path_file(poses, focal, center, width, height, _number(content, "fps", path, **_FPS))
+        times.append(_number(frame, "time", source, above=-1e-9, below=1 + 1e-9))
+    made = _path_file(poses, focal, center, width, height, _number(content, "fps", path, **_FPS))
+    return made if None in times else made._replace(time=np.clip(times, 0, 1))
 
 
 def _read_nerfstudio(content, frames, path):

@@ -20,7 +20,7 @@ from jaxnerf.data.images.image_files import read_stored
 from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths import camera_path
 from jaxnerf.evaluation.paths.camera_path import CameraPath
-from jaxnerf.evaluation.restore import TrainedRun, newest_step, refined_views
+from jaxnerf.evaluation.restore import TrainedRun, check_moves, newest_step, refined_views
 from jaxnerf.evaluation.supersampling import MAX_RAYS, render_pixels, trained_footprint, training_cameras
 from jaxnerf.runtime import atomic_files, shards
 from jaxnerf.runtime.fingerprint import fingerprint
@@ -28,6 +28,7 @@ from jaxnerf.runtime.stages import Progress
 from jaxnerf.training.metric_log import minutes
 
 VIDEO_KINDS = ("auto", "mp4", "gif", "none")
+_FPS = 24.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +39,9 @@ class Frames:
         path: see `camera_path.make_path`; when None `path_poses.default_kind` selects one, and it is printed.
         num_frames, closed, up: see `camera_path.make_path`; without up, it is that of the run's option `data.up`.
         width, height: px, see `camera_path.resize`.
+        time: the first and the last in [0, 1] of a scene that moves, equally spaced in between; when None those of the
+            path's file, or 0 and 1.
+        seconds: of the video; without num_frames, it has 24 frames a second. None: it follows from the frames.
         max_rays_per_pixel: a pixel that covers more of the scene than a ray of training is the mean over as many rays
             as training has there, and at most so many, see `Footprint.rays_per_side`.
     """
@@ -48,6 +52,8 @@ class Frames:
     up: str | None = None
     width: int | None = None
     height: int | None = None
+    time: tuple[float, float] | None = None
+    seconds: float | None = None
     max_rays_per_pixel: int = MAX_RAYS
 
 
@@ -60,7 +66,7 @@ class Output:
         rgba: whether rgba/0000.png is written, too: straight alpha, without the background.
         depth: whether there is a video of the depth, too.
         video: its kind, see `video_suffix`.
-        fps: frames per second; when None the path file's, or 24.
+        fps: frames per second; when None those of `Frames.seconds`, or the path file's, or 24.
         overwrite: whether frames of that name are deleted first.
         shard: (index, count): only every count-th frame, from frame `index` on. The process that finds all
             frames finished makes the depth images and the videos.
@@ -128,7 +134,7 @@ def render_path(
             end = "" if folder == "color" else f"-{folder}"
             written.append(target.with_name(f"{target.name}{end}{suffix}"))
             files = [target / folder / f"{index:04d}.png" for index in range(len(shown.path.poses))]
-            write_video(written[-1], files, output.fps or shown.path.fps or 24.0)
+            write_video(written[-1], files, output.fps or shown.path.fps or _FPS)
     return written
 
 
@@ -147,13 +153,31 @@ def _shown(run, workdir, variables, frames):
     """Makes the path of frames; prints what has been chosen for it."""
     views = refined_views(run, run.experiment.load_split("train", images=False), "train", variables[0])
     up = frames.up or run.experiment.config.data.up or None
-    options = {"num_frames": frames.num_frames, "closed": frames.closed, "up": up}
-    path = camera_path.make_path(select_kind(frames.path, views, up), views, **options)
-    path = camera_path.resize(path, frames.width, frames.height)
+    kind, count = select_kind(frames.path, views, up), frames.num_frames
+    if frames.seconds and not kind.endswith(".json"):
+        count = count or max(round(frames.seconds * _FPS), 1)
+    path = camera_path.make_path(kind, views, num_frames=count, closed=frames.closed, up=up)
+    path = _timed(camera_path.resize(path, frames.width, frames.height), frames, run.experiment.model)
     footprint = trained_footprint(run, training_cameras(run, workdir, variables[0]))
     sides = footprint.rays_per_side(path.poses, path.focal, max_rays=frames.max_rays_per_pixel)
     _print_rays(sides)
     return _Shown(run, variables, views, path, sides)
+
+
+def _timed(path, frames, model):
+    """Returns the path with the times that frames show, and frames per second of the duration; prints a default."""
+    count = len(path.poses)
+    if frames.seconds:
+        path = path._replace(fps=count / frames.seconds)
+    if "time" not in model.needs:
+        if frames.time is not None:
+            check_moves(model, "{:g} to {:g}".format(*frames.time))
+        return path._replace(time=None)
+    if frames.time is None and path.time is not None:
+        return path
+    if frames.time is None:
+        print("time: from 0 to 1, as the scene moves; --time=T or --time=FIRST:LAST selects others", file=sys.stderr)
+    return path._replace(time=np.linspace(*(frames.time or (0.0, 1.0)), count))
 
 
 def _write_frames(target, shown, output):
@@ -239,6 +263,8 @@ def _provenance(shown, frames):
         provenance["closed"] = frames.closed
     if sides.max() > 1:
         provenance["rays_per_pixel"] = fingerprint(sides)
+    if path.time is not None:
+        provenance["time"] = fingerprint(path.time)
     if shown.predictor:
         provenance["uncertainty"] = shown.predictor.identity
     return {

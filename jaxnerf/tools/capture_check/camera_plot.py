@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from jaxnerf.core.types import Camera
 from jaxnerf.data.images.image_files import open_image
 from jaxnerf.runtime.atomic_files import partial_file
-from jaxnerf.runtime.plotting import Figure, LineCollection
 from jaxnerf.runtime.printed_text import printable
 from jaxnerf.tools.capture_check.report import Report
+from jaxnerf.tools.curve.plotting import Figure, LineCollection
 
 CAMERA, FLAGGED, POINT, PATH, NEXT = "#2060c0", "#e02020", "#9a9a9a", "#20a040", "#d06000"
 _SOFTWARE = "jaxnerf-check"

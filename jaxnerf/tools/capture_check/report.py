@@ -15,7 +15,7 @@ from jaxnerf.data.geometry.poses import axis_of, gaze_center, look_one_way, side
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.images.load_images import scored_splits, split_indices
 from jaxnerf.data.readers import base
-from jaxnerf.data.readers.base import TIME_UNUSED, Capture
+from jaxnerf.data.readers.base import Capture
 from jaxnerf.options import AUTO, replaced
 from jaxnerf.runtime.printed_text import printable
 from jaxnerf.tools.capture_check import cameras, depths, exposure, folds, image_facts, mattes, mixed_axes, tracks
@@ -185,8 +185,30 @@ def _image_facts(capture, available, images):
         ("views", f"{len(capture.frames)}: {counts}{checked}"),
         ("images", f"{_counted(sizes)} px; {_counted(channels)}; {masks or 'no'} masks"),
         *([("rays", rays)] if (rays := image_facts.rays_of(capture)) else []),
-        *([("time", TIME_UNUSED)] if any(frame.time is not None for frame in capture.frames) else []),
+        *(("time", line) for line in _time_facts(capture, splits)),
     ]
+
+
+def _time_facts(capture, splits):
+    """Returns lines about the times of images; none if they have none."""
+    times = {name: [capture.frames[index].time for index in chosen] for name, chosen in splits.items()}
+    times = {name: np.float64([time for time in found if time is not None]) for name, found in times.items()}
+    train = np.unique(times.get("train", []))
+    if not len(train):
+        return []
+    images = len(times["train"])
+    each = "one image each" if images == len(train) else f"{images / len(train):.3g} images each, as of a rig"
+    lines = [
+        f"training images at {len(train)} time{'s' * (len(train) > 1)} from {train[0]:.3g} to {train[-1]:.3g}, {each}"
+    ]
+    if len(train) > 1:
+        gap = int(np.diff(train).argmax())
+        lines[0] += f"; the largest gap is {np.diff(train)[gap]:.3g}, from {train[gap]:.3g} to {train[gap + 1]:.3g}"
+    for name, found in times.items():
+        beyond = int(((found < train[0]) | (found > train[-1])).sum())
+        if beyond:
+            lines.append(f"{beyond} of {len(found)} {name} images are before or after all training images")
+    return [*lines, "--config=moving trains a scene that moves; others train it as if nothing moved"]
 
 
 def _camera_facts(capture, evidence, images, up):

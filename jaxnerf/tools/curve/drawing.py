@@ -3,6 +3,7 @@
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -52,15 +53,14 @@ def save(curves: Curves, path: pathlib.Path, *, ylabel: str, lines_only: Sequenc
         The path; None without matplotlib, which is reported on stderr.
     """
     try:
-        from jaxnerf.runtime.plotting import Figure
+        from jaxnerf.tools.curve.plotting import Figure
     except ImportError as error:
         print(f"no {path.name}: matplotlib is unavailable ({error}); `pip install matplotlib`", file=sys.stderr)
         return None
     figure = Figure(figsize=(7, 4), dpi=100, layout="constrained")
     axes = figure.subplots()
     for name, points in curves.items():
-        label = f" {printable(name)}" if name.startswith("_") else printable(name)  # _ would hide it
-        thin = name in lines_only
+        label, thin = label_of(name), name in lines_only
         (line,) = axes.plot(
             *zip(*points, strict=True), "-" if thin else "o-", label=label, **({"linewidth": 0.8} if thin else {})
         )
@@ -74,8 +74,18 @@ def save(curves: Curves, path: pathlib.Path, *, ylabel: str, lines_only: Sequenc
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
     axes.grid(alpha=0.3)
-    for label in axes.legend(fontsize="small").get_texts():
-        label.set_parse_math(False)
+    add_legend(axes)
     with partial_file(path) as partial:
         figure.savefig(partial, format="png")
     return path
+
+
+def label_of(name: str) -> str:
+    """Returns the label of a curve with a name of unknown origin; matplotlib hides one that begins with _."""
+    return f" {printable(name)}" if name.startswith("_") else printable(name)
+
+
+def add_legend(axes: Any) -> None:
+    """Adds the legend to axes of matplotlib; names are not read as formulas."""
+    for label in axes.legend(fontsize="small").get_texts():
+        label.set_parse_math(False)

@@ -8,7 +8,9 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxnerf.runtime.printed_text import printable, spreadsheet_cell
+from jaxnerf.runtime.printed_text import printable
+
+_FORMULA = ("=", "+", "-", "@", "\\t", "\\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +110,18 @@ def to_csv(points: Sequence[Point]) -> str:
     for point in points:
         writer.writerow(["" if x is None else spreadsheet_cell(x) for x in dataclasses.astuple(point)])
     return file.getvalue()
+
+
+def spreadsheet_cell(value: object) -> object:
+    """Returns a value for a cell of a CSV file: a text that a spreadsheet would compute begins with an apostrophe."""
+    if not isinstance(value, str):
+        return value
+    text = printable(value)
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}" if text.lstrip(" ").startswith(_FORMULA) else text
+    return text
 
 
 def read_csv(path: str | pathlib.Path) -> list[Point]:

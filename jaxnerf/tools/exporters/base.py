@@ -45,6 +45,7 @@ def export_run(
     step: int | None = None,
     data_dir: str | None = None,
     max_uncertainty: float | str | None = None,
+    time: float | None = None,
     name: str | None = None,
     overwrite: bool = False,
     say: Callable[[str], None] = print,
@@ -58,7 +59,8 @@ def export_run(
         step: of the checkpoint; the newest when None.
         data_dir: see `restore_run`.
         max_uncertainty: of the cells of the grid, see `cleaned`.
-        name: of the folder; KIND-STEP when None.
+        time: in [0, 1], of a scene that moves, of which one instant is exported; when None 0, and `say` is told.
+        name: of the folder; when None KIND-STEP, or KIND-STEP-timeTIME with a time.
         overwrite: whether an existing folder of that name is replaced.
         say: called with each line for the user.
         **settings: options of the exporter by name.
@@ -74,16 +76,16 @@ def export_run(
     options.check()
     if name and (pathlib.Path(name).name != name or name.startswith(".")):
         raise ValueError(f"name is {name!r}, expected a plain file name; drop folders and a leading dot")
-    run = restore_run(workdir, data_dir=data_dir)
+    run = restore_run(workdir, data_dir=data_dir, time=time)
     if exporter.check is not None:
         exporter.check(run)
     step = newest_step(run, workdir, step)
-    target = pathlib.Path(workdir) / "exports" / (name or f"{kind}-{step}")
+    at_time = "" if time is None else f"-time{time:g}"
+    target = pathlib.Path(workdir) / "exports" / (name or f"{kind}-{step}{at_time}")
     atomic_files.check_tree(target.parent)
     if target.exists() and not overwrite:
         raise ValueError(f"{target}: exists already; give --overwrite to replace it, or another --name")
-    if run.experiment.model.grid_schedule is None:  # whole rays through a dense network would take hours
-        run = restore_run(workdir, data_dir=data_dir, settings={"bake_occupancy": True})
+    run = _one_instant(run, workdir, data_dir, time, say)
     variables = cleaned(run, workdir, max_uncertainty).variables(step)
     views = refined_views(run, run.experiment.load_split("train", images=None), "train", variables[0])
     target.parent.mkdir(exist_ok=True)
@@ -97,6 +99,17 @@ def export_run(
         if relative:
             (partial / "file_origin.json").write_text(json.dumps({"file_origin": views.file_origin}) + "\n")
     return target
+
+
+def _one_instant(run, workdir, data_dir, time, say):
+    """Returns the run with an occupancy grid, and at a time if its scene moves."""
+    moves, has_grid = "time" in run.experiment.model.needs, run.experiment.model.grid_schedule is not None
+    if moves:
+        say("the scene moves, and the export shows time 0; --time=T selects another from 0 to 1")
+    if has_grid and not moves:
+        return run
+    baked = {} if has_grid else {"bake_occupancy": True}  # whole rays through a dense network would take hours
+    return restore_run(workdir, data_dir=data_dir, settings=baked, time=0.0 if moves else time)
 
 
 def can_be_scored(source: ExportSource) -> bool:

@@ -21,7 +21,14 @@ _KIND = flags.DEFINE_string(
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = cli.define_step("The checkpoint's step. When it is not given, the newest is exported.")
 _MAX_UNCERTAINTY = cli.define_fraction("max_uncertainty", run_flags.MAX_UNCERTAINTY)
-_NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP.")
+_TIME = flags.DEFINE_float(
+    "time",
+    None,
+    "The instant of a scene that moves, from 0 to 1. When it is not given, it is 0.",
+    lower_bound=0.0,
+    upper_bound=1.0,
+)
+_NAME = flags.DEFINE_string("name", None, "The name of the folder. It overrides KIND-STEP or KIND-STEP-timeTIME.")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "Whether to replace an existing folder of that name.")
 
 
@@ -44,6 +51,7 @@ def main(argv):
             step=_STEP.value,
             data_dir=_DATA_DIR.value,
             max_uncertainty=_MAX_UNCERTAINTY.value,
+            time=_TIME.value,
             name=_NAME.value,
             overwrite=_OVERWRITE.value,
             say=lambda line: print(line, file=sys.stderr),

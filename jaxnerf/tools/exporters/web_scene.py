@@ -158,19 +158,19 @@ def _leaves(value):
 
 def _layers(network, params, groups):
     """Returns the Layers; inputs are in the order in which the shader has them."""
-    count, size = len(network.resolutions), network.features_per_level
+    count, size = len(network.options.resolutions), network.options.features_per_level
     kernel = params["kernel"].reshape(count, size, -1)
     kernel = np.pad(kernel, ((0, 0), (0, 4 * groups - size), (0, 0))).reshape(4 * groups * count, -1)
     layers = {
         "hidden": _padded(kernel, params["bias"]),
         "density": _padded(params["density"]["kernel"], params["density"]["bias"]),
     }
-    names = [f"view_{index}" for index in range(network.view_depth)] + ["rgb"]
+    names = [f"view_{index}" for index in range(network.options.view_depth)] + ["rgb"]
     first = params[names[0]]
     # The colour network does not read the density, which is the first output of the layer before.
     kernel = np.concatenate([np.zeros((1, first["kernel"].shape[1]), np.float32), first["kernel"][:GEOMETRY_FEATURES]])
     layers[names[0]] = _padded(kernel, first["bias"])
-    if network.use_viewdirs:
+    if network.options.use_viewdirs:
         layers["ray"] = _padded(first["kernel"][GEOMETRY_FEATURES:], np.zeros_like(first["bias"]))
     return layers | {name: _padded(params[name]["kernel"], params[name]["bias"]) for name in names[1:]}
 

@@ -11,7 +11,6 @@ import pickletools
 
 import numpy as np
 
-from jaxnerf.data.readers.validation import read_npy_header
 from jaxnerf.runtime.atomic_files import open_regular
 
 # The names in a pickled list of arrays: of numpy 1 and 2, and of protocol 2, which encodes bytes as text.
@@ -36,6 +35,14 @@ class Record:
         self.name, self.arguments, self.state = name, arguments, None
 
 
+def _read_npy_header(file):
+    """Returns shape, whether the order is Fortran's, and dtype; the file's position is then the data's start."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version}")
+    return getattr(np.lib.format, f"read_array_header_{version[0]}_0")(file)
+
+
 def read_array_list(path: pathlib.Path, expected: str) -> list[np.ndarray]:
     """Returns the floating-point arrays of a .npy file that holds a list of them.
 
@@ -48,7 +55,7 @@ def read_array_list(path: pathlib.Path, expected: str) -> list[np.ndarray]:
     """
     try:
         with open_regular(path, "rb") as file:
-            shape, _, dtype = read_npy_header(file)
+            shape, _, dtype = _read_npy_header(file)
             if not dtype.hasobject:
                 raise ValueError(f"one array of {dtype}{list(shape)}, not a list")
             content = file.read()

@@ -129,7 +129,8 @@ def facts_of(config: RunConfig, views: Views) -> Facts:
     has_alpha = bounded_by_alpha(config.scene, views, ndc=config.data.ndc, refined=refined) and config.has_box
     return dataset_facts(
         views,
-        config.scene.box,
+        lower=config.scene.box[0],
+        upper=config.scene.box[1],
         ndc=config.data.ndc,
         contracted=config.scene.contracted,
         has_alpha=has_alpha,

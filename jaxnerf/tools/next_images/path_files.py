@@ -43,5 +43,7 @@ def write_path_file(file: pathlib.Path, path: CameraPath, views: Views) -> None:
         | dict(zip(("fl_x", "fl_y", "cx", "cy"), [*map(float, focal), *map(float, center)], strict=True))
         for pose, focal, center in zip(poses, path.focal, path.center, strict=True)
     ]
+    if path.time is not None:
+        frames = [{**frame, "time": float(time)} for frame, time in zip(frames, path.time, strict=True)]
     content = {"w": path.width, "h": path.height, "fps": path.fps or 1.0, "frames": frames}
     atomic_files.write_text(file, json.dumps(content, indent=1) + "\n")

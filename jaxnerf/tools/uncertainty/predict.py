@@ -2,7 +2,7 @@
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,6 +82,20 @@ class Predictor(NamedTuple):
         """Returns what results.json holds about the figures of its images."""
         target = None if self.calibration is None else self.calibration.coverage
         return {"estimator": self.name, "target_coverage": target, **calibrations.figures(rows)}
+
+
+def line(results: Mapping[str, Any]) -> str | None:
+    """Returns the line that sums up the predicted errors of results.json; None without any."""
+    found = results.get("uncertainty")
+    if not found:
+        return None
+    text = f"predicted errors: AUSE {found['ause_rmse']:.3f} (RMSE), {found['ause_mae']:.3f} (MAE)"
+    if "ause_rmse_object" in found:
+        text += f", on the object {found['ause_rmse_object']:.3f}, {found['ause_mae_object']:.3f}"
+    if "coverage" in found:
+        target = f"{100 * found['target_coverage']:g} %"
+        text += f", {100 * found['coverage']:.1f} % of errors within intervals for {target}"
+    return text
 
 
 def requested(

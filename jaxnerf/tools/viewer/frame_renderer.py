@@ -42,12 +42,14 @@ class FrameCamera(NamedTuple):
         to_world: [3, 4] camera to the run's world, x right, y up, looking along -z.
         fov: radians, vertical.
         width, height: px.
+        time: in [0, 1], of a scene that moves.
     """
 
     to_world: np.ndarray
     fov: float
     width: int
     height: int
+    time: float = 0.0
 
     @property
     def focal(self) -> float:
@@ -178,8 +180,8 @@ class FrameRenderer:
         """Renders a frame.
 
         Rays begin at the camera and end where the box of the scene does, whatever near and far the training views
-        have; where space is contracted, they end as far away as those views may see. A scene that asks for time or
-        image_index gets 0.
+        have; where space is contracted, they end as far away as those views may see. A scene that asks for time gets
+        that of the camera, one that asks for image_index 0.
 
         Args:
             state: what to render.
@@ -241,6 +243,7 @@ class FrameRenderer:
             "focal": np.float32([camera.focal, camera.focal]),
             "center": np.float32([camera.width / 2, camera.height / 2]),
             "width": np.int32(camera.width),
+            "time": np.float32(camera.time),
             "bounds": np.float32([near, far]),
             "crop": everything if crop is None else np.float32(crop),
             "box": state.box,
@@ -251,7 +254,8 @@ class FrameRenderer:
         pixels = jnp.stack([ids % arrays["width"], ids // arrays["width"]], axis=-1) + self._offset
         camera = Camera(**{name: arrays[name] for name in ("to_world", "focal", "center")})
         near, far = arrays["bounds"]
-        world = with_needs(rays_from_pixels(camera, pixels, near=near, far=far), camera, pixels, self._needs)
+        world = rays_from_pixels(camera, pixels, near=near, far=far)
+        world = with_needs(world, camera, pixels, self._needs, time=arrays["time"])
         world = rays = clip_rays(world, *arrays["crop"])
         if self._ndc:
             rays = ndc_rays(world, self._lens)
@@ -333,6 +337,13 @@ def frame_image(frame: Frame, mode: str) -> UInt8[np.ndarray, "H W 3"]:
     else:
         raise ValueError(f"mode is {mode!r}, expected one of {', '.join(MODES)}")
     return np.repeat(plane[..., None], 3, axis=-1)
+
+
+def view_image(views: Views, index: int, longest: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Returns a training image over its background, uint8, subsampled to at most so many px."""
+    image = np.asarray(views.image(index))
+    every = -(-max(image.shape[:2]) // longest)
+    return output_images.to_8_bits(image[::every, ::every])
 
 
 def _normals(frame):

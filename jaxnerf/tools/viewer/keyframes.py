@@ -39,7 +39,11 @@ def cameras_through(
     places = np.arange(len(keyframes))
     period = len(keyframes) if closed else None
     fovs = np.interp(times, places, [camera.fov for camera in keyframes], period=period)
-    return [keyframes[0]._replace(to_world=pose, fov=float(fov)) for pose, fov in zip(poses, fovs, strict=True)]
+    instants = np.interp(times, places, [camera.time for camera in keyframes], period=period)
+    return [
+        keyframes[0]._replace(to_world=pose, fov=float(fov), time=float(time))
+        for pose, fov, time in zip(poses, fovs, instants, strict=True)
+    ]
 
 
 def save_path(
@@ -69,6 +73,7 @@ def save_path(
         width=width,
         height=height,
         fps=fps,
+        time=None if views.time is None else np.array([camera.time for camera in cameras]),
     )
     file = file_of(workdir, name)
     file.parent.mkdir(exist_ok=True)
@@ -91,4 +96,8 @@ def load_keyframes(workdir: str | os.PathLike, name: str, views: Views) -> list[
         raise ValueError(f"{file}: has {len(path.poses)} frames, expected at most {MAX_KEYFRAMES} keyframes")
     width, height = (min(side, MAX_SIDE) for side in (path.width, path.height))
     fovs = 2 * np.arctan(0.5 * path.height / path.focal[:, 1])
-    return [FrameCamera(pose, float(fov), width, height) for pose, fov in zip(path.poses, fovs, strict=True)]
+    instants = np.zeros(len(fovs)) if path.time is None else path.time
+    return [
+        FrameCamera(pose, float(fov), width, height, float(time))
+        for pose, fov, time in zip(path.poses, fovs, instants, strict=True)
+    ]

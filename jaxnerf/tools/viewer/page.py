@@ -12,11 +12,10 @@ import numpy as np
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.poses import axis_of, gaze_center
 from jaxnerf.data.geometry.world import direction_in_run
-from jaxnerf.evaluation import output_images
 from jaxnerf.evaluation.paths.render_path import Frames, Output, render_path
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.tools.uncertainty.cleaning import MAX_UNCERTAINTY, cleaned
-from jaxnerf.tools.viewer.frame_renderer import MAX_SIDE, MODES, UNCERTAINTY, FrameCamera, frame_image
+from jaxnerf.tools.viewer.frame_renderer import MAX_SIDE, MODES, UNCERTAINTY, FrameCamera, frame_image, view_image
 from jaxnerf.tools.viewer.keyframes import MAX_KEYFRAMES, cameras_through, load_keyframes, save_path
 from jaxnerf.tools.viewer.occupied_cells import surface_cells
 from jaxnerf.tools.viewer.render_loop import Delivery, Request
@@ -26,6 +25,7 @@ _AXES = {"+x": (1, 0, 0), "+y": (0, 1, 0), "+z": (0, 0, 1), "-x": (-1, 0, 0), "-
 _MAX_FRUSTUMS, _THUMBNAIL, _BESIDE = 120, 64, 400  # views, px, px
 _NARROW = 0.75  # width over height of a window, below which the controls are folded at first: a phone's
 _MAX_WAITING = 32  # uses of controls that wait for their turn; later ones are dropped
+_PLAY_EVERY = 0.1  # s between times while time runs
 _STATUS_EVERY = 0.25  # s between changes of the status while the camera moves
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])  # viser's cameras look along +z with y down
 
@@ -60,6 +60,9 @@ class Page:
         with gui.add_folder("Rendering", expand_by_default=wide):
             self._mode = self._add(gui.add_dropdown("Show", self._modes()), self._change_mode)
             self._resolution = self._add(gui.add_dropdown("Resolution (px)", RESOLUTIONS, initial_value="800"))
+            moves = "time" in self._viewer.run.experiment.model.needs
+            self._time = self._add(gui.add_slider("Time", 0.0, 1.0, 0.005, 0.0, visible=moves))
+            self._play = self._add(gui.add_checkbox("Play", False, visible=moves), self._run_time)
             self._crop = self._add(gui.add_checkbox("Crop", False))
             if not self._viewer.client_rendering.refused:
                 gui.add_markdown("[Render in this browser](/?here)")
@@ -115,8 +118,8 @@ class Page:
         elif delivery.frames_per_second is None:
             kind = pace = "refining"
         else:
-            kind, pace = "moving", f"{delivery.frames_per_second:.0f} frames/s"
-        if kind != "moving" or kind != self._kind or now - self._reported > _STATUS_EVERY:
+            kind, pace = "in motion", f"{delivery.frames_per_second:.0f} frames/s"
+        if kind != "in motion" or kind != self._kind or now - self._reported > _STATUS_EVERY:
             self._kind = kind
             score = f" · {self._viewer.score}" if self._viewer.score else ""
             self.report(f"**step {delivery.step:,}**{score}\n\n{pace} · {camera.width} × {camera.height} px")
@@ -185,7 +188,8 @@ class Page:
         rotation = _rotation(numbers[:4] / length) @ _TO_OPENCV
         scale = min(longest / max(width, height), 1.0)
         sides = (max(round(side * scale), 1) for side in (width, height))
-        return FrameCamera(np.column_stack([rotation, numbers[4:7]]), float(numbers[7]), *sides)
+        time = _number(self._time.value, "the time", 0, 1)
+        return FrameCamera(np.column_stack([rotation, numbers[4:7]]), float(numbers[7]), *sides, time)
 
     def _request(self):
         """Requests the frame of the camera and the settings, unless what the browser sent makes no sense."""
@@ -196,6 +200,17 @@ class Page:
         if camera is not None and not self._closed.is_set():
             uncertain = self._mode.value == UNCERTAINTY
             self._viewer.loop.submit(self._client.client_id, Request(camera, crop, uncertain))
+
+    def _run_time(self):
+        """Lets the time run, as often as the seconds of the path say, until the control is off."""
+
+        def play():
+            while self._play.value is True and not self._closed.wait(_PLAY_EVERY):
+                passed = _PLAY_EVERY / _number(self._path_seconds.value, "the duration", 0.01, 1e5)
+                self._time.value = (_number(self._time.value, "the time", 0, 1) + passed) % 1.0
+                self._request()
+
+        threading.Thread(target=self._guarded_without_lock(play), daemon=True).start()
 
     def _crop_box(self):
         if self._crop.value is not True:
@@ -330,14 +345,14 @@ class Page:
             aspect=width / height,
             scale=0.05 * self._size,
             thickness=0.001 * self._size,
-            image=_view_image(views, index, _THUMBNAIL),
+            image=view_image(views, index, _THUMBNAIL),
             wxyz=_quaternion(pose[:, :3] @ _TO_OPENCV),
             position=pose[:, 3],
         )
 
         def visit():
             self._show_view(index, pose[:, 1])
-            self._beside.image = _view_image(views, index, _BESIDE)
+            self._beside.image = view_image(views, index, _BESIDE)
             self._beside.label = views.names[index] if views.names else f"view {index}"
             self._beside.visible = True
 
@@ -481,10 +496,3 @@ def _quaternion(rotation):
     from viser.transforms import SO3
 
     return SO3.from_matrix(np.asarray(rotation, np.float64)).wxyz
-
-
-def _view_image(views, index, longest):
-    """Returns a training image over its background, uint8, subsampled to at most so many px."""
-    image = np.asarray(views.image(index))
-    every = -(-max(image.shape[:2]) // longest)
-    return output_images.to_8_bits(image[::every, ::every])

@@ -593,15 +593,15 @@ def test_times_are_all_or_none(dataset):
 
     def timed(content):
         for index, frame in enumerate(content["frames"]):
-            frame["time"] = index / 10
+            frame["time"] = 5 * index
         content["frames"].reverse()
 
     folder = dataset(timed)
     capture = read_capture(folder)
-    assert [frame.time for frame in capture.frames] == [index / 10 for index in range(8)]
+    assert [frame.time for frame in capture.frames] == [5.0 * index for index in range(8)]
     assert fingerprint(capture) != fingerprint(plain)
     views = jaxnerf.load_dataset(folder, world="file", num_views=3)
-    assert [int(name) / 10 for name in views.names] == pytest.approx(views.time.tolist())
+    assert [int(name) / 7 for name in views.names] == pytest.approx(views.time.tolist())
 
     def incomplete(content):
         timed(content)

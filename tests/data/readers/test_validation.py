@@ -23,7 +23,7 @@ def test_read_npy_reads_what_numpy_writes(tmp_path):
 def test_read_npy_unpickles_nothing(tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(ValueError, match="a.npy: unreadable .Python objects, which are never unpickled."):
+    with pytest.raises(ValueError, match="a.npy: unreadable .*Python objects"):
         read_npy(path, "numbers")
     with pytest.raises(ValueError, match="b.npy: no such file, expected numbers"):
         read_npy(tmp_path / "b.npy", "numbers")

@@ -583,7 +583,7 @@ def test_what_files_state_and_training_does_not_follow_is_reported(folders, tmp_
     assert "WARNING colour profiles differ, and images are read as they are: 5 pRGB" in text and "7 sRGB" in text
     assert "WARNING the principal point of 000 is -900, 80 px in an image of 160, 160 px, so outside" in text
     assert "% of the pixels have no ray: " in text and "expected a ray for each" in text
-    assert "time       images state one, which is not used: the scene is trained as static" in text
+    assert "time       training images at 1 time from 0 to 0, " in text and "images each, as of a rig" in text
 
 
 def test_split_files_with_full_intrinsics_are_checked_as_one_file_is(folders, tmp_path):

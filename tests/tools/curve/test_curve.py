@@ -2,9 +2,12 @@
 
 import csv
 import dataclasses
+import io
+import os
 
 import pytest
 
+from jaxnerf.runtime.printed_text import printable
 from jaxnerf.tools.curve import curve, drawing, measure, points
 from jaxnerf.tools.curve import runs as curve_runs
 from jaxnerf.tools.curve.points import Point
@@ -149,3 +152,17 @@ def test_flags_of_a_curve_need_one(tmp_path):
     assert code == 1 and "--seconds is missing" in err
     code, _, err = run_forked("report", f"--curve={tmp_path}", "--csv=a.csv", "--seconds=5")
     assert code == 1 and "--curve takes no RUN, --csv or --plot" in err
+
+
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1+1", "-1+1", "@SUM(1)", "\t=1", "\r=1", " =1", "=cmd|' /C calc'!A0", "\uff1d1"]
+)
+def test_a_spreadsheet_computes_no_text(text):
+    assert points.spreadsheet_cell(text) == "'" + printable(text)
+
+
+@pytest.mark.parametrize("value", [-1.5, 3, None, "-1.5", "+2e3", "-inf", "run", "a=b", "", os.sep])
+def test_numbers_and_other_texts_stay_as_they_are_in_cells(value):
+    assert points.spreadsheet_cell(value) == value
+    file = io.StringIO()
+    csv.writer(file).writerow([points.spreadsheet_cell(value)])

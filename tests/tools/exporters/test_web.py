@@ -38,7 +38,7 @@ FIELDS = {
 
 def packed(options, precision="16 bits", contracted=False, as_scene=False, ndc=False):
     """Returns the function that evaluates a field with random parameters, and its WebScene; as_scene: it is a scene."""
-    network, field = HashGrid(**options), hash_grid_field(**options)
+    field = hash_grid_field(**options)
     params = jax.jit(field.init)(jax.random.key(1))
     leaves, tree = jax.tree.flatten(params)
     rng = np.random.default_rng(2)
@@ -48,7 +48,7 @@ def packed(options, precision="16 bits", contracted=False, as_scene=False, ndc=F
     lower, upper = (np.float32(options[name]) for name in ("lower", "upper"))
     grid = create_grid(lower, upper, occupied, initial_density=1.0, contracted=contracted)
     march = {"step_size": 0.02, "early_stop_eps": 0.01, "background": None}
-    scene = web_scene.pack(network, params, grid, precision=precision, ndc=ndc, **march)
+    scene = web_scene.pack(field.network, params, grid, precision=precision, ndc=ndc, **march)
     field = contract_field(field, lower, upper) if contracted else field
     decoded = scene.decoded(params)
 
@@ -217,11 +217,11 @@ def test_a_table_that_no_texture_holds_is_refused(monkeypatch):
 
 
 def test_parameters_that_are_not_finite_are_refused():
-    network, options = HashGrid(**SMALL), FIELDS["dense"]
-    params = jax.jit(hash_grid_field(**options).init)(jax.random.key(0))
+    field = hash_grid_field(**FIELDS["dense"])
+    params = jax.jit(field.init)(jax.random.key(0))
     params = {**params, "bias": params["bias"].at[0].set(jnp.nan)}
     with pytest.raises(ValueError, match="not finite"):
-        web_scene.pack(network, params, None, precision="8 bits", step_size=1, early_stop_eps=0, background=None)
+        web_scene.pack(field.network, params, None, precision="8 bits", step_size=1, early_stop_eps=0, background=None)
 
 
 @pytest.mark.parametrize(

@@ -346,3 +346,12 @@ def test_an_evaluation_writes_and_scores_predicted_errors(unoptimized, tmp_path,
     assert clean["settings"]["max_uncertainty"] == limit and clean["psnr"] != results["psnr"]
     said = re.findall(r"cleaning +([\d.]+) % of the occupied cells", capsys.readouterr().err)
     assert len(said) == 1 and 10 < float(said[0]) < 90
+
+
+def test_the_line_of_predicted_errors_names_what_results_hold():
+    assert predict.line({"psnr": 30.0}) is None
+    found = {"ause_rmse": 0.25, "ause_mae": 0.125, "target_coverage": 0.9, "coverage": 0.875}
+    expected = "predicted errors: AUSE 0.250 (RMSE), 0.125 (MAE), 87.5 % of errors within intervals for 90 %"
+    assert predict.line({"uncertainty": found}) == expected
+    on_object = {"ause_rmse_object": 0.5, "ause_mae_object": 0.75}
+    assert "on the object 0.500, 0.750" in predict.line({"uncertainty": found | on_object})

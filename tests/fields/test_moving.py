@@ -1,0 +1,77 @@
+"""The field that moves: at rest at first, a hash grid at displaced positions, and a hash grid where nothing moves."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnerf.core.scene import needs_of
+from jaxnerf.fields import hash_grid
+from jaxnerf.fields.base import at_time
+from jaxnerf.fields.moving import MovingOptions, from_options
+from jaxnerf.options import Device, Facts
+
+BOX = (-1.0, -1.5, 0.0), (1.0, 1.5, 4.0)
+GRID = {"resolutions": (4, 8), "prefilter": False, "compute_dtype": "float32", "table_size": 64}
+
+
+@pytest.fixture(scope="module")
+def points():
+    x = np.random.default_rng(0).uniform(*BOX, (3, 5, 3)).astype(np.float32)
+    return x, np.float32(np.broadcast_to([0, 0, 1.0], (3, 1, 3))), np.float32([[0.0], [0.3], [1.0]])
+
+
+def test_it_is_at_rest_at_first_and_each_time_has_a_gradient(points):
+    x, viewdirs, time = points
+    field = from_options(MovingOptions(**GRID, motion_depth=2), BOX)
+    assert needs_of(field.apply) == ("time",) and field.network is None
+    params = field.init(jax.random.key(0))
+    others = {name: value for name, value in params.items() if name != "motion"}
+    still = hash_grid.from_options(hash_grid.HashGridOptions(**GRID), BOX)
+    for got, expected in zip(
+        field.apply(params, x, viewdirs, time=time), still.apply(others, x, viewdirs), strict=True
+    ):
+        np.testing.assert_allclose(got, expected, rtol=1e-5)
+    kernel = jax.grad(lambda params: field.apply(params, x, viewdirs, time=time)[1].sum())(params)["motion"]["kernel"]
+    assert (jnp.abs(kernel).max(axis=0) > 0).all()
+
+
+def test_positions_are_displaced_by_fractions_of_the_box_that_depend_on_time(points):
+    """The last layer reads one unit, of which only the time is an input, so that all points move alike."""
+    x, viewdirs, time = points
+    field = from_options(MovingOptions(**GRID, motion_depth=1, motion_width=8, motion_freqs=0, time_freqs=0), BOX)
+    params = field.init(jax.random.key(0))
+    first = np.zeros((4, 8), np.float32)
+    first[3, 0] = 1.0  # the time from -1 to 1
+    kernel = np.zeros((8, 3), np.float32)
+    kernel[0] = [1.0, 0, -2.0]
+    params["motion"] = {"layer_0": {"kernel": first, "bias": np.zeros(8, np.float32)}, "kernel": kernel}
+    moved = x + 0.1 * np.maximum(2 * time - 1, 0)[..., None] * np.float32([1, 0, -2]) * np.float32([2, 3, 4])
+    others = {name: value for name, value in params.items() if name != "motion"}
+    still = hash_grid.from_options(hash_grid.HashGridOptions(**GRID), BOX).apply(others, moved, viewdirs)
+    for got, expected in zip(field.apply(params, x, viewdirs, time=time), still, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-4)
+    last = at_time(field, 1.0)
+    assert needs_of(last.apply) == ()
+    for got, expected in zip(last.apply(params, x, viewdirs), still, strict=True):
+        np.testing.assert_allclose(got[2], expected[2], rtol=1e-4)
+        assert not np.allclose(got[0], expected[0], rtol=1e-4)
+
+
+def test_cones_have_a_radius_and_scenes_without_times_no_motion(points):
+    x, viewdirs, time = points
+    field = from_options(MovingOptions(**{**GRID, "prefilter": True}, motion_depth=1), BOX)
+    assert needs_of(field.apply) == ("radius", "time")
+    params = field.init(jax.random.key(0))
+    wide, narrow = (
+        field.apply(params, x, viewdirs, time=time, radius=np.full((3, 1), radius, np.float32))[0]
+        for radius in (1.0, 1e-4)
+    )
+    assert not np.allclose(wide, narrow, rtol=1e-3)
+    device = Device("cpu", 1)
+    for has_times, depth in ((True, 2), (False, 0)):
+        facts = Facts(num_views=2, side=100.0, footprint=0.1, has_times=has_times)
+        options, lines = MovingOptions().resolve(facts, device)
+        assert options.motion_depth == depth and any(line.startswith("motion ") for line in lines)
+    field = from_options(MovingOptions(**GRID, motion_depth=0), BOX)
+    assert needs_of(field.apply) == () and isinstance(field.network, hash_grid.HashGrid)
