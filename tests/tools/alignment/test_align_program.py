@@ -24,10 +24,10 @@ def ran(program, *flags):
     return out + err
 
 
-@pytest.mark.slow
+@pytest.mark.extra
 def test_refined_cameras_pass_through_all_programs(unoptimized, tmp_path):
     data, run = tmp_path / "data", tmp_path / "run"
-    captures.write_transforms(data, captures.shoot(captures.orbit(9)))
+    captures.write_transforms(data, captures.shoot(captures.orbit(9, height=12, width=16)))
     for steps in (5, 10):
         flags = as_flags({**OPTIONS, "train.max_steps": steps})
         log = ran("train", *SMOKE_FLAGS, f"--data_dir={data}", f"--workdir={run}", *flags)
@@ -36,8 +36,6 @@ def test_refined_cameras_pass_through_all_programs(unoptimized, tmp_path):
     results = json.loads((run / "eval" / "10" / "results.json").read_text())
     assert "pose and exposure aligned: PSNR " in log and results["aligned"] == "pose_exposure"
     assert results["psnr_pose_exposure_aligned"] > results["psnr"]
-    ran("eval", f"--workdir={run}", "--align=none", "--overwrite")
-    assert "aligned" not in json.loads((run / "eval" / "10" / "results.json").read_text())
     code, _, err = run_forked("eval", f"--workdir={run}", "--align=poses")
     assert code != 0 and "--align is 'poses'" in err and "Traceback" not in err
     ran("export", f"--workdir={run}", "--kind=cameras", "--name=refined")
