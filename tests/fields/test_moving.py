@@ -1,5 +1,8 @@
 """The field that moves: at rest at first, a hash grid at displaced positions, and a hash grid where nothing moves."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,39 +24,52 @@ def points():
     return x, np.float32(np.broadcast_to([0, 0, 1.0], (3, 1, 3))), np.float32([[0.0], [0.3], [1.0]])
 
 
-def test_it_is_at_rest_at_first_and_each_time_has_a_gradient(points):
-    x, viewdirs, time = points
-    field = from_options(MovingOptions(**GRID, motion_depth=2), BOX)
-    assert needs_of(field.apply) == ("time",) and field.network is None
+def made(**options):
+    """Returns the field, parameters whose density does not read the code, and the hash grid with these parameters."""
+    options = MovingOptions(**GRID, width=64, view_width=64, **options)
+    field = from_options(options, BOX)
     params = field.init(jax.random.key(0))
-    others = {name: value for name, value in params.items() if name != "motion"}
-    still = hash_grid.from_options(hash_grid.HashGridOptions(**GRID), BOX)
-    for got, expected in zip(
-        field.apply(params, x, viewdirs, time=time), still.apply(others, x, viewdirs), strict=True
-    ):
+    unread = np.zeros((options.motion_width, 64), np.float32)
+    kernel = np.concatenate([np.eye(64, dtype=np.float32), unread])
+    params["code"] = {"kernel": kernel, "bias": np.zeros(64, np.float32)}
+        "kernel": np.concatenate([np.eye(64, dtype=np.float32), unread]),
+        "bias": np.zeros(64, np.float32),
+    }
+    others = {name: value for name, value in params.items() if name not in ("motion", "code")}
+    names = [each.name for each in dataclasses.fields(hash_grid.HashGridOptions)]
+    still = hash_grid.HashGridOptions(**{name: getattr(options, name) for name in names})
+    return field, params, functools.partial(hash_grid.from_options(still, BOX).apply, others)
+
+
+def test_it_is_at_rest_at_first_and_displacements_have_a_gradient(points):
+    x, viewdirs, time = points
+    field, params, still = made(motion_depth=2)
+    assert needs_of(field.apply) == ("time",) and field.network is None
+    for got, expected in zip(field.apply(params, x, viewdirs, time=time), still(x, viewdirs), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-5)
     kernel = jax.grad(lambda params: field.apply(params, x, viewdirs, time=time)[1].sum())(params)["motion"]["kernel"]
     assert (jnp.abs(kernel).max(axis=0) > 0).all()
+    density = field.apply(field.init(jax.random.key(0)), x, viewdirs, time=np.float32([[0], [1], [1]]))[0]
+    again = field.apply(field.init(jax.random.key(0)), x, viewdirs, time=np.zeros((3, 1), np.float32))[0]
+    assert np.allclose(density[0], again[0], rtol=1e-5) and not np.isclose(density[1:], again[1:], rtol=1e-5).any()
 
 
 def test_positions_are_displaced_by_fractions_of_the_box_that_depend_on_time(points):
-    """The last layer reads one unit, of which only the time is an input, so that all points move alike."""
+    """The only output that is not 0 is that of a unit that reads the time alone, so that all points move alike."""
     x, viewdirs, time = points
-    field = from_options(MovingOptions(**GRID, motion_depth=1, motion_width=8, motion_freqs=0, time_freqs=0), BOX)
-    params = field.init(jax.random.key(0))
+    field, params, still = made(motion_depth=1, motion_width=8, motion_freqs=0, time_freqs=0)
     first = np.zeros((4, 8), np.float32)
     first[3, 0] = 1.0  # the time from -1 to 1
     kernel = np.zeros((8, 3), np.float32)
     kernel[0] = [1.0, 0, -2.0]
     params["motion"] = {"layer_0": {"kernel": first, "bias": np.zeros(8, np.float32)}, "kernel": kernel}
     moved = x + 0.1 * np.maximum(2 * time - 1, 0)[..., None] * np.float32([1, 0, -2]) * np.float32([2, 3, 4])
-    others = {name: value for name, value in params.items() if name != "motion"}
-    still = hash_grid.from_options(hash_grid.HashGridOptions(**GRID), BOX).apply(others, moved, viewdirs)
-    for got, expected in zip(field.apply(params, x, viewdirs, time=time), still, strict=True):
+    at_rest = still(moved, viewdirs)
+    for got, expected in zip(field.apply(params, x, viewdirs, time=time), at_rest, strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-4)
     last = at_time(field, 1.0)
     assert needs_of(last.apply) == ()
-    for got, expected in zip(last.apply(params, x, viewdirs), still, strict=True):
+    for got, expected in zip(last.apply(params, x, viewdirs), at_rest, strict=True):
         np.testing.assert_allclose(got[2], expected[2], rtol=1e-4)
         assert not np.allclose(got[0], expected[0], rtol=1e-4)
 
