@@ -32,9 +32,6 @@ def made(**options):
     unread = np.zeros((options.motion_width, 64), np.float32)
     kernel = np.concatenate([np.eye(64, dtype=np.float32), unread])
     params["code"] = {"kernel": kernel, "bias": np.zeros(64, np.float32)}
-        "kernel": np.concatenate([np.eye(64, dtype=np.float32), unread]),
-        "bias": np.zeros(64, np.float32),
-    }
     others = {name: value for name, value in params.items() if name not in ("motion", "code")}
     names = [each.name for each in dataclasses.fields(hash_grid.HashGridOptions)]
     still = hash_grid.HashGridOptions(**{name: getattr(options, name) for name in names})
