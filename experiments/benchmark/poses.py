@@ -1,22 +1,25 @@
 """Trains on cameras that are wrong by a known amount, and measures how far the refined ones are from the truth.
 
     JAXNERF_SCENES=... python experiments/benchmark/poses.py [--dataset=lego] [--side=100] [--noise=0.15] \
-        [--seeds=0,1] [--steps=4000] [--set=cameras.refine_lr=2e-3] [--out=runs/poses] [--page=docs/results/captures.md]
+        [--seeds=0,1] [--steps=4000] [--set=cameras.refine_lr=2e-3] [--out=runs/poses] [--align] [--without] \
+        [--page=docs/results/captures.md]
 
 The poses of the training views are perturbed as BARF (arXiv:2104.06405) does for synthetic scenes: by motions of the
 world before the true cameras, exp(twist) with twists from a normal distribution of the standard deviation --noise. With
 --degrees=0.1,0.3,1,3 each camera is turned about itself instead, by a normal angle about each axis, and moved by the
-same fraction of its distance from the origin. "still_life" is the embedded scene in closed form.
+same fraction of its distance from the origin, in a capture from what the cameras look at. "still_life" is the embedded
+scene in closed form. Cameras of a capture are refined as by default, those of other scenes, which may be far off, from
+step 50 on at a rate of 4e-3.
 
 Errors are those after the similarity that maps the refined cameras' positions onto the true ones best (Umeyama 1991);
-the test views are mapped by its inverse and scored. BARF then also optimises their poses on their images, which this
-does not. A finished run is not repeated.
+the test views are mapped by its inverse and scored. BARF then also optimises their poses on their images, as --align
+does in a further column. --without trains each run also without refinement. A finished run is not repeated.
 """
 
 import dataclasses
 import pathlib
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from absl import flags
@@ -25,43 +28,37 @@ from jaxtyping import Float
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 from benchmark import settings
+from pose_estimation.pose_errors import errors, similarity
 
 from jaxnerf.core.poses import se3_exponential
 from jaxnerf.core.views import Views
+from jaxnerf.data.facts import LookAt
 from jaxnerf.runtime import cli
 from jaxnerf.tools.curve.measure import SCORE
 
 HEADS = ("run", "noise", "seed", "steps", "rotation before, degrees", "after", "position before, units", "after")
 HEADS += ("focal length", "PSNR, dB")
+ALIGNED, _POSE_ALIGNED = "pose aligned, dB", "psnr_pose_aligned"
 # Of lego at 400 px, by the documentation of nerfacc 0.5, in which its sampler is used in BARF's own code.
 PUBLISHED = [
     ("BARF, lego at 400 px, 9.5 h on a 2080 Ti", "0.15", "-", "-", "-", "0.105", "-", "0.0043", "-", "31.16"),
     ("BARF with nerfacc, the same, 1.5 h", "0.15", "-", "-", "-", "0.081", "-", "0.0038", "-", "32.25"),
 ]
 _FULL_SIDE = 800
+_BLENDER = ("lego", "mic")
+_FAR_OFF = {"cameras.refine_lr": 4e-3, "cameras.refine_start_step": 50}
 
-_DATASET = flags.DEFINE_string("dataset", "lego", "Folder of a dataset in Blender's format, or still_life.")
-_SIDE = flags.DEFINE_integer("side", 100, "px of an image's side.", lower_bound=8)
+_DATASET = flags.DEFINE_string("dataset", "lego", "lego, mic, still_life, or the folder of a capture.")
+_SIDE = flags.DEFINE_integer("side", 100, "px of an image's side, of a capture of its width.", lower_bound=8)
 _NOISE = flags.DEFINE_list("noise", ["0.15"], "Standard deviations of the twists, as BARF perturbs.")
 _DEGREES = flags.DEFINE_list("degrees", [], "Standard deviations of turns about the cameras, in place of --noise.")
 _SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds of the noise and of training.")
 _STEPS = flags.DEFINE_integer("steps", 4000, "Steps of training.", lower_bound=1)
+_ALIGN = flags.DEFINE_bool("align", False, "Whether test views are also scored after their poses are fitted to them.")
+_WITHOUT = flags.DEFINE_bool("without", False, "Whether to train without refined cameras, too.")
 _SET = settings.define_set()
 _OUT = flags.DEFINE_string("out", "runs/poses", "Folder of the runs.")
 _TABLE = flags.DEFINE_string("table", "poses", "Name of the table in the marks of --page.")
-
-
-class Similarity(NamedTuple):
-    """x -> scale * turn @ x + move."""
-
-    scale: float
-    turn: Float[np.ndarray, "3 3"]
-    move: Float[np.ndarray, "3"]
-
-    def __call__(self, poses: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, "V 3 4"]:
-        """Returns the cameras in the other world."""
-        eyes = self.scale * poses[:, :, 3] @ self.turn.T + self.move
-        return np.concatenate([self.turn @ poses[:, :, :3], eyes[:, :, None]], axis=2)
 
 
 def main(argv: list[str]) -> None:
@@ -71,12 +68,16 @@ def main(argv: list[str]) -> None:
     kinds = [("degrees", float(value)) for value in _DEGREES.value] or [("twist", float(v)) for v in _NOISE.value]
     for kind, amount in kinds:
         for seed in common.seeds_of("--seeds", _SEEDS.value):
-            folder = pathlib.Path(_OUT.value) / f"{name}_{_SIDE.value}_{kind}_{amount:g}_seed{seed}_{_STEPS.value}"
-            found = measured(folder, kind, amount, seed)
-            rows.append(row(f"{name}, {_SIDE.value} px", found, kind, amount, seed, _STEPS.value))
-            print(f"{folder}: {found}", flush=True)
+            for refine in (False, True)[not _WITHOUT.value :]:
+                folder = f"{name}_{_SIDE.value}_{kind}_{amount:g}_seed{seed}_{_STEPS.value}" + "_given" * (not refine)
+                found = measured(pathlib.Path(_OUT.value) / folder, kind, amount, seed, refine)
+                label = f"{name}, {_SIDE.value} px" + ", not refined" * (not refine)
+                rows.append(row(label, found, kind, amount, seed, _STEPS.value))
+                print(f"{folder}: {found}", flush=True)
     published = PUBLISHED if (name, kinds) == ("lego", [("twist", 0.15)]) else []
-    common.publish([*common.markdown(HEADS, [*rows, *published]), "", *common.provenance()], _TABLE.value)
+    published = [(*cells, *["-"] * _ALIGN.value) for cells in published]
+    heads = (*HEADS, *[ALIGNED] * _ALIGN.value)
+    common.publish([*common.markdown(heads, [*rows, *published]), "", *common.provenance()], _TABLE.value)
 
 
 def row(name: str, found: dict[str, float], kind: str, amount: float, seed: int, steps: int) -> tuple[str, ...]:
@@ -84,31 +85,25 @@ def row(name: str, found: dict[str, float], kind: str, amount: float, seed: int,
     turns = (f"{found['turn_before']:.2f}", f"{found['turn']:.3f}")
     moves = (f"{found['move_before']:.3f}", f"{found['move']:.4f}")
     noise = f"{amount:g} degrees" if kind == "degrees" else f"{amount:g}"
-    return (
-        name,
-        noise,
-        str(seed),
-        f"{steps:,}",
-        *turns,
-        *moves,
-        f"{found['focal']:.4f}",
-        f"{found['psnr']:.2f}",
-    )
+    scores = (f"{found[key]:.2f}" for key in ("psnr", _POSE_ALIGNED) if key in found)
+    return (name, noise, str(seed), f"{steps:,}", *turns, *moves, f"{found['focal']:.4f}", *scores)
 
 
-def measured(folder: pathlib.Path, kind: str, amount: float, seed: int) -> dict[str, Any]:
+def measured(folder: pathlib.Path, kind: str, amount: float, seed: int, refine: bool) -> dict[str, Any]:
     """Trains a run on perturbed cameras if it is not there yet; returns errors of its cameras and its PSNR."""
     from jaxnerf.evaluation.evaluate import score_run
     from jaxnerf.evaluation.restore import newest_step, refined_views, restore_run
+    from jaxnerf.tools.alignment.align_views import Aligner
     from jaxnerf.training.loop import train
 
     done = common.read_json(folder / SCORE)
     if done:
         return done
-    config = configuration(seed)
+    config = configuration(seed, refine)
     views = common.load_split(config, "train")
     truth = np.asarray(views.cameras.to_world, np.float64)
-    noisy = perturbed(truth, amount, seed) if kind == "twist" else turned(truth, amount, seed)
+    center = LookAt(views).center if _is_capture() else None
+    noisy = perturbed(truth, amount, seed) if kind == "twist" else turned(truth, amount, seed, center)
     given = with_poses(views, noisy)
     if not train(config, folder, views=given):
         raise ValueError(f"{folder}: training was stopped; the same command continues it")
@@ -120,27 +115,36 @@ def measured(folder: pathlib.Path, kind: str, amount: float, seed: int) -> dict[
     test = with_poses(test, to_refined(np.asarray(test.cameras.to_world, np.float64)))
     before, after = (errors(each, truth) for each in (noisy, poses))
     focal = float(np.mean(np.asarray(refined.cameras.focal) / np.asarray(views.cameras.focal)))
-    psnr = score_run(run, folder, split="test", overwrite=True, views=test)["psnr"]
+    aligner = Aligner(("pose",)) if _ALIGN.value else None
+    scored = score_run(run, folder, split="test", overwrite=True, views=test, aligner=aligner)
     found = {
         "turn_before": before[0],
         "move_before": before[1],
         "turn": after[0],
         "move": after[1],
         "focal": focal,
+        **{key: scored[key] for key in ("psnr", _POSE_ALIGNED) if key in scored},
     }
-    common.write_json(folder / SCORE, found | {"psnr": psnr})
-    return found | {"psnr": psnr}
+    common.write_json(folder / SCORE, found)
+    return found
 
 
-def configuration(seed: int):
+def configuration(seed: int, refine: bool):
     """Returns the config of a run of the chosen dataset."""
-    options = {"cameras.refine": True, "train.preview_every": 0.0}
+    options = {"cameras.refine": refine, "train.preview_every": 0.0, **({} if _is_capture() else _FAR_OFF)}
     options |= {"train.max_seconds": 0.0, "train.max_steps": _STEPS.value, "train.lr_steps": _STEPS.value}
     if _DATASET.value == "still_life":
         data = {"data.format": "synthetic", "data.dir": "", "data.factor": 1, "data.size": _SIDE.value}
+    elif _is_capture():
+        data = {"data.dir": _DATASET.value, "data.width": _SIDE.value}
     else:
         data = {"data.format": "blender", "data.dir": _DATASET.value, "data.factor": _FULL_SIDE // _SIDE.value}
-    return common.configuration("lego_fast", {**data, **options, **dict(settings.parse(_SET.value))}, seed=seed)
+    fields = {**data, **options, **dict(settings.parse(_SET.value))}
+    return common.configuration("capture" if _is_capture() else "lego_fast", fields, seed=seed)
+
+
+def _is_capture():
+    return _DATASET.value not in (*_BLENDER, "still_life")
 
 
 def perturbed(poses: Float[np.ndarray, "V 3 4"], amount: float, seed: int) -> Float[np.ndarray, "V 3 4"]:
@@ -152,31 +156,22 @@ def perturbed(poses: Float[np.ndarray, "V 3 4"], amount: float, seed: int) -> Fl
     return np.concatenate([back @ poses[:, :, :3], eyes], axis=2)
 
 
-def turned(poses: Float[np.ndarray, "V 3 4"], degrees: float, seed: int) -> Float[np.ndarray, "V 3 4"]:
-    """Returns cameras that are turned about themselves, and moved by the same fraction of their mean distance."""
+def turned(
+    poses: Float[np.ndarray, "V 3 4"], degrees: float, seed: int, center: Float[np.ndarray, "3"] | None = None
+) -> Float[np.ndarray, "V 3 4"]:
+    """Returns cameras that are turned about themselves, and moved by the same fraction of their distance.
+
+    Args:
+        poses: camera to world.
+        degrees: the standard deviation of the angles about each axis.
+        seed: of the angles.
+        center: from which the mean distance is taken; None: the origin.
+    """
     size = np.radians(degrees) * np.random.default_rng(seed).normal(size=(len(poses), 6))
     turns = se3_exponential(np.float32(np.concatenate([size[:, :3], 0 * size[:, 3:]], axis=1)))
-    distance = np.linalg.norm(poses[:, :, 3], axis=1).mean()
+    distance = np.linalg.norm(poses[:, :, 3] - (0 if center is None else center), axis=1).mean()
     eyes = poses[:, :, 3] + distance * size[:, 3:]
     return np.concatenate([np.asarray(turns)[:, :, :3] @ poses[:, :, :3], eyes[:, :, None]], axis=2)
-
-
-def similarity(start: Float[np.ndarray, "V 3"], end: Float[np.ndarray, "V 3"]) -> Similarity:
-    """Returns the similarity that maps points onto others with the least squared distance (Umeyama 1991)."""
-    centers = start.mean(axis=0), end.mean(axis=0)
-    left, sizes, right = np.linalg.svd((end - centers[1]).T @ (start - centers[0]) / len(start))
-    signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
-    turn = (left * signs) @ right
-    scale = float((sizes * signs).sum() / ((start - centers[0]) ** 2).sum(axis=1).mean())
-    return Similarity(scale, turn, centers[1] - scale * turn @ centers[0])
-
-
-def errors(poses: Float[np.ndarray, "V 3 4"], truth: Float[np.ndarray, "V 3 4"]) -> tuple[float, float]:
-    """Returns the mean error of rotations, degrees, and of positions, world units, after the best similarity."""
-    aligned = similarity(poses[:, :, 3], truth[:, :, 3])(poses)
-    apart = np.linalg.norm(aligned[:, :, :3] - truth[:, :, :3], axis=(1, 2)) / np.sqrt(8)
-    angles = np.degrees(2 * np.arcsin(np.minimum(apart, 1)))
-    return float(angles.mean()), float(np.linalg.norm(aligned[:, :, 3] - truth[:, :, 3], axis=1).mean())
 
 
 def with_poses(views: Views, poses: Float[np.ndarray, "V 3 4"]) -> Views:

@@ -6,26 +6,27 @@ from jaxnerf.data.synthetic import load_synthetic
 from studies import study
 
 poses = study("benchmark/poses")
+pose_errors = study("pose_estimation/pose_errors")
 TRUTH = np.float64(load_synthetic(size=200).cameras.to_world)
 
 
 def test_errors_do_not_depend_on_the_world():
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     turn *= np.linalg.det(turn)
-    to_other = poses.Similarity(1.7, turn, np.array([0.3, -2.0, 5.0]))
-    found = poses.similarity(TRUTH[:, :, 3], to_other(TRUTH)[:, :, 3])
+    to_other = pose_errors.Similarity(1.7, turn, np.array([0.3, -2.0, 5.0]))
+    found = pose_errors.similarity(TRUTH[:, :, 3], to_other(TRUTH)[:, :, 3])
     np.testing.assert_allclose(found.scale, 1.7)
     np.testing.assert_allclose(found.turn, turn, atol=1e-9)
     np.testing.assert_allclose(found.move, to_other.move, atol=1e-9)
-    np.testing.assert_allclose(poses.errors(to_other(TRUTH), TRUTH), 0, atol=1e-4)
+    np.testing.assert_allclose(pose_errors.errors(to_other(TRUTH), TRUTH), 0, atol=1e-4)
 
 
 def test_cameras_that_are_turned_about_themselves_have_the_errors_that_are_asked_for():
-    degrees, moves = poses.errors(poses.turned(TRUTH, 1.0, 0), TRUTH)
+    degrees, moves = pose_errors.errors(poses.turned(TRUTH, 1.0, 0), TRUTH)
     expected = np.sqrt(8 / np.pi)  # the mean length of a normal vector of three components
     np.testing.assert_allclose(degrees, expected, rtol=0.1)
     np.testing.assert_allclose(moves, expected * np.radians(4), rtol=0.1)
-    np.testing.assert_allclose(poses.errors(poses.turned(TRUTH, 0.0, 0), TRUTH), 0, atol=1e-4)
+    np.testing.assert_allclose(pose_errors.errors(poses.turned(TRUTH, 0.0, 0), TRUTH), 0, atol=1e-4)
 
 
 def test_a_motion_of_the_world_is_seen_by_the_cameras_that_barf_perturbs():
