@@ -31,7 +31,7 @@ def workdir(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_unseen_views_at_unseen_times_are_learned(workdir):
+def test_other_views_at_other_times_are_learned(workdir):
     run = jaxnerf.restore_run(workdir)
     test = run.experiment.load_split("test")
     value = score(run, test)
