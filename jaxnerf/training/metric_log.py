@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import os
 import pathlib
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from jaxnerf.core.metrics import decibels
 from jaxnerf.core.views import Views
@@ -257,9 +259,7 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
         options: the config's section `train`.
         out_of_time: whether train.max_seconds has passed.
     """
-    left = (options.max_steps - row["step"]) * options.batch_size / max(row["rays_per_second"], 1e-9)
-    if options.max_seconds:
-        left = min(left, options.max_seconds - row["seconds"])
+    left = _seconds_left(row, options)
     notes = f"  {row['nonfinite']} nonfinite steps" if row["nonfinite"] else ""
     if row["rays_dropped"]:
         fraction = row["rays_dropped"] / (row["rays"] + row["rays_dropped"])
@@ -270,6 +270,26 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
         f"{final_psnr(row):.2f} dB  {row['rays_per_second']:,.0f} rays/s  "
         f"{minutes(row['seconds'])} elapsed, {minutes(0.0 if out_of_time else left)} left{notes}"
     )
+
+
+def passes(row: dict[str, Any], options: Any, size: Int[np.ndarray, "V 2"]) -> str:
+    """Returns a line: how often a run reads each pixel at the pace of a row, and the width that it would read twice.
+
+    Args:
+        row: see `row`.
+        options: the config's section `train`.
+        size: [V, 2] height and width of the images, px.
+    """
+    rays = row["rays"] + row["rays_per_second"] * _seconds_left(row, options)
+    total = int(np.prod(np.asarray(size, np.int64), axis=1).sum())
+    line = f"passes        {rays / total:.2g} over {total:,} pixels at this pace"
+    width = max(int(size[:, 1].mean() * math.sqrt(rays / total / 2)), 1)
+    return line + (f"; images {width} px wide would be read twice" if rays < total else "")
+
+
+def _seconds_left(row, options):
+    left = (options.max_steps - row["step"]) * options.batch_size / max(row["rays_per_second"], 1e-9)
+    return min(left, options.max_seconds - row["seconds"]) if options.max_seconds else left
 
 
 def final_psnr(row: dict[str, Any]) -> float | None:
