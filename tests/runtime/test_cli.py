@@ -43,8 +43,8 @@ _PROGRAM = '''"""Prints a count and the names of all fields."""
 from jaxnerf.registry import FIELDS
 from jaxnerf.runtime import cli
 
-COUNT = cli.define_count("count", "The number of things.")
-LIMIT = cli.define_fraction("limit", "The most of a thing.")
+COUNT = cli.define_value("count", "The number of things.", int, cli.COUNT)
+LIMIT = cli.define_value("limit", "The most of a thing.", float, cli.PART)
 
 def main(argv):
     print(COUNT.value, *FIELDS.names(), *[LIMIT.value] * (LIMIT.value is not None))
