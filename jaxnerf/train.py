@@ -58,9 +58,11 @@ _SEEDS = flags.DEFINE_list(
     "Seeds of runs that train one after the other, such as 0,1,2,3: an ensemble. Each has a workdir of its own, "
     "seed_<seed> in --workdir.",
 )
-_BATCH = cli.define_count(
+_BATCH = cli.define_value(
     "batch",
     "The rays of a microbatch, or auto: as many as fit into memory. It overrides config.train.microbatch_size.",
+    int,
+    cli.COUNT,
 )
 _VIEWER = flags.DEFINE_bool("viewer", False, "Whether to show the scene in a web browser while it trains.")
 _VIEWER_HOST = flags.DEFINE_string(

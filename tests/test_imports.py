@@ -47,6 +47,7 @@ HANDS_OVER = {
     ("jaxnerf.report", "tools.curve"),
     ("jaxnerf.data.synthetic", "tools.embedded_scene"),
     ("jaxnerf.evaluation.run_flags", "tools.uncertainty"),
+    ("jaxnerf.training.metric_log", "tools.interop"),
     ("jaxnerf.extend", "tools.exporters"),
     ("jaxnerf.extend", "tools.uncertainty"),
 }

@@ -33,6 +33,12 @@ PROTOCOLS = {
         "blender",
         "nerf",
     ),
+    "dnerf": Protocol(
+        {**_WHOLE, "data.format": "blender", "data.background": "white"},
+        "alpha over white; the test views of the dataset's own list, each at its own time",
+        None,
+        "default",
+    ),
     "llff": Protocol(
         {**_WHOLE, "data.format": "llff"}, "every 8th view is a test view, the first one included", "llff", "nerf"
     ),
@@ -71,6 +77,11 @@ def _blender(dataset, side, seconds, *, work, beside=(), **overrides):
     return Job(dataset, "lego_fast", fixed | overrides, seconds, "blender", f"{dataset}, {work}", beside)
 
 
+def _dnerf(dataset, side, seconds, *, beside=()):
+    fixed = {"data.format": "blender", "data.dir": dataset, "data.factor": 800 // side}
+    return Job(dataset, "moving", fixed, seconds, "dnerf", f"{dataset}, a scene that moves, {side} px", beside)
+
+
 def _llff(dataset, factor, seconds, *, work, beside=()):
     fixed = {"data.format": "llff", "data.dir": dataset, "data.factor": factor}
     return Job(dataset, "capture", fixed, seconds, "llff", f"{dataset}, {work}", beside)
@@ -95,6 +106,8 @@ JOBS = {
     "lego_400": _blender("lego", 400, (180,), work="400 px"),
     "lego_800": _blender("lego", 800, (600,), work="800 px, its full size", beside=_OF_LEGO),
     "mic_800": _blender("mic", 800, (600,), work="800 px, its full size", beside=_OF_MIC),
+    "dnerf_lego_100": _dnerf("dnerf_lego", 100, (120,)),
+    "dnerf_lego_400": _dnerf("dnerf_lego", 400, (1800,), beside=("dnerf_lego, 400x400",)),
     "fern_4": _llff("fern", 4, (600,), work="forward-facing, 1008 px wide", beside=("fern, 1008x756",)),
     "trex_8": _llff("trex", 8, (300,), work="forward-facing, 504 px wide"),
     "fox_200": _capture("fox", (120, 300), work="fox, phone images, 216 px wide"),

@@ -48,6 +48,7 @@ _PER_IMAGE = "nerfbaselines, results of each image"
 _TABLE = "nerfbaselines, table of November 2025"
 _AVX2, _TWO_CORES = "one core, AVX2, CPU s", "two busy cores, AVX-512, CPU s"
 
+_DNERF, _RTX = "dnerf_lego, 400x400", "an RTX GPU; time: mean of 8 scenes"
 # Beside the benchmark, with the entries of TRAINING for the same images.
 BENCHMARK = [
     _entry("3DGS", 35.94, 359, "A100", _LEGO_25, _PER_IMAGE),
@@ -76,6 +77,12 @@ BENCHMARK = [
     _entry("nerfacto", 33.74, None, "A100", _MIC, _PER_IMAGE),
     _entry("mip-NeRF 360", 31.50, None, "A100", _MIC, _PER_IMAGE),
     _entry("TensoRF", 25.08, 32 * 60, "not said", "fern, 1008x756", _TABLE),
+    _entry("D-NeRF", 21.64, None, "not said; days", _DNERF, "arXiv:2011.13961"),
+    _entry("T-NeRF, occupancy grid", 24.32, 58 * 60, _RTX, _DNERF, "nerfacc t-nerf.rst"),
+    _entry("TiNeuVox", 24.32, 11.8 * 60, _RTX, _DNERF, "nerfacc tineuvox.rst"),
+    _entry("TiNeuVox + nerfacc", 25.17, 4.2 * 60, _RTX, _DNERF, "nerfacc tineuvox.rst"),
+    _entry("K-Planes", 25.18, 64 * 60, _RTX, _DNERF, "nerfacc kplanes.rst"),
+    _entry("K-Planes + nerfacc", 25.25, 39 * 60, _RTX, _DNERF, "nerfacc kplanes.rst"),
 ]
 
 # Run by hand, once each: TensoRF (VM decomposition, grid 32^3 to 100^3) in PyTorch, and OpenSplat's build for CPUs from

@@ -122,11 +122,7 @@ def render_rays(
     Raises:
         ValueError: on an unknown rule or an odd number for "gauss", and as uniform_edges and render_samples.
     """
-    if rule == "points":
-        samples = _uniform_points(key, rays, num_samples, in_disparity)
-    else:
-        edges = _uniform_edges("num_samples", rays, num_samples, rule, in_disparity)
-        samples = sampling.samples_from_edges(key, edges, rule=rule)
+    samples, _ = _evenly_spaced(key, rays, "num_samples", num_samples, rule, in_disparity)
     extras = {"median_depth": True} if median_depth else {}
     return render(scene, rays, samples, background=background, **extras)
 
@@ -166,11 +162,7 @@ def render_hierarchical(
         (Rendering, Rendering): coarse and fine. No gradient flows from the fine one to the coarse scene.
     """
     coarse_key, point_key, fine_key = sampling.split_key(key, 3)
-    if rule == "points":
-        samples = _uniform_points(coarse_key, rays, num_coarse, in_disparity)
-    else:
-        edges = _uniform_edges("num_coarse", rays, num_coarse, rule, in_disparity)
-        samples = sampling.samples_from_edges(coarse_key, edges, rule=rule)
+    samples, edges = _evenly_spaced(coarse_key, rays, "num_coarse", num_coarse, rule, in_disparity)
     first = render_samples(coarse, rays, samples, background=background)
     if rule == "points":
         # The released codes draw between the midpoints of the coarse points, from the inner weights.
@@ -304,14 +296,15 @@ def lengths_at_speeds(
     return jnp.where(unknown & (delta > 0), jnp.nan, length)
 
 
-def _uniform_points(key, rays, num_samples, in_disparity):
-    t = sampling.stratified_points(key, rays.near, rays.far, num_points=num_samples, in_disparity=in_disparity)
-    return sampling.samples_from_points(t)
-
-
-def _uniform_edges(name, rays, num_samples, rule, in_disparity):
-    num_segments = _num_segments(name, num_samples, rule)
-    return sampling.uniform_edges(rays.near, rays.far, num_segments=num_segments, in_disparity=in_disparity)
+def _evenly_spaced(key, rays, name, num_samples, rule, in_disparity):
+    """Returns evenly spaced samples, and the edges of their segments; of the rule "points" the points."""
+    options = {"in_disparity": in_disparity}
+    if rule == "points":
+        points = sampling.stratified_points(key, rays.near, rays.far, num_points=num_samples, **options)
+        return sampling.samples_from_points(points), points
+    number = _num_segments(name, num_samples, rule)
+    edges = sampling.uniform_edges(rays.near, rays.far, num_segments=number, **options)
+    return sampling.samples_from_edges(key, edges, rule=rule), edges
 
 
 def _num_segments(name, num_samples, rule):

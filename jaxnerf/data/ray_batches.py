@@ -301,9 +301,7 @@ def step_key(seed: Integer[ArrayLike, ""], step: Int[ArrayLike, ""]) -> Key[Arra
     return jax.random.fold_in(jax.random.key(seed), step)
 
 
-def random_rays(
-    views: Views, count: int, view_rays: Callable[..., Rays], *, pixel_offset: float = 0.5, seed: int = 0
-) -> Rays:
+def random_rays(views: Views, count: int, view_rays: Callable[..., Rays], *, pixel_offset: float = 0.5) -> Rays:
     """Returns Rays [count] through random pixels, almost equally many of each view. Colours are not read.
 
     Args:
@@ -311,9 +309,8 @@ def random_rays(
         count: number of rays.
         view_rays: (views, index, pixels [M, 2]) -> Rays [M].
         pixel_offset: see `pixel_grid`.
-        seed: of the choice.
     """
-    rng, parts = np.random.default_rng(seed), []
+    rng, parts = np.random.default_rng(0), []
     ends = np.linspace(0, count, len(views.size) + 1).astype(int)
     for index, (height, width) in enumerate(np.asarray(views.size)):
         each = ends[index + 1] - ends[index]

@@ -1,8 +1,6 @@
 """Finds views of a test split that are training views, too, so that their scores are not those of held-out views."""
 
-import filecmp
 import os
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,8 +8,7 @@ import numpy as np
 
 from jaxnerf.data.images.load_images import scored_splits, split_indices
 from jaxnerf.data.readers.base import Capture
-
-_SAMPLES, _SAMPLE = 3, 4096  # bytes of files of one size that are compared before the whole files are
+from jaxnerf.runtime.fingerprint import file_sha256
 
 
 class SharedView(NamedTuple):
@@ -31,7 +28,7 @@ class SharedView(NamedTuple):
 def shared_views(capture: Capture, split: str, train: Sequence[int] | np.ndarray | None = None) -> list[SharedView]:
     """Returns the views of a split that are training views, too.
 
-    Only files are compared: `jaxnerf-capture-check` finds equal images of different files, too. Most datasets end
+    Only files are compared: `jaxnerf-check` finds equal images of different files, too. Most datasets end
     without a file being read, since no two have one size.
 
     Args:
@@ -43,10 +40,13 @@ def shared_views(capture: Capture, split: str, train: Sequence[int] | np.ndarray
         ValueError: if a split is empty.
     """
     train = split_indices(capture, "train") if train is None else train
-    rest, found = list(split_indices(capture, split)), {}
-    for reason, search in {"the same file": _same_file, "the same bytes": _same_bytes}.items():
-        pairs = search(capture, rest, train)
-        found |= {index: (other, reason) for index, other in pairs.items()}
+    rest, found, images = list(split_indices(capture, split)), {}, [frame.image for frame in capture.frames]
+    sizes = {index: os.path.getsize(images[index]) for index in (*train, *rest)}
+    for reason, key in {"the same file": _identity, "the same bytes": file_sha256}.items():
+        common = {sizes[index] for index in train} & {sizes[index] for index in rest}
+        known = {key(images[index]): index for index in reversed(train) if sizes[index] in common}
+        pairs = {index: known.get(key(images[index])) for index in rest if sizes[index] in common}
+        found |= {index: (other, reason) for index, other in pairs.items() if other is not None}
         rest = [index for index in rest if index not in found]
     names = [frame.name for frame in capture.frames]
     return [SharedView(names[index], names[other], reason) for index, (other, reason) in sorted(found.items())]
@@ -86,37 +86,6 @@ def _summary(capture, split, train):
     return {"count": len(shared), "names": [view.name for view in shared], "note": note}
 
 
-def _same_file(capture, rest, train):
-    frames = capture.frames
-    files = {_identity(frames[index].image): index for index in reversed(train)}
-    pairs = {index: files.get(_identity(frames[index].image)) for index in rest}
-    return {index: other for index, other in pairs.items() if other is not None}
-
-
 def _identity(path):
     state = os.stat(path)
     return state.st_dev, state.st_ino
-
-
-def _same_bytes(capture, rest, train):
-    frames, sizes = capture.frames, defaultdict(list)
-    for index in train:
-        sizes[os.path.getsize(frames[index].image)].append(index)
-    pairs = {}
-    for index in rest:
-        image = frames[index].image
-        for other in sizes.get(size := os.path.getsize(image), ()):
-            candidate = frames[other].image
-            if _sample(image, size) == _sample(candidate, size) and filecmp.cmp(image, candidate, shallow=False):
-                pairs[index] = other
-                break
-    return pairs
-
-
-def _sample(path, size):
-    with open(path, "rb") as file:
-        parts = []
-        for place in np.linspace(0, max(size - _SAMPLE, 0), _SAMPLES).astype(int):
-            file.seek(place)
-            parts.append(file.read(_SAMPLE))
-    return b"".join(parts)

@@ -59,8 +59,7 @@ def mark_finished(
 
 def view_files(folder: pathlib.Path, index: int, *, count: int, errors: bool) -> list[pathlib.Path]:
     """Returns the files of a finished view, one of `count`: its images, with `errors` predicted ones, and its row."""
-    files = output_images.view_files(folder, f"{index:03d}")
-    files += [output_images.error_file(folder, f"{index:03d}")] if errors else []
+    files = output_images.view_files(folder, f"{index:03d}", errors=errors)
     files += [_contact_sheet_file(folder, index)] if index in _on_contact_sheet(count) else []
     return [*files, _row_file(folder, index)]
 

@@ -277,14 +277,14 @@ def _score_views(run, render, views, sides, folder, shard, tools):
                 plain = image_metrics(render(index, pixels, side=1)[0].rgb, truth, pixel_mask(views, index))
                 row |= {"rays_per_pixel": int(sides[index]) ** 2}
                 row |= {f"{name}_one_ray": plain[name] for name in ("psnr", "ssim")}
+            error = None
             if predictor is not None:
                 rays = run.experiment.view_rays(views, index, pixels)
                 error, figures = predictor.scored(rays, image.rgb, truth, views, index)
-                output_images.write_error(folder, f"{index:03d}", error)
                 row |= figures
             if align is not None:
                 row |= align(index, image.rgb, side=int(sides[index]))
-            output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth)
+            output_images.write_view(folder, f"{index:03d}", image.rgb, truth, depth, error)
             aggregate.mark_finished(folder, index, row, truth, image, count=count, first=index == todo[0])
             progress.show(done, f"{name}: {row['psnr']:.2f} dB in {seconds:.2f} s")
 

@@ -26,28 +26,24 @@ def to_8_bits(image: ArrayLike) -> np.ndarray:
     return np.rint(np.clip(np.asarray(image), 0, 1) * 255).astype(np.uint8)
 
 
-def write_view(folder: pathlib.Path, name: str, rgb: ArrayLike, truth: ArrayLike, depth: ArrayLike) -> None:
-    """Writes color/NAME.png, gt-color/NAME.png and depth/NAME.tiff (float32, in the dataset's units)."""
-    contents = to_8_bits(rgb), to_8_bits(truth), np.asarray(depth, np.float32)
-    for path, pixels in zip(view_files(folder, name), contents, strict=True):
+def write_view(
+    folder: pathlib.Path, name: str, rgb: ArrayLike, truth: ArrayLike, depth: ArrayLike, error: ArrayLike | None = None
+) -> None:
+    """Writes color/NAME.png, gt-color/NAME.png, depth/NAME.tiff and, if it is predicted, the error of each pixel.
+
+    Depths, in the dataset's units, and uncertainty/NAME.tiff, in units of colour, are float32.
+    """
+    floats = [np.asarray(plane, np.float32) for plane in (depth, error) if plane is not None]
+    paths = view_files(folder, name, errors=error is not None)
+    for path, pixels in zip(paths, [to_8_bits(rgb), to_8_bits(truth), *floats], strict=True):
+        path.parent.mkdir(exist_ok=True)
         write_image(path, pixels)
 
 
-def write_error(folder: pathlib.Path, name: str, error: ArrayLike) -> None:
-    """Writes uncertainty/NAME.tiff, the predicted error of each pixel in units of colour, float32."""
-    path = error_file(folder, name)
-    path.parent.mkdir(exist_ok=True)
-    write_image(path, np.asarray(error, np.float32))
-
-
-def error_file(folder: pathlib.Path, name: str) -> pathlib.Path:
-    """Returns the path that `write_error` writes."""
-    return pathlib.Path(folder) / "uncertainty" / f"{name}.tiff"
-
-
-def view_files(folder: pathlib.Path, name: str) -> list[pathlib.Path]:
-    """Returns the paths that `write_view` writes; their folders must exist."""
-    return [pathlib.Path(folder) / kind / f"{name}.{suffix}" for kind, suffix in _VIEW_FILES.items()]
+def view_files(folder: pathlib.Path, name: str, *, errors: bool) -> list[pathlib.Path]:
+    """Returns the paths that `write_view` writes, with or without predicted errors."""
+    kinds = {**_VIEW_FILES, **({"uncertainty": "tiff"} if errors else {})}
+    return [pathlib.Path(folder) / kind / f"{name}.{suffix}" for kind, suffix in kinds.items()]
 
 
 def readable(

@@ -32,8 +32,11 @@ class RunFlags:
         self.workdir = flags.DEFINE_string("workdir", None, "The run's folder.", required=required)
         self.data_dir = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
         self.step = cli.define_step(f"The checkpoint's step. When it is not given, the newest is {done}.")
-        self.chunk = cli.define_count(
-            "chunk", "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk."
+        self.chunk = cli.define_value(
+            "chunk",
+            "The rays rendered at once, or auto: as many as suit the device. It overrides config.eval.chunk.",
+            int,
+            cli.COUNT,
         )
         self.bake_occupancy = flags.DEFINE_bool(
             "bake_occupancy",
@@ -41,7 +44,7 @@ class RunFlags:
             "Whether to render a hierarchical model through a grid of its visible matter. It overrides "
             "config.eval.bake_occupancy.",
         )
-        self.max_uncertainty = cli.define_fraction("max_uncertainty", MAX_UNCERTAINTY)
+        self.max_uncertainty = cli.define_value("max_uncertainty", MAX_UNCERTAINTY, float, cli.PART)
         self.uncertainty = flags.DEFINE_string(
             "uncertainty",
             None,

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxnerf.core.safe_math import clamp, divide
 from jaxnerf.core.sampling import ONE_KEY, typed_key
+from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Vector
 from jaxnerf.fields.base import PREFILTER_PART, VIEW_PART, WIDTH_PART, Dense, Field, apply_network, infer_prefilter
 from jaxnerf.fields.hash_interpolation import TableLevel, interpolate, stored, transposed_product
@@ -215,36 +216,47 @@ def from_options(options: HashGridOptions, box: Box | None) -> Field:
     resolutions = tuple(options.resolutions)
     if min(resolutions, default=0) < 2:
         raise ValueError(f"hash_grid_field: resolutions are {resolutions}, expected at least one, each at least 2")
-    network = HashGrid(*box, options)
+    return network_field(HashGrid(*box, options), _scene_of)
+
+
+def network_field(network: "HashGrid", scene_of: Callable[["HashGrid"], Callable[..., Any]]) -> Field:
+    """Makes the Field of a network whose function `apply` another one makes, by `evaluate`."""
+    inputs = {name: jnp.zeros((1, 1)) for name in needs_of(scene_of(network))}
 
     def init(key):
-        inputs = {"radius": jnp.zeros((1, 1))} if options.prefilter else {}
         return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
-    color_layers = ("view_0",) if options.view_depth else ("rgb",)
-    regularizers = {"total_variation": functools.partial(total_variation, levels=network.levels())}
     return Field(
         init,
-        _scene_of(network),
-        regularizers=regularizers,
-        color_layers=color_layers,
+        scene_of(network),
+        regularizers={"total_variation": functools.partial(total_variation, levels=network.levels())},
+        color_layers=("view_0",) if network.options.view_depth else ("rgb",),
         network=network,
-        apply_in_fixed_order=_scene_of(network.clone(fixed_order=True)),
+        apply_in_fixed_order=scene_of(network.clone(fixed_order=True)),
     )
+
+
+def evaluate(
+    network: "HashGrid",
+    params: Any,
+    x: Float[ArrayLike, "*batch samples 3"],
+    viewdirs: Float[ArrayLike, "*batch #samples 3"],
+    **inputs: Float[ArrayLike, "*batch #samples"],
+) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
+    """Returns density and colour of a network, after their activations; inputs: what else its call takes."""
+    inputs = {name: jnp.broadcast_to(value, x.shape[:-1]) for name, value in inputs.items()}
+    density, rgb = apply_network(network, params, x, viewdirs, **inputs)
+    return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), color_activation(rgb)
 
 
 def _scene_of(network):
     """Returns the function `apply` of a HashGrid's Field."""
 
-    def apply(params, x, viewdirs, **inputs):
-        density, rgb = apply_network(network, params, x, viewdirs, **inputs)
-        return jnp.exp(jnp.minimum(density, _LARGEST_EXPONENT)), color_activation(rgb)
-
     def apply_to_rays(params, x, viewdirs):
-        return apply(params, x, viewdirs)
+        return evaluate(network, params, x, viewdirs)
 
     def apply_to_cones(params, x, viewdirs, *, radius):
-        return apply(params, x, viewdirs, radius=jnp.broadcast_to(radius, x.shape[:-1]))
+        return evaluate(network, params, x, viewdirs, radius=radius)
 
     return apply_to_cones if network.options.prefilter else apply_to_rays
 
@@ -310,8 +322,12 @@ class HashGrid(linen.Module):
         x: Float[ArrayLike, "*batch samples 3"],
         viewdirs: Float[ArrayLike, "*batch #samples 3"],
         radius: Float[ArrayLike, "*batch samples"] | None = None,
+        code: Float[ArrayLike, "D N"] | None = None,
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
-        """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N]."""
+        """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N].
+
+        A code [D, N] is read by a further layer of the density network.
+        """
         options, shape = self.options, x.shape[:-1]
         dtype = _COMPUTE_DTYPES.get(options.compute_dtype, options.compute_dtype)
 
@@ -334,6 +350,8 @@ class HashGrid(linen.Module):
         bias = self.param("bias", linen.initializers.zeros_init(), (options.width,))
         kernel, bias = rounded(kernel), rounded(bias)
         hidden = jax.nn.relu(transposed_product(kernel, features) + bias[:, None])
+        if code is not None:
+            hidden = jax.nn.relu(Dense(options.width, name="code")(hidden, rounded(code)))
         # The logarithm of a density is up to 15, where bfloat16 has steps of 1/16.
         outputs = {"dtype": None if dtype is None else table.dtype}
         geometry = Dense(1 + GEOMETRY_FEATURES, name="density", **outputs)(hidden)

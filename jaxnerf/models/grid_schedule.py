@@ -13,6 +13,8 @@ from jaxnerf.core.occupancy.grid import NUM_TIMES, OccupancyGrid, create_grid, u
 from jaxnerf.core.scene import needs_of
 from jaxnerf.fields.base import Field, field_scene
 
+_FEWEST_UPDATES = 5  # that empty a cell which is ten times as dense as the threshold
+
 Corner = tuple[float, float, float]
 
 
@@ -117,8 +119,7 @@ def make_grid_schedule(
     density, spacings = threshold / step_size, _spacings(step_size, shape, contracted)
 
     def create(valid, empty=None):
-        # A cell starts at ten times the threshold, so about half a dozen updates empty it; NUM_TIMES in a scene that
-        # moves.
+        # A cell starts at ten times the threshold, so about half a dozen updates empty it.
         initial = 10 * density if empty is None else jnp.where(jnp.asarray(empty), 0, 10 * density)
         return create_grid(
             jnp.asarray(lower, jnp.float32),
@@ -139,8 +140,11 @@ def make_grid_schedule(
         num_updates = jnp.where(young, step // often, step // update_every)
         first = initial_passes * update_every // often // rounds  # of later updates of a cell
         later = first + (step // update_every - initial_passes) // rounds
-        # What was ten times as dense as the threshold stays occupied until the cell was evaluated at all times.
-        decay = {"decay": 10 ** (-1 / (NUM_TIMES + 1))} if "time" in needs_of(field.apply) else {}
+        visits, decay = jnp.where(young, step // often // rounds, later), {}
+        if "time" in needs_of(field.apply):
+            # What was ten times as dense as the threshold stays occupied for as many updates of the cell as there are
+            # times; at first for half as many as there have been, as the fog of early steps would stay, too.
+            decay["decay"] = 10 ** (-1 / jnp.clip(visits / 2, _FEWEST_UPDATES, NUM_TIMES + 1))
 
         def updated():
             # Whole chunks, as a remainder of another size would have to be compiled, too.
@@ -158,7 +162,7 @@ def make_grid_schedule(
                 spread=young,
                 chunk=update_chunk,
                 radii=radii,
-                index=jnp.where(young, step // often // rounds, later),
+                index=visits,
                 **decay,
             )
 

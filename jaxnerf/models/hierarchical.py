@@ -95,10 +95,8 @@ def hierarchical_model(
     """
     options = {"rule": sampling.rule, "in_disparity": sampling.in_disparity, "background": background}
     for name, field in fields.items():
-        parameters = inspect.signature(field.apply).parameters
-        takes_noise = "density_noise" in parameters or any(
-            parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()
-        )
+        parameters = inspect.signature(field.apply).parameters.values()
+        takes_noise = any(each.name == "density_noise" or each.kind is each.VAR_KEYWORD for each in parameters)
         if sampling.density_noise and not takes_noise:
             raise ValueError(
                 f"sampling.density_noise is {sampling.density_noise}, and the {name} field takes no noise; set it to 0"

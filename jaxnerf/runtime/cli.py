@@ -20,10 +20,11 @@ from typing import Any
 from absl import app, flags, logging
 from ml_collections import ConfigDict, config_flags
 
-from jaxnerf.options import MAX_INT, Option, between, is_auto, is_tuple
+from jaxnerf.options import MAX_INT, Range, between, is_auto, is_tuple
 from jaxnerf.registry import READERS, needs_folder
 from jaxnerf.runtime import failed_imports, signals, stages
 
+COUNT, PART = between(1, MAX_INT), between(0, 1)  # ranges of flags
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 
 flags.disclaim_key_flags()  # a flag defined here belongs to the program that calls
@@ -170,26 +171,16 @@ def given_flag(name: str, argv: Sequence[str]) -> str:
     return value
 
 
-def define_count(name: str, help: str) -> flags.FlagHolder:
-    """Defines a flag that is "auto" or an integer of at least 1; None when it is not given."""
-    return flags.DEFINE(_Value(int, auto=True, range=between(1, MAX_INT)), name, None, help)
-
-
-def define_fraction(name: str, help: str) -> flags.FlagHolder:
-    """Defines a flag that is "auto" or a number from 0 to 1; None when it is not given."""
-    return flags.DEFINE(_Value(float, auto=True, range=between(0, 1)), name, None, help)
+def define_value(name: str, help: str, kind: Any, range: Range | None, *, auto: bool = True) -> flags.FlagHolder:
+    """Defines a flag of an option's type, in a range, or with "auto"; None when it is not given."""
+    if kind is bool:
+        return flags.DEFINE_bool(name, None, help)
+    return flags.DEFINE(_Value(kind, auto=auto, range=range), name, None, help)
 
 
 def define_step(help: str) -> flags.FlagHolder:
     """Defines --step, that of a checkpoint; None when it is not given."""
     return flags.DEFINE_integer("step", None, help, lower_bound=0)
-
-
-def define_option(name: str, declared: Option, kind: Any, help: str) -> flags.FlagHolder:
-    """Defines the flag of an option from its declaration and its type; None when it is not given."""
-    if kind is bool:
-        return flags.DEFINE_bool(name, None, help)
-    return flags.DEFINE(_Value(kind, auto=declared.auto, range=declared.range), name, None, help)
 
 
 def use_data(config, data_dir: str | None, format: str | None = None):
@@ -274,7 +265,7 @@ def _list_configs():
 class _Value(flags.ArgumentParser):
     """Parses a text, a number in a range, or numbers that commas separate; or "auto"."""
 
-    def __init__(self, kind, *, auto=False, range=None):
+    def __init__(self, kind, *, auto, range):
         self._kind, self._auto, self._range = kind, auto, range
         name = {int: "an integer", float: "a number", str: "a text"}.get(kind, "numbers that commas separate")
         self.syntactic_help = f"{'auto, or ' * auto}{name}{f' ({range.text})' if range else ''}"

@@ -11,7 +11,7 @@ import jax
 
 from jaxnerf.runtime.atomic_files import partial_file, read_bytes
 from jaxnerf.runtime.fingerprint import fingerprint
-from jaxnerf.runtime.user_cache import private_folder
+from jaxnerf.runtime.user_cache import private_folder, prune
 
 MAX_BYTES = 2**30  # a training step takes half a megabyte, so this holds over a thousand programs
 _HASH_BYTES = 32
@@ -27,7 +27,8 @@ def use_compilation_cache() -> None:
         return
     try:
         folder = private_folder("compiled", _machine())
-        prune(folder)
+        # JAX has a size limit of its own, but a kill at the wrong moment makes that fail forever after.
+        prune(folder.glob("*-cache*"), MAX_BYTES)
         _use_programs()
     except (OSError, RuntimeError, ImportError) as error:  # RuntimeError: no home folder
         print(f"compiled programs cannot be cached ({error}); continuing without", file=sys.stderr)
@@ -77,24 +78,6 @@ class Programs:
 
 def _hash(key, program):
     return hashlib.sha256(b"%d:%s%s" % (len(key), key.encode(), program)).digest()
-
-
-def prune(folder: Path, max_bytes: float = MAX_BYTES) -> None:
-    """Removes the least recently used programs until the rest fits into max_bytes.
-
-    JAX has a size limit of its own, but a kill at the wrong moment makes that fail forever after.
-    """
-    kept = []
-    for path in folder.glob("*-cache*"):  # with the partial files of killed processes
-        with contextlib.suppress(FileNotFoundError):  # another process may prune, too
-            status = path.stat()
-            kept.append((max(status.st_atime, status.st_mtime), status.st_size, path))
-    size = sum(entry[1] for entry in kept)
-    for _, bytes_, path in sorted(kept):
-        if size <= max_bytes:
-            break
-        path.unlink(missing_ok=True)
-        size -= bytes_
 
 
 def _machine():

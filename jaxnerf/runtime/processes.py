@@ -161,15 +161,12 @@ def _leave(error):
     """Ends this process with one line; see cluster."""
     if isinstance(error, SystemExit) and not error.code:
         raise error
-    code = 1
+    code, line = 1, _line(error)
     if isinstance(error, KeyboardInterrupt):
         code, line = 130, "stopped; the same command continues from the last checkpoint"
     elif isinstance(error, jax.errors.JaxRuntimeError):
         line = f"another process may have ended; start all again to continue from the last checkpoint ({_line(error)})"
-    elif isinstance(error, ValueError | OSError):
-        line = _line(error)
-    else:
-        line = _line(error)
+    elif not isinstance(error, ValueError | OSError):
         traceback.print_exception(error)
     print(f"error: {line}", file=sys.stderr, flush=True)
     sys.stdout.flush()
@@ -182,15 +179,13 @@ def _line(error):
 
 def describe_loss(messages: str) -> str:
     """Returns a line for what the coordination service prints before it aborts the process."""
-    if found := re.search(r"(\d+) unexpectedly tried to connect with a different incarnation", messages):
-        return (
-            f"process {found[1]} has connected twice: --process_id={found[1]} was given to two processes, or one was "
-            f"started again alone; {_REMEDY}, each with its own id"
-        )
-    if "more recent barrier call" in messages:  # while the processes still wait for each other
-        return (
-            f"a process has connected twice: one --process_id was given to two processes; {_REMEDY}, each with its own"
-        )
+    found = re.search(r"(\d+) unexpectedly tried to connect with a different incarnation", messages)
+    if found or "more recent barrier call" in messages:  # the latter while the processes still wait for each other
+        which, given = "a process", "one --process_id"
+        if found:
+            which, given = f"process {found[1]}", f"--process_id={found[1]}"
+        why = f"{given} was given to two processes, or one was started again alone"
+        return f"{which} has connected twice: {why}; {_REMEDY}, each with its own id"
     if found := re.search(r"stopped sending heartbeats\):\s*((?:\d+\s+)+)", messages):
         names = ", ".join(found[1].split())
         return f"process {names} does not answer any more: it hangs, or its machine or network is down; {_REMEDY}"

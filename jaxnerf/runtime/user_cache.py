@@ -3,11 +3,12 @@
 What it holds is believed, and compiled programs are run, so its folders belong to the user alone.
 """
 
+import contextlib
 import logging
 import os
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxnerf.runtime.atomic_files import open_regular, partial_file
 
 _logger = logging.getLogger(__name__)
 _CHECKSUM = "checksum"  # the name of an array in each file
+_ABANDONED = 3600  # seconds after which a partial file has no writer any more
 
 
 def load_or_make(
@@ -83,6 +85,23 @@ def private_folder(*names: str) -> Path:
         if mode & 0o077:
             folder.chmod(0o700)
     return folder
+
+
+def prune(files: Iterable[Path], max_bytes: float) -> None:
+    """Removes the least recently used of some files until the rest fits into max_bytes, and old partial ones.
+
+    Another process may do the same. One that has a removed file mapped keeps it until it ends.
+    """
+    found = []
+    for path in files:
+        with contextlib.suppress(FileNotFoundError):
+            status = path.stat()
+            found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    total = 0
+    for used, size, path in sorted(found, reverse=True):
+        total += size
+        if total > max_bytes or (path.suffix == ".tmp" and time.time() - used > _ABANDONED):
+            path.unlink(missing_ok=True)
 
 
 def _checksum(name, arrays):

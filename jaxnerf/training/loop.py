@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 
 import jax
+import numpy as np
 
 from jaxnerf.core.views import Views
 from jaxnerf.runtime import devices, memory, processes, signals, stages
@@ -118,7 +119,7 @@ def run_training(
     previews = PreviewTimes(options.preview_every if preview else 0.0, log.seconds)
     clock = Clock(log.seconds, done * options.batch_size - int(state.counters.get("rays_dropped", 0)))
     pace = Pace(options, clock, compiled.data)
-    recent = []  # metrics since the last row of the log
+    recent, first = [], True  # metrics since the last row of the log, and whether that is this start's first
     last = processes.any_of(done >= options.max_steps or 0 < options.max_seconds <= log.seconds)
     with signals.Interrupt() as interrupt, progress:
         while not last:
@@ -140,6 +141,9 @@ def run_training(
             if done % options.log_every == 0 or save:  # a resumed run reads the clock from the checkpoint's row
                 row = metric_log.row(experiment, done, recent, clock, pace, compiled.compile_seconds)
                 log.append(row)
+                if first and not last:
+                    processes.print_once(metric_log.passes(row, options, np.asarray(views.size)))
+                first = False
                 text = metric_log.line(row, options, out_of_time=out_of_time)
                 progress.show(done, text, metric_log.fraction_done(row, options))
                 recent = []

@@ -2,14 +2,15 @@
 
 import json
 import logging
+import math
 import os
 import pathlib
 import sys
-import time
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from jaxnerf.core.metrics import decibels
 from jaxnerf.core.views import Views
@@ -53,7 +54,9 @@ class MetricLog:
         if cut:
             print(f"{self._path}: dropped an incomplete last line", file=sys.stderr)
         write_text(self._path, "".join(json.dumps(row) + "\n" for row in self.rows))
-        self._events = _Events(workdir, first_step=first_step)
+        from jaxnerf.tools.interop.tensorboard import EventFile
+
+        self._events = EventFile(workdir, first_step=first_step)
 
     @property
     def seconds(self) -> float:
@@ -106,58 +109,6 @@ def _parse_row(line):
     return row if finite and "seconds" in row else None
 
 
-class _Events:
-    """An event file for TensorBoard where tensorboardX is installed; an error in writing it only prints a line."""
-
-    def __init__(self, workdir, *, first_step):
-        """Opens a new file; TensorBoard ignores what earlier files hold after first_step."""
-        self._folder, self._writer = pathlib.Path(workdir) / "tensorboard", None
-        try:
-            # Not SummaryWriter: it writes from a thread, and waits forever for it once the disk is full.
-            from tensorboardX.event_file_writer import EventsWriter
-            from tensorboardX.proto.event_pb2 import SessionLog
-        except ImportError:
-            return
-
-        def begin():
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._writer = EventsWriter(str(self._folder / "events"))
-            self._write(first_step, file_version="brain.Event:2")
-            self._write(first_step, session_log=SessionLog(status=SessionLog.START))
-
-        self._try(begin)
-
-    def append(self, row):
-        """Adds the numbers of a row."""
-
-        def add():
-            from tensorboardX.summary import scalar
-
-            for name, value in row.items():
-                self._write(row["step"], summary=scalar(name, value))
-            self._writer.flush()
-
-        if self._writer is not None:
-            self._try(add)
-
-    def close(self):
-        if self._writer is not None:
-            self._try(self._writer.close)
-
-    def _write(self, step, **content):
-        from tensorboardX.proto.event_pb2 import Event
-
-        self._writer.write_event(Event(step=step, wall_time=time.time(), **content))
-
-    def _try(self, write):
-        try:
-            write()
-        except OSError as error:
-            self._writer = None
-            why = f"event files end here ({error.strerror}); metrics.jsonl holds all metrics"
-            print(f"{self._folder}: {why}", file=sys.stderr)
-
-
 def header(experiment: Any, views: Views, state: TrainState, compiled: Any) -> list[str]:
     """Returns the lines that describe a run before its first step; compiled: its CompiledStep."""
     options, devices = experiment.config.train, jax.devices()
@@ -168,12 +119,13 @@ def header(experiment: Any, views: Views, state: TrainState, compiled: Any) -> l
     parts = ", ".join(f"{name} {count:,}" for name, count in counts.items())
     dtype = jax.tree.leaves(state.params)[0].dtype
     eyes = np.asarray(views.cameras.to_world)[:, :, 3]
+    low, high = (", ".join(f"{value:.2f}" for value in corner) for corner in (eyes.min(0), eyes.max(0)))
     lines = [
         f"device        {len(devices)} x {devices[0].device_kind} ({devices[0].platform}){processes}",
         Detail(f"parameters    {sum(counts.values()):,} {dtype} ({parts})"),
         f"views         {len(views.offset)} with {views.pixels.shape[0]:,} pixels, "
         f"t from {np.min(views.near):g} to {np.max(views.far):g}",
-        Detail(f"cameras       from {_point(eyes.min(0))} to {_point(eyes.max(0))}"),
+        Detail(f"cameras       from ({low}) to ({high})"),
     ]
     if state.grid is not None:
         cells = "x".join(map(str, state.grid.valid.shape))
@@ -257,9 +209,7 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
         options: the config's section `train`.
         out_of_time: whether train.max_seconds has passed.
     """
-    left = (options.max_steps - row["step"]) * options.batch_size / max(row["rays_per_second"], 1e-9)
-    if options.max_seconds:
-        left = min(left, options.max_seconds - row["seconds"])
+    left = _seconds_left(row, options)
     notes = f"  {row['nonfinite']} nonfinite steps" if row["nonfinite"] else ""
     if row["rays_dropped"]:
         fraction = row["rays_dropped"] / (row["rays"] + row["rays_dropped"])
@@ -272,6 +222,26 @@ def line(row: dict[str, Any], options: Any, *, out_of_time: bool) -> str:
     )
 
 
+def passes(row: dict[str, Any], options: Any, size: Int[np.ndarray, "V 2"]) -> str:
+    """Returns a line: how often a run reads each pixel at the pace of a row, and the width that it would read twice.
+
+    Args:
+        row: see `row`.
+        options: the config's section `train`.
+        size: [V, 2] height and width of the images, px.
+    """
+    rays = row["rays"] + row["rays_per_second"] * _seconds_left(row, options)
+    total = int(np.prod(np.asarray(size, np.int64), axis=1).sum())
+    line = f"passes        {rays / total:.2g} over {total:,} pixels at this pace"
+    width = max(int(size[:, 1].mean() * math.sqrt(rays / total / 2)), 1)
+    return line + (f"; images {width} px wide would be read twice" if rays < total else "")
+
+
+def _seconds_left(row, options):
+    left = (options.max_steps - row["step"]) * options.batch_size / max(row["rays_per_second"], 1e-9)
+    return min(left, options.max_seconds - row["seconds"]) if options.max_seconds else left
+
+
 def final_psnr(row: dict[str, Any]) -> float | None:
     """Returns the PSNR of the final rendering, dB, of a row of metrics; None if the row has none."""
     return next((value for name, value in reversed(row.items()) if name.startswith("psnr_")), None)
@@ -281,7 +251,3 @@ def minutes(seconds: float) -> str:
     """Returns a duration as minutes and seconds, such as 1:05."""
     minutes, seconds = divmod(int(seconds), 60)
     return f"{minutes}:{seconds:02d}"
-
-
-def _point(values):
-    return "(" + ", ".join(f"{value:.2f}" for value in values) + ")"

@@ -201,7 +201,7 @@ def make_train_step(
             return jnp.where(complete, values, 0).sum()
 
         parts = {loss.name: total(_value(loss, complete.shape, renderings, batch)) for loss in ray_losses}
-        weighted = sum(_scaled(loss.weight(state.step), parts[loss.name]) for loss in ray_losses)
+        weighted = sum(loss.weight(state.step) * parts[loss.name] for loss in ray_losses)
         errors = zip(model.image_networks, renderings, strict=True)
         sums = {f"mse_{name}": total(squared_error(rendering, batch)) for name, rendering in errors}
         sums |= {"rays": complete.sum(dtype=jnp.int32), "dropped": (~complete).sum(dtype=jnp.int32)}
@@ -279,11 +279,6 @@ def repeat_step(train_step: Callable[..., tuple], num_steps: int) -> Callable[..
 def _progress_at(step, model, data):
     """Returns the entry "progress" of the parameters at a step; none if the model does not ask for it."""
     return {PROGRESS: data.progress.at(step)} if PROGRESS in model.needs else {}
-
-
-def _scaled(weight, value):
-    """Returns weight * value; a constant weight of 1 adds no operation."""
-    return value if isinstance(weight, int | float) and weight == 1 else weight * value
 
 
 def _sum(trees):

@@ -70,7 +70,7 @@ def test_cells_are_cubes_along_all_sides():
 
 @pytest.mark.parametrize("cells_per_update", [2**18, 100])
 def test_a_body_that_is_there_for_a_fiftieth_of_the_time_is_never_skipped(cells_per_update):
-    """Whenever it is there: its cells are occupied after every update, and those that are always empty become so."""
+    """Whenever it is there, once cells were updated 150 times; and those that are always empty become so."""
     begins = jnp.linspace(0, 0.98, 8)  # of the body in each layer of cells along x
 
     def apply(params, x, viewdirs, *, time):
@@ -88,8 +88,9 @@ def test_a_body_that_is_there_for_a_fiftieth_of_the_time_is_never_skipped(cells_
         return grid, (grid.occupied[:, :4].all(), grid.occupied[:, 5:].any())
 
     start = schedule.create(np.ones(schedule.shape, bool))
-    full, others = jax.jit(lambda grid: jax.lax.scan(step, grid, jnp.arange(16 * 700))[1])(start)
-    assert full.all() and others[16 * 40] and not others[-1]
+    full, others = jax.jit(lambda grid: jax.lax.scan(step, grid, jnp.arange(16 * 1300))[1])(start)
+    rounds = -(-(8**3) // cells_per_update)
+    assert full[16 * 150 * rounds :].all() and not full.all() and not others[16 * 7 * rounds :].any()
 
 
 def test_half_a_dozen_updates_empty_a_cell_without_density():
@@ -203,16 +204,15 @@ def lengths(rays):
 
 
 @pytest.mark.parametrize(
-    "step, random, stretch",
+    "step, random",
     [
-        (0.3, True, 1.0),
-        (0.0777, False, 1.0),
-        (5.0, True, 1.0),
-        (np.sqrt(3) / 7, False, 1.0),
-        (0.1, True, 3.0),
+        (0.3, True),
+        (0.0777, False),
+        (5.0, True),
+        (np.sqrt(3) / 7, False),
     ],
 )
-def test_samples_cover_the_whole_way_through_the_box(step, random, stretch):
+def test_samples_cover_the_whole_way_through_the_box(step, random):
     """For any step size; also along the diagonal, the longest way through the box."""
     grid, rays = full_grid(0.5), rays_past_origin(5, 60)
     diagonal = np.float32([[1, 1, 1], [-2, 2, 2], [0.5, 0.5, 0.5], [1, 0, 0]])
@@ -222,8 +222,7 @@ def test_samples_cover_the_whole_way_through_the_box(step, random, stretch):
     keys = jax.random.split(jax.random.key(0), 64) if random else None
     march_rays = compiled(ray_marching.march_rays, "step_size", "cell")
     cell = tuple(1 / size for size in grid.valid.shape)
-    samples = march_rays(keys, grid, rays, step_size=float(step), cell=cell, stretch=stretch)
-    step = step * stretch
+    samples = march_rays(keys, grid, rays, step_size=float(step), cell=cell)
     inside = compiled(clip_rays_to_box)(grid, rays)
     way = np.float64(inside.far) - inside.near
     assert (way > 0).mean() > 0.4 and (way == 0).any()

@@ -43,8 +43,8 @@ _PROGRAM = '''"""Prints a count and the names of all fields."""
 from jaxnerf.registry import FIELDS
 from jaxnerf.runtime import cli
 
-COUNT = cli.define_count("count", "The number of things.")
-LIMIT = cli.define_fraction("limit", "The most of a thing.")
+COUNT = cli.define_value("count", "The number of things.", int, cli.COUNT)
+LIMIT = cli.define_value("limit", "The most of a thing.", float, cli.PART)
 
 def main(argv):
     print(COUNT.value, *FIELDS.names(), *[LIMIT.value] * (LIMIT.value is not None))
@@ -163,7 +163,7 @@ def test_a_plugin_registers_a_field(tmp_path):
     (tmp_path / "my_plugin.py").write_text(plugin)
     code, out, err = call(tmp_path, "--plugins=my_plugin", "--count=auto")
     names = out.split()  # another test of this process may have registered fields, the program has not
-    assert (code, names) == (0, ["auto", "mlp", "hash_grid", "mine"]), err
+    assert (code, names) == (0, ["auto", "mlp", "hash_grid", "moving", "mine"]), err
 
 
 def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):

@@ -1,6 +1,7 @@
 """The cache of arrays: whose folders are used, and which files are believed."""
 
 import os
+import time
 
 import numpy as np
 import pytest
@@ -68,3 +69,17 @@ def test_the_file_of_another_name_is_not_believed(cache):
     load("other", {name: array + 1 for name, array in ARRAYS.items()})
     os.replace(cache / "one.npz", cache / "other.npz")
     assert load("other")[1]
+
+
+def test_least_recently_used_are_removed_first(tmp_path):
+    for age in range(6):
+        path = tmp_path / f"{age}-cache"
+        path.write_bytes(bytes(1000))
+        os.utime(path, (time.time() - 100 * age,) * 2)
+    size = path.stat().st_size
+    (tmp_path / "partial.tmp").write_bytes(b"of a killed process")
+    os.utime(tmp_path / "partial.tmp", (time.time() - 7200,) * 2)
+    user_cache.prune(tmp_path.iterdir(), 100 * size)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{age}-cache" for age in range(6)]
+    user_cache.prune(tmp_path.iterdir(), 3.5 * size)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0-cache", "1-cache", "2-cache"]

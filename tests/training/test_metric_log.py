@@ -73,3 +73,17 @@ def test_progress_of_a_run_of_limited_time(max_steps, shown, done, capsys):
     assert capsys.readouterr().err == shown
     assert metric_log.fraction_done(row([{}]), train) == done
     assert metric_log.of_all(20, train) == ("20 of 100" if max_steps == 100 else "20")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"),
+    [
+        (110.0, "0.6 over 50,000 pixels at this pace; images 109 px wide would be read twice"),
+        (210.0, "1.1 over 50,000"),
+    ],
+)
+def test_passes_follow_from_the_pace_and_the_time_that_is_left(seconds, shown):
+    size = np.array([[100, 200], [150, 200]])
+    at = {"step": 50, "rays": 5_000, "seconds": 10.0, "rays_per_second": 250.0}
+    options = TrainOptions(max_steps=UNLIMITED_STEPS, max_seconds=seconds, batch_size=100)
+    assert shown in metric_log.passes(at, options, size)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxnerf.core.occupancy.grid import OccupancyGrid, clip_rays_to_box
 from jaxnerf.core.safe_math import at_least_float32
@@ -13,13 +13,7 @@ from jaxnerf.core.types import Keys, Rays, Samples
 
 
 def march_rays(
-    key: Keys | None,
-    grid: OccupancyGrid,
-    rays: Rays,
-    *,
-    step_size: float,
-    cell: Sequence[float],
-    stretch: Float[ArrayLike, "*#batch"] = 1.0,
+    key: Keys | None, grid: OccupancyGrid, rays: Rays, *, step_size: float, cell: Sequence[float]
 ) -> Samples:
     """Returns samples at equal steps along the part of each ray that is inside the grid's box.
 
@@ -30,12 +24,11 @@ def march_rays(
         step_size: world units, a number.
         cell: [3] world units, numbers, the size of a cell of this grid; it bounds the number of samples that a
             ray may need.
-        stretch: factor of the step size, at least 1, a number or one for each ray; may be traced.
 
     Returns:
         Samples [..., S].
     """
-    t_step, count = stretch * steps_in_t(rays, step_size), num_steps(grid, step_size, cell)
+    t_step, count = steps_in_t(rays, step_size), num_steps(grid, step_size, cell)
     if grid.contracted:
         return samples_in_contracted_space(key, grid, rays, t_step, count)
     inside = clip_rays_to_box(grid, rays)

@@ -1,5 +1,6 @@
 """Checks of camera poses, and the point and the direction that a set of poses defines. numpy on the host."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -156,3 +157,14 @@ def look_one_way(poses: Float[np.ndarray, "V 3 4"], *, cosine: float = 0.85) -> 
     backs = poses[:, :, 2]
     mean = backs.mean(axis=0)
     return len(backs) > 1 and bool((backs @ mean > cosine * np.linalg.norm(mean)).all())
+
+
+def travel(poses: Float[np.ndarray, "V 3 4"]) -> bool:
+    """Returns whether cameras travel, as on a walk: fewer than half look at the point that is nearest to their axes.
+
+    A camera looks at it if it is within 45 degrees of the axis, as in most images. All do in a capture of an object,
+    a room around one, or cameras that look one way.
+    """
+    towards = gaze_center(poses) - poses[:, :, 3]
+    ahead = -(towards * poses[:, :, 2]).sum(axis=1)
+    return bool((ahead > math.sqrt(0.5) * np.linalg.norm(towards, axis=1)).mean() < 0.5)

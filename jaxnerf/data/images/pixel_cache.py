@@ -4,7 +4,6 @@ A mapped file takes no memory of the process's own: the operating system reads t
 drops them when it needs the memory.
 """
 
-import contextlib
 import inspect
 import logging
 import os
@@ -23,14 +22,13 @@ from jaxnerf.data.images import image_files
 from jaxnerf.runtime import cores, stages
 from jaxnerf.runtime.atomic_files import open_regular, partial_file
 from jaxnerf.runtime.fingerprint import file_sha256, fingerprint
-from jaxnerf.runtime.user_cache import private_folder
+from jaxnerf.runtime.user_cache import private_folder, prune
 
 _logger = logging.getLogger(__name__)
 _LARGE = 2**28  # bytes from which pixels are mapped
 _SLOW = 0.5  # seconds of decoding from which smaller arrays are cached, too
 _MAX_SIZE = 2**35  # bytes of all cached files; the least recently used are deleted first
 _PART = 2**24  # bytes that have a checksum of their own, so that several are computed at a time
-_ABANDONED = 3600  # seconds after which a temporary file has no writer any more
 _SPARE = 2**28  # bytes of the disk that stay free
 
 
@@ -160,15 +158,8 @@ def _write(path, fill, shape, dtype):
 
 
 def _free_space(folder, size):
-    """Deletes the least recently used and the abandoned files; raises OSError if the disk is still too full."""
-    files, total = [], size
-    for file in (*folder.glob("pixels_*"), *folder.glob("active_*")):
-        with contextlib.suppress(FileNotFoundError):  # another process may delete files, too
-            files.append((file.stat().st_mtime, file.stat().st_size, file))
-    for used, length, file in sorted(files, reverse=True):
-        total += length
-        if total > _MAX_SIZE or (file.suffix == ".tmp" and time.time() - used > _ABANDONED):
-            file.unlink(missing_ok=True)  # processes that have it mapped keep it until they end
+    """Deletes old files, so that so many bytes more may be cached; raises OSError if the disk is still too full."""
+    prune((*folder.glob("pixels_*"), *folder.glob("active_*")), _MAX_SIZE - size)
     free = shutil.disk_usage(folder).free
     if free < size + _SPARE:
         raise OSError(f"{folder} has {free / 1e9:.1f} GB free, expected at least {(size + _SPARE) / 1e9:.1f}")

@@ -20,7 +20,7 @@ _KIND = flags.DEFINE_string(
 )
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = cli.define_step("The checkpoint's step. When it is not given, the newest is exported.")
-_MAX_UNCERTAINTY = cli.define_fraction("max_uncertainty", run_flags.MAX_UNCERTAINTY)
+_MAX_UNCERTAINTY = cli.define_value("max_uncertainty", run_flags.MAX_UNCERTAINTY, float, cli.PART)
 _TIME = flags.DEFINE_float(
     "time",
     None,
@@ -86,7 +86,7 @@ def _define_flags(argv):
             helps.setdefault(f"{option.help}. Default: {default}.", []).append(kind)
         help = " ".join(f"{', '.join(kinds)}: {text}" for text, kinds in helps.items())
         option, type_, _ = declared.get(chosen) or next(iter(declared.values()))
-        cli.define_option(name, option, type_, help)
+        cli.define_value(name, help, type_, option.range, auto=option.auto)
     return argv
 
 

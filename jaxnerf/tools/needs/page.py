@@ -196,8 +196,8 @@ def results(outcome: Outcome, settings: Settings) -> dict[str, Any]:
             **(measured([outcome.longest[LEAN]]) if outcome.lean else {}),
         },
         "refused": [
-            {"parts": [each.name for each in parts], "effect": _finite(effect._asdict())}
-            for parts, effect in outcome.refused
+            {"parts": [each.name for each in parts], "effect": _finite(effect._asdict()), "why": why}
+            for parts, effect, why in outcome.refused
         ],
         "complete_in_longest": measured([outcome.longest[COMPLETE]]),
         "curve": outcome.curve,
@@ -235,11 +235,7 @@ def config_file(asked: RunConfig, lean: RunConfig, outcome: Outcome) -> str:
 def _lean_lines(outcome):
     """Returns lines about the lean model."""
     seconds = outcome.longest[COMPLETE].seconds
-    lines = [
-        f"refused       {'; '.join(each.name for each in parts)}: together they lose {effect.mean:.2f} dB after "
-        f"{seconds:.0f} s with images that are not shrunk"
-        for parts, effect in outcome.refused
-    ]
+    lines = [f"refused       {'; '.join(each.name for each in parts)}: {why}" for parts, _, why in outcome.refused]
     if not outcome.lean:
         return [*lines, "lean          the complete model: nothing was shown to be dispensable, or to pay"]
     complete, lean = (measured([outcome.longest[name]]) for name in (COMPLETE, LEAN))

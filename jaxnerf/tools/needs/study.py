@@ -94,7 +94,7 @@ class Outcome(NamedTuple):
         complete: the trials of the complete model, by seed.
         lean: the variants that the lean model combines.
         lean_effect: what it loses in the longest run of the curve; None: it is the complete model.
-        refused: combinations that lose more than the margin there, with their effect.
+        refused: combinations that the lean model does not make, with their effect there and the reason.
         longest: the results of the longest run, of "complete" and "lean".
         curve: {"complete" or "lean": [(seconds, dB)]}, of images that are not shrunk.
         aligned: whether all scores have fitted colours.
@@ -106,7 +106,7 @@ class Outcome(NamedTuple):
     complete: dict[int, Result]
     lean: list[Variant]
     lean_effect: Effect | None
-    refused: list[tuple[list[Variant], Effect]]
+    refused: list[tuple[list[Variant], Effect, str]]
     longest: dict[str, Result]
     curve: dict[str, list[tuple[float, float]]]
     aligned: bool
@@ -331,10 +331,29 @@ class Study:
             found = self._contribution(lean, base, other)[None]
             others = {slug: self.differences(self.by_slug[slug]) for slug in known}
             effect = racing.effects({**others, LEAN: found})[LEAN]
-            if effect.mean <= margin:
+            why = self._objection(each, effect, length)
+            if not why:
                 return each, effect, refused, length
-            refused.append((each, effect))
+            refused.append((each, effect, why))
         return [], None, refused, length
+
+    def _objection(self, chosen, effect, length):
+        """Returns why the lean model does not combine some variants, from runs of this length; "" if it does."""
+        margin, images = self.settings.margin, "with images that are not shrunk"
+        if effect.mean > margin:
+            return f"together they lose {effect.mean:.2f} dB after {length:.0f} s {images}"
+        if all(each.change != LESS for each in chosen):
+            return ""
+        # A smaller model takes more steps in the same time, and learns faster at first.
+        lean, shorter = combined(chosen), CURVE[-2] * length
+        base, other = (self.trial(each, 0, shorter, full=True) for each in (complete(), lean))
+        before = float(np.mean(self._contribution(lean, base, other)))
+        if effect.mean - before <= margin:
+            return ""
+        return (
+            f"together they gain {-before:.2f} dB after {shorter:.0f} s and {-effect.mean:.2f} dB after {length:.0f} s "
+            f"{images}, so that a longer run may lose"
+        )
 
     def _longest(self):
         """Returns the seconds of the longest runs of the curve, which take what is left of the budget."""

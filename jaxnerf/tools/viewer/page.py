@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxnerf.data.geometry import path_poses
-from jaxnerf.data.geometry.poses import axis_of, gaze_center
+from jaxnerf.data.geometry.poses import axis_of, gaze_center, travel
 from jaxnerf.data.geometry.world import direction_in_run
 from jaxnerf.evaluation.paths.render_path import Frames, Output, render_path
 from jaxnerf.evaluation.restore import newest_step, restore_run
@@ -24,6 +24,7 @@ RESOLUTIONS = ("100", "200", "400", "800", "1600")  # px of the longer side
 _AXES = {"+x": (1, 0, 0), "+y": (0, 1, 0), "+z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 _MAX_FRUSTUMS, _THUMBNAIL, _BESIDE = 120, 64, 400  # views, px, px
 _NARROW = 0.75  # width over height of a window, below which the controls are folded at first: a phone's
+_AHEAD = 0.05  # of the scene's size, from a camera to the nearest point about which its view turns
 _MAX_WAITING = 32  # uses of controls that wait for their turn; later ones are dropped
 _PLAY_EVERY = 0.1  # s between times while time runs
 _STATUS_EVERY = 0.25  # s between changes of the status while the camera moves
@@ -264,9 +265,9 @@ class Page:
         return [[float(f"{value:.6g}") for value in end] for end in ends]
 
     def _look_at(self, pose):
-        """Returns the point on a camera's axis that is nearest to what all cameras look at, in front of it."""
-        along = float((pose[:, 3] - self._target) @ pose[:, 2])
-        return pose[:, 3] - pose[:, 2] * (along if along > 0.05 * self._size else self._size)
+        """Returns the point about which a view turns, nearest to what all look at; just ahead where cameras travel."""
+        along = _AHEAD * self._size if travel(self._poses) else float((pose[:, 3] - self._target) @ pose[:, 2])
+        return pose[:, 3] - pose[:, 2] * (along if along >= _AHEAD * self._size else self._size)
 
     def _go_to(self, pose, fov, up):
         camera = self._client.camera

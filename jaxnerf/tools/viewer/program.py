@@ -11,7 +11,7 @@ from jaxnerf.runtime import cli
 _WORKDIR = flags.DEFINE_string("workdir", None, "The run's folder.", required=True)
 _DATA_DIR = flags.DEFINE_string("data_dir", None, "The dataset's folder. It overrides config.data.dir.")
 _STEP = cli.define_step("The checkpoint's step. When it is not given, the newest is shown.")
-_MAX_UNCERTAINTY = cli.define_fraction("max_uncertainty", run_flags.MAX_UNCERTAINTY)
+_MAX_UNCERTAINTY = cli.define_value("max_uncertainty", run_flags.MAX_UNCERTAINTY, float, cli.PART)
 _HOST = flags.DEFINE_string(
     "host", "127.0.0.1", "The address to listen on. 0.0.0.0 lets other machines connect, without a password."
 )

@@ -48,7 +48,8 @@ class Trials:
         compiling = self.compiling * (tuple(values) not in self.compiled)
         self.compiled.add(tuple(values))
         rng = np.random.default_rng([seed, round(10 * length), *map(len, sorted(values))])
-        gained = sum(self.effects.get(key, 0.0) for key in values)
+        effects = [self.effects.get(key, 0.0) for key in values]
+        gained = sum(each(length) if callable(each) else each for each in effects)
         score = 25 + 2 * math.log2(length) + gained + RNG_OF_VIEWS
         score = score + self.noise * rng.normal() + self.noise * rng.normal(size=VIEWS)
         result = Result(
@@ -103,6 +104,15 @@ def test_verdicts_are_those_of_the_true_effects(tmp_path):
     assert outcome.spent <= 2000 and len(lines) > 12
     assert {each.part for each in outcome.lean} == {"encoding", "poses"}
     assert outcome.lean_effect.mean == pytest.approx(-1.1, abs=0.1) and not outcome.refused
+
+
+@pytest.mark.parametrize("change, kept", [("less", False), ("without", True)])
+def test_a_smaller_model_whose_gain_shrinks_with_time_is_refused(tmp_path, change, kept):
+    """It takes more steps in the same time, which helps at first."""
+    trials = Trials({"rows": lambda length: 8 - math.log2(length)})
+    outcome, _ = run_study(tmp_path / "a", trials, budget=100.0, variants=[variant("rows", change)], length=1.0)
+    assert verdicts(outcome) == {"rows": "not needed"} and bool(outcome.lean) == kept
+    assert ["a longer run may lose" in why for *_, why in outcome.refused] == [True] * (not kept)
 
 
 def test_the_budget_is_kept_and_what_is_not_tried_is_named(tmp_path):

@@ -41,3 +41,13 @@ def test_a_frame_is_requested_where_the_last_one_does_not_hold_the_mode(mode, un
     page._request, page._redraw = (lambda name=name: calls.append(name) for name in ("request", "redraw"))
     Page._change_mode(page)
     assert calls == ["request"] * requests or (calls == ["redraw"] and not requests)
+
+
+@pytest.mark.parametrize("outwards, distance", [(False, 3.0), (True, 0.2)])
+def test_a_view_turns_about_what_cameras_look_at_or_about_its_own_place_where_they_travel(outwards, distance):
+    turns = [np.diag([1.0, 1, 1]), np.diag([-1.0, 1, -1])]  # looking along -z and along z
+    eyes = [[0.5, 0, 3], [0, 0, -3]]
+    poses = np.stack([np.column_stack([turn, eye]) for turn, eye in zip(turns, eyes[:: 1 - 2 * outwards], strict=True)])
+    page = SimpleNamespace(_poses=poses, _size=4.0, _target=np.zeros(3))
+    pose = np.column_stack([np.eye(3), [0.5, 0, 3]])
+    np.testing.assert_allclose(Page._look_at(page, pose), [0.5, 0, 3 - distance])
