@@ -75,7 +75,7 @@ def source_of(scene=ball, *, say=lambda line: None, background=None, count=14, n
         world_depth=ray_batches.world_depth,
         config=changed(RunConfig(), {"eval.chunk": SIZE**2, "eval.sample_multiplier": 1.0}),
         background=background,
-        model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid)),
+        model=SimpleNamespace(scene=lambda params, grid: mask_scene(scene, grid), needs=()),
         load_split=lambda split, **options: views,
         cameras=None,
     )

@@ -41,23 +41,24 @@ def main(argv: list[str]) -> None:
     """Runs everything and prints the tables."""
     del argv
     out, needs, scores = pathlib.Path(_OUT.value), {}, {}
+    origin = common.provenance()  # before the page changes the tree
     options = [f"--parts={','.join(_PARTS.value)}"] if _PARTS.value else []
     options += [f"--seconds={_TRIAL.value}"] if _TRIAL.value else []
     options += [] if _SECONDS.value else ["--nolean"]
     for scene in _SCENES.value:
         arguments = [f"--config={_CONFIG.value}", *options]
         needs[scene] = run_program(scene, out / scene / "needs", _BUDGET.value, *arguments)
-        publish(needs, scores)
+        publish(needs, scores, origin)
     for scene in _SCENES.value if _SECONDS.value else ():
         scores[scene] = score(scene, out / scene, needs[scene]["lean"]["parts"])
-        publish(needs, scores)
+        publish(needs, scores, origin)
 
 
-def publish(needs: Mapping[str, dict[str, Any]], scores: Mapping[str, dict[str, Any]]) -> None:
-    """Prints the tables of the scenes so far, and writes them to the page."""
+def publish(needs: Mapping[str, dict[str, Any]], scores: Mapping[str, dict[str, Any]], origin: Sequence[str]) -> None:
+    """Prints the tables of the scenes so far, and writes them to the page; origin: the table of the command."""
     tables = [parts_table(needs, _BUDGET.value)]
     tables += [lean_table(needs, scores, _SECONDS.value)] if scores else []
-    tables += [common.provenance()]
+    tables += [origin]
     common.publish([line for table in tables for line in (*table, "")][:-1], "six")
 
 
@@ -108,7 +109,9 @@ def parts_table(needs: Mapping[str, dict[str, Any]], budget: str) -> list[str]:
     trials = [f"{scene} {results['plan']['length']:.0f} s" for scene, results in needs.items()]
     complete = [f"{results['complete']['psnr']:.2f} dB" for results in needs.values()]
     about = f"A budget of {budget} a scene; a trial trains for: {', '.join(trials)}."
-    return [about, "", *common.markdown(("part, change", *needs), [("complete model", *complete), *body])]
+    took = [f"{results['spent']:.0f} s" for results in needs.values()]
+    rows = [("the program took", *took), ("complete model", *complete), *body]
+    return [about, "", *common.markdown(("part, change", *needs), rows)]
 
 
 def cell(row: Mapping[str, Any]) -> str:

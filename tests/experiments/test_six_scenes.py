@@ -12,6 +12,7 @@ def results(verdict, mean, part="levels"):
     return {
         "parts": [row],
         "plan": {"length": 4.2},
+        "spent": 290.0,
         "complete": {"psnr": 25.0},
         "lean": {"parts": ["levels, less"] if verdict == "not needed" else []},
     }
@@ -29,6 +30,7 @@ def test_a_row_is_a_part_and_a_column_a_scene():
     assert "| levels, less | **+1.25** | -0.50 | +0.12 ? | not tried |  |" in lines
     assert "| visual hull, less |  |  |  |  | **+0.50** |" in lines
     assert "5min" in lines[0] and "fern 4 s" in lines[0]
+    assert any(line.startswith("| the program took | 290 s | 290 s |") for line in lines)
 
 
 def test_the_lean_model_is_beside_the_complete_one():

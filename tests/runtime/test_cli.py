@@ -163,7 +163,7 @@ def test_a_plugin_registers_a_field(tmp_path):
     (tmp_path / "my_plugin.py").write_text(plugin)
     code, out, err = call(tmp_path, "--plugins=my_plugin", "--count=auto")
     names = out.split()  # another test of this process may have registered fields, the program has not
-    assert (code, names) == (0, ["auto", "mlp", "hash_grid", "mine"]), err
+    assert (code, names) == (0, ["auto", "mlp", "hash_grid", "moving", "mine"]), err
 
 
 def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):

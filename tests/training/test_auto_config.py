@@ -64,6 +64,10 @@ AUTO_FIELDS = {
     "eval.sample_multiplier": 3,
     "eval.chunk": 512,
     "eval.max_samples": 2048,
+    "moving.motion_depth": 1,
+}
+AUTO_FIELDS |= {
+    name.replace("hash_grid", "moving"): value for name, value in AUTO_FIELDS.items() if "hash_grid" in name
 }
 
 
@@ -296,6 +300,7 @@ def test_explicit_values_do_not_change(views):
     expected |= {f"scene.{name}" for name in ("contracted", "lower", "upper")}
     expected |= {"data.world", "hash_grid.resolutions"}
     expected |= {"data.near", "scene.background", "cameras.num_images", "losses.depth", "hash_grid.prefilter"}
+    expected |= {f"moving.{name}" for name in ("resolutions", "prefilter", "motion_depth")}
     assert changed == expected
 
 
@@ -350,7 +355,8 @@ def test_device_fields_are_resolved_at_every_start(resolved, monkeypatch, tmp_pa
     assert set(auto_fields(read)) == set(DEVICE_FIELDS)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     config, lines = resolve_for_device(read)
-    assert not auto_fields(config) and len(lines) == len(DEVICE_FIELDS)
+    used = [name for name in DEVICE_FIELDS if not name.startswith("moving.")]
+    assert not auto_fields(config) and len(lines) == len(used)
     assert config.eval.chunk == chunk
     # 10 divides the numbers of steps between which rows are logged, checkpoints saved and dead networks sought.
     assert steps_per_dispatch(config.train, backend) == steps

@@ -309,7 +309,7 @@ def workdir(monkeypatch, tmp_path):
     """A workdir whose run is that of the sources; `registered` exports of the kind "test" are called."""
     source = source_of()
     source.run.experiment.model.grid_schedule = ()
-    monkeypatch.setattr(base, "restore_run", lambda workdir, data_dir=None, settings=None: source.run)
+    monkeypatch.setattr(base, "restore_run", lambda workdir, **options: source.run)
     return tmp_path
 
 
@@ -345,8 +345,8 @@ def test_an_export_is_whole_or_absent(workdir, monkeypatch):
 def test_a_run_that_cannot_be_exported_is_refused_before_its_grid_is_extracted(monkeypatch, tmp_path):
     source, calls = source_of(), []
 
-    def restore(workdir, data_dir=None, settings=None):
-        calls.append(settings)
+    def restore(workdir, **options):
+        calls.append(options.get("settings"))
         return source.run
 
     def check(run):
