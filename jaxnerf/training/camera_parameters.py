@@ -119,10 +119,13 @@ class CameraParameters(NamedTuple):
         behind = 0.0
         if self.background is not None:
             behind = (1 - batch.alpha[:, None]) * jnp.asarray(self.background, gains.dtype)[None]
-        return {
-            name: dataclasses.replace(each, rgb=behind + gains * (each.rgb - behind))
-            for name, each in renderings.items()
-        }
+
+        def seen(rgb):
+            rgb = behind + gains * (rgb - behind)
+            # A saturated colour says that there was at least so much light.
+            return jnp.where(batch.rgb >= 1, jnp.minimum(rgb, 1), rgb)
+
+        return {name: dataclasses.replace(each, rgb=seen(each.rgb)) for name, each in renderings.items()}
 
     def refined_views(self, params: Mapping[str, Any], views: Views, split: str) -> Views:
         """Returns Views with the refined cameras.

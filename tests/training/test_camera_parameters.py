@@ -222,6 +222,14 @@ def test_exposure_changes_the_object_and_not_its_background():
     np.testing.assert_allclose(exposed.rgb, [[0.4, 0.6, 0.8], [1, 0.5, 0.25], [0.55, 0.325, 0.225]], atol=1e-6)
 
 
+def test_a_saturated_colour_only_says_that_there_was_enough_light():
+    parameters = CameraParameters(2, True, False, None)
+    params = {CAMERAS: {"log_gains": jnp.log(jnp.float32([[2, 2, 2], [0.5, 0.5, 0.5]]))}}
+    batch = Batch(rays=None, rgb=jnp.float32([[1, 1, 0.99]]), image_index=jnp.array([0]), alpha=jnp.ones(1))
+    exposed = parameters.exposed(params, {"fine": toy_rendering(jnp.float32([[0.9, 0.4, 0.9]]))}, batch)["fine"]
+    np.testing.assert_allclose(exposed.rgb, [[1, 0.8, 1.8]], atol=1e-6)
+
+
 # In a run
 
 

@@ -16,9 +16,11 @@ import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from jaxnerf.runtime.atomic_files import open_regular
 
@@ -246,6 +248,48 @@ def map_images(
     for model in abandoned:
         shutil.rmtree(model.folder)
     return [model for model in listed if model not in abandoned]
+
+
+def triangulate(
+    database: Path,
+    folder: Path,
+    cameras: Mapping[str, tuple[str, Sequence[float], np.ndarray]],
+    models: Path,
+    num_threads: int,
+    *,
+    report: Callable,
+) -> list[Model]:
+    """Triangulates the matches of a database with known cameras, and writes the model to models/0.
+
+    Args:
+        database: with matches.
+        folder: of the images.
+        cameras: by the image's name: COLMAP's camera model, its parameters in px of the image, and the pose [3, 4]
+            from the world to the camera, whose y axis points down and whose z axis points ahead.
+        models: an existing folder.
+        num_threads: see `map_images`.
+    """
+    import pycolmap
+
+    known, target = pycolmap.Reconstruction(), models / "0"
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            kind, parameters, pose = cameras[image.name]
+            stored = opened.read_camera(image.camera_id)
+            camera = pycolmap.Camera(model=kind, width=stored.width, height=stored.height, params=list(parameters))
+            camera.camera_id = image.camera_id
+            if image.camera_id not in known.cameras:
+                known.add_camera_with_trivial_rig(camera)
+            place = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3])
+            keypoints = opened.read_keypoints(image.image_id)[:, :2].astype(float)
+            image = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
+            known.add_image_with_trivial_frame(image, place)
+    target.mkdir()
+    options = pycolmap.IncrementalPipelineOptions(num_threads=num_threads, random_seed=SEED, fix_existing_frames=True)
+    model = pycolmap.triangulate_points(known, database, folder, target, options=options)
+    report(model.num_reg_images())
+    found = model.num_points3D(), model.compute_mean_track_length(), model.compute_mean_reprojection_error()
+    return [Model(target, tuple(cameras), *found, ())]
 
 
 def _contradictions(model, database, names):

@@ -9,7 +9,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from jaxnerf.data import dataset
+from jaxnerf.data.dataset import DataOptions
+from jaxnerf.data.images.image_files import image_size
 from jaxnerf.data.readers import colmap
+from jaxnerf.options import AUTO
 from jaxnerf.registry import READERS
 from jaxnerf.runtime.atomic_files import check_tree, partial_file, read_bytes, remove, sweep, write_text
 from jaxnerf.runtime.fingerprint import file_sha256
@@ -41,12 +47,15 @@ class Settings(NamedTuple):
         single_camera: whether all images of one size have one camera in common.
         matching: see `image_pairs`; "auto": exhaustive for up to 200 images, otherwise sequential.
         max_size: px, the longer side at which features are extracted. Cameras are those of the full images.
+        cameras_of: folder of a dataset, of any format, with the same images, whose cameras are kept: only points are
+            found; "": cameras are estimated.
     """
 
     camera_model: str = "OPENCV"
     single_camera: bool = True
     matching: str = "auto"
     max_size: int = 1600
+    cameras_of: str = ""
 
 
 class Report(NamedTuple):
@@ -144,12 +153,14 @@ def estimate_cameras(
         )
     matching = images_module.resolve_matching(settings.matching, len(paths))
     used = {**settings._asdict(), "matching": matching, "images": {path.name: file_sha256(path) for path in paths}}
+    del used["cameras_of"]  # features and matches do not depend on it
+    known = known_cameras(settings.cameras_of, paths) if settings.cameras_of else None
     say(f"images: {len(paths)} in {images}" + (f"; its other files are skipped: {others}" if others else ""))
     stages = _Stages(out, used, num_threads or -1, overwrite, say)
     names, notes = stages.prepare_images(paths, in_place)
     stages.extract(names)
     stages.match(names)
-    models, more = stages.map_images(names)
+    models, more = stages.map_images(names) if known is None else (stages.triangulate(known), [])
     notes += more
     _publish(models[0].folder, out / "sparse", stages.work)
     capture = colmap.read_capture(out)
@@ -253,10 +264,23 @@ class _Stages:
         write_text(models[0].folder / _NOTES, note + "\n")
         return models, [note]
 
-    def _map(self, database, names, folder):
+    def triangulate(self, known):
+        """Returns COLMAP's model of known cameras; known: see `colmap_process.triangulate`."""
+        models = self._new_models("models")
+        with _Progress(self.say, "triangulation", "images", len(known)) as progress:
+            arguments = (self.database, self.images, known, models, self.num_threads)
+            found = self._call(colmap_process.triangulate, *arguments, progress=progress)
+            self.seconds["triangulation"] = progress.end(len(known))
+        return found
+
+    def _new_models(self, folder):
         models = self.work / folder
         remove(models)
         models.mkdir()
+        return models
+
+    def _map(self, database, names, folder):
+        models = self._new_models(folder)
         with _Progress(self.say, "mapping", "images", len(names)) as progress:
             arguments = (database, self.images, names, models, self.num_threads)
             found = self._call(colmap_process.map_images, *arguments, progress=progress)
@@ -318,6 +342,40 @@ class _Progress(Stage):
         seconds = time.monotonic() - self.started
         self.say(f"{self.step}: {count} of {self.total} {self.what}, {seconds:.0f} s")
         return seconds
+
+
+def known_cameras(folder: str | os.PathLike, paths: Sequence[Path]) -> dict[str, tuple[str, list[float], np.ndarray]]:
+    """Returns the cameras of a dataset for images of the same names, as `colmap_process.triangulate` takes them.
+
+    Raises:
+        ValueError: if the dataset has no camera for an image, or a lens that COLMAP's OPENCV models do not have.
+    """
+    data = DataOptions(format=AUTO, dir=os.fspath(folder), world="file", background="none")  # type: ignore[arg-type]
+    capture, found = dataset.resolve(data)[2], {}
+    frames = {} if capture is None else {frame.image.name: frame.camera for frame in capture.frames}
+    for path in paths:
+        if path.name not in frames:
+            raise ValueError(
+                f"{folder}: has no camera of {path.name}, expected one of each of the {len(paths)} images; remove "
+                "the image, or estimate all cameras without --cameras_of"
+            )
+        camera = frames[path.name]
+        lens = [] if camera.distortion is None else [*map(float, camera.distortion)]
+        if camera.lens not in ("pinhole", "opencv") or len(lens) > 4:
+            raise ValueError(
+                f"{folder}: the camera of {path.name} has the lens {camera.lens} of {len(lens)} coefficients, expected "
+                "pinhole, or opencv of at most 4; estimate all cameras without --cameras_of"
+            )
+        # The dataset may state cameras of images of another size.
+        width, height = (int(side) for side in image_size(path))
+        scale = [width / (camera.width or width), height / (camera.height or height)]
+        parameters = [*np.multiply(camera.focal, scale).tolist(), *np.multiply(camera.center, scale).tolist(), *lens]
+        parameters += [0.0] * (8 - len(parameters)) * bool(lens)
+        to_world = np.asarray(camera.to_world, np.float64) * [1, -1, -1, 1]
+        turn = to_world[:, :3].T
+        pose = np.column_stack([turn, -turn @ to_world[:, 3]])
+        found[images_module.copy_name(path)] = ("OPENCV" if lens else "PINHOLE", parameters, pose)
+    return found
 
 
 def _check_choice(name, value, choices):

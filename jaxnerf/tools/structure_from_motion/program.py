@@ -31,6 +31,11 @@ _MATCHING = flags.DEFINE_string(
 _MAX_SIZE = flags.DEFINE_integer(
     "max_size", 1600, "The longer side in px at which features are extracted.", lower_bound=64, upper_bound=65_536
 )
+_CAMERAS_OF = flags.DEFINE_string(
+    "cameras_of",
+    "",
+    "The folder of a dataset in any format with the same images, whose cameras are kept: only points are found.",
+)
 _NUM_THREADS = flags.DEFINE_integer(
     "num_threads",
     None,
@@ -52,7 +57,7 @@ def main(argv):
     report = estimate_cameras(
         _IMAGES.value,
         _OUT.value,
-        Settings(_CAMERA_MODEL.value, _SINGLE_CAMERA.value, _MATCHING.value, _MAX_SIZE.value),
+        Settings(_CAMERA_MODEL.value, _SINGLE_CAMERA.value, _MATCHING.value, _MAX_SIZE.value, _CAMERAS_OF.value),
         num_threads=_NUM_THREADS.value,
         overwrite=_OVERWRITE.value,
         say=lambda line: print(printable(line), flush=True),

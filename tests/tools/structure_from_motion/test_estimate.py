@@ -18,6 +18,7 @@ from PIL import Image
 
 import captures
 import runs
+from jaxnerf.data.readers import colmap
 from jaxnerf.data.readers.base import read_capture
 from jaxnerf.tools.structure_from_motion import colmap_process, estimate
 from jaxnerf.tools.structure_from_motion import images as images_module
@@ -286,3 +287,33 @@ def test_cameras_of_a_few_images_agree_with_the_given_ones_and_an_interrupted_ca
     code, text, err = runs.run_forked("cameras", *flags, "--overwrite")
     assert code == 0 and files(out / "sparse") == before, err
     assert json.loads((out / "cameras" / "settings.json").read_text())["matching"] == "exhaustive"
+
+    given = colmap.read_capture(out)
+    shutil.move(out / "sparse", tmp_path / "sparse")
+    shutil.copytree(out / "images", tmp_path / "images")
+    code, text, err = runs.run_forked("cameras", *flags, f"--cameras_of={tmp_path}")
+    assert code == 0 and "triangulation: 8 of 8 images" in text, err
+    found = colmap.read_capture(out)
+    assert len(found.points) > 100 and all(len(frame.seen) for frame in found.frames)
+    for first, second in zip(found.frames, given.frames, strict=True):
+        np.testing.assert_allclose(first.camera.to_world, second.camera.to_world, atol=1e-12)
+        np.testing.assert_allclose(first.camera.focal, second.camera.focal)
+
+
+def test_known_cameras_are_those_of_the_images_size_in_the_axes_of_colmap(tmp_path, images):
+    pose = np.column_stack([np.diag([1.0, -1, -1]), [1, 2, 3]])  # looks along +z
+    lens = {"camera_model": "OPENCV", "k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.02}
+    content = {"w": 48, "h": 32, "fl_x": 40.0, "fl_y": 44.0, "cx": 25.0, "cy": 15.0, **lens}
+    content["frames"] = [
+        {"file_path": f"{name}.png", "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]} for name in "abc"
+    ]
+    (images / "transforms.json").write_text(json.dumps(content))
+    paths = sorted(images.glob("*.png"))
+    known = estimate.known_cameras(images, paths)
+    assert list(known) == ["a.png", "b.png", "c.png"]
+    kind, parameters, to_camera = known["b.png"]
+    assert kind == "OPENCV"
+    np.testing.assert_allclose(parameters, [10, 11, 6.25, 3.75, 0.1, 0, 0, 0.02])
+    np.testing.assert_allclose(to_camera, np.column_stack([np.eye(3), [-1, -2, -3]]))
+    with pytest.raises(ValueError, match="has no camera of d.png, expected one of each of the 1 images"):
+        estimate.known_cameras(images, [images / "d.png"])
