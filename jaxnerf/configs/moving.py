@@ -10,5 +10,4 @@ def get_config():
     config.field = "moving"
     for name in ("width", "view_width", "table_size", "view_depth"):
         setattr(config.moving, name, "auto")
-    config.losses.opacity = "auto"
     return config

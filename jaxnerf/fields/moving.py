@@ -25,7 +25,7 @@ from jaxnerf.fields.hash_grid import HashGrid, HashGridOptions
 from jaxnerf.options import Ablation, Box, Device, Facts, at_least, between, infer, option
 from jaxnerf.registry import Part
 
-_SCALE = 0.01  # of the box: a displacement of an output of 1, so that steps move matter by little
+_SCALE = 0.03  # of the box: a displacement of an output of 1, so that steps move matter by little
 _DEPTH = 2
 
 
