@@ -300,14 +300,13 @@ class HashGrid(linen.Module):
         upper: [3] world units, the opposite corner.
         options: its sizes. With prefilter the features of each level are multiplied by its `damping`, and the radius is
             an input, too. Parameters, interpolation and outputs keep the precision of the table.
-        fixed_order, num_graded: see `interpolate`.
+        fixed_order: see `interpolate`.
     """
 
     lower: Sequence[float]
     upper: Sequence[float]
     options: HashGridOptions
     fixed_order: bool = False
-    num_graded: int | None = None
 
     @linen.nowrap
     def levels(self) -> tuple[TableLevel, ...]:
@@ -340,8 +339,7 @@ class HashGrid(linen.Module):
         levels = self.levels()
         # All levels share a table, so there is only one gradient to clear and one array to update.
         table = self.param("table", _near_zero, (levels[-1].rows.stop, options.features_per_level))
-        how = {"fixed_order": self.fixed_order, "num_graded": self.num_graded}
-        features = FEATURE_SCALE * interpolate(table, place, levels, **how)
+        features = FEATURE_SCALE * interpolate(table, place, levels, fixed_order=self.fixed_order)
         if options.prefilter:
             cells = [float((side / (np.array(level.size) - 1)).max()) for level in levels]
             left = jnp.stack([damping(radius.reshape(-1), cell) for cell in cells], axis=-1)

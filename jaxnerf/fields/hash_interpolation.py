@@ -42,7 +42,6 @@ def interpolate(
     levels: Sequence[TableLevel],
     *,
     fixed_order: bool = False,
-    num_graded: int | None = None,
 ) -> Float[Array, "N levels_and_features"]:
     """Interpolates features linearly between the 8 vertices around each place, for each level.
 
@@ -53,7 +52,6 @@ def interpolate(
             the hash of arXiv:2201.05989 (Eq. 4). All hashed levels have the same number of rows.
         fixed_order: whether the gradient of a row is summed in a fixed order, for accelerators, whose own additions to
             rows have none. There are then no forward-mode derivatives.
-        num_graded: how many levels, the first ones, have a derivative with respect to place; None: all.
 
     Returns:
         [N, L F], level by level, at least float32. The derivative with respect to place is that of the linear pieces,
@@ -67,8 +65,7 @@ def interpolate(
     if len(counts) > 1:
         raise ValueError(f"interpolate: hashed levels have {sorted(counts)} rows, expected the same number in each")
     chosen = _interpolate_in_fixed_order if fixed_order else _interpolate
-    graded = len(levels) if num_graded is None else num_graded
-    return chosen(tuple(levels), graded, jnp.asarray(table), tuple(map(jnp.asarray, place)))
+    return chosen(tuple(levels), jnp.asarray(table), tuple(map(jnp.asarray, place)))
 
 
 def _interpolated(levels, table, place):
@@ -83,13 +80,11 @@ def _interpolated(levels, table, place):
     return _weighted_sums(weights, features)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _interpolate(levels, graded, table, place):
-    return _interpolated(levels, table, place)
+_interpolate = jax.custom_jvp(_interpolated, nondiff_argnums=(0,))
 
 
 @functools.partial(_interpolate.defjvp, symbolic_zeros=True)
-def _interpolate_jvp(levels, graded, primals, tangents):
+def _interpolate_jvp(levels, primals, tangents):
     """Gathers the rows of all levels and vertices at once.
 
     Otherwise the gradient would compile loops of its own for the rows of each vertex of each level. The gathered
@@ -108,8 +103,7 @@ def _interpolate_jvp(levels, graded, primals, tangents):
             jnp.zeros_like(value) if isinstance(each, SymbolicZero) else each
             for value, each in zip(place, moved, strict=True)
         )
-        slope = jax.jvp(functools.partial(_interpolated, levels[:graded], table), (place,), (moved,))[1]
-        tangent += jnp.pad(slope, [(0, 0), (0, (len(levels) - graded) * table.shape[-1])])
+        tangent += jax.jvp(functools.partial(_interpolated, levels, table), (place,), (moved,))[1]
     if not is_cpu():
         return _together(rows, weights, table), tangent
     return _weighted_sums(weights, [[_read(table, row) for row in level] for level in rows]), tangent
@@ -136,23 +130,22 @@ def _by_sample(features):
     return jnp.moveaxis(features, 0, 1).reshape(samples, levels * size)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _interpolate_in_fixed_order(levels, graded, table, place):
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _interpolate_in_fixed_order(levels, table, place):
     return _together(*_all_corners(levels, place), table)
 
 
-def _forward_in_fixed_order(levels, graded, table, place):
-    return _interpolate_in_fixed_order(levels, graded, table, place), (table, place)
+def _forward_in_fixed_order(levels, table, place):
+    return _interpolate_in_fixed_order(levels, table, place), (table, place)
 
 
-def _backward_in_fixed_order(levels, graded, residuals, change):
+def _backward_in_fixed_order(levels, residuals, change):
     table, place = residuals
     rows, weights = _all_corners(levels, place)
     change_of_level = jnp.moveaxis(change.reshape(*rows.shape[2:], len(levels), table.shape[-1]), 1, 0)
     values = weights[..., None] * change_of_level[:, None]
     sums = add_rows(values.reshape(-1, values.shape[-1]), rows.reshape(-1), len(table))
-    first = change[:, : graded * table.shape[-1]]
-    moved = jax.vjp(lambda place: _interpolated(levels[:graded], table, place), place)[1](first)[0]
+    moved = jax.vjp(lambda place: _interpolated(levels, table, place), place)[1](change)[0]
     return sums.astype(table.dtype), moved
 
 

@@ -5,9 +5,6 @@
 The hash grid H holds the scene at no particular time; d is 0 at first, so training starts from a scene at rest
 (arXiv:2011.13961). The network of densities also reads c, the last hidden layer of the network of d (after
 arXiv:2205.15285), so that matter may appear or vanish where no displacement brings it.
-
-Displacements follow the gradient of the coarser half of H's levels alone: that of the finer ones leads to matter that
-fits by chance, as where cameras are refined (arXiv:2104.06405).
 """
 
 import dataclasses
@@ -25,7 +22,7 @@ from jaxnerf.fields.hash_grid import HashGrid, HashGridOptions
 from jaxnerf.options import Ablation, Box, Device, Facts, at_least, between, infer, option
 from jaxnerf.registry import Part
 
-_SCALE = 0.03  # of the box: a displacement of an output of 1, so that steps move matter by little
+_SCALE = 0.1  # of the box: a displacement of an output of 1, so that early steps move little
 _DEPTH = 2
 
 
@@ -40,7 +37,7 @@ class MovingOptions(HashGridOptions):
         auto=True,
         ablations=(Ablation("motion", without=0),),
     )
-    motion_width: int = option(32, "outputs of such a layer", range=at_least(1), ablations=(WIDTH_PART,))
+    motion_width: int = option(64, "outputs of such a layer", range=at_least(1), ablations=(WIDTH_PART,))
     motion_freqs: int = option(4, "octaves of the encoding of positions in it", range=between(0, 16))
     time_freqs: int = option(4, "octaves of the encoding of time in it", range=between(0, 16))
 
@@ -116,9 +113,7 @@ def from_options(options: MovingOptions, box: Box | None) -> Field:
     field = hash_grid.from_options(options, box)
     if not options.motion_depth:
         return field
-    coarse = max(len(options.resolutions) // 2, 1)
-    network = MovingHashGrid(*box, options, num_graded=coarse)
-    return hash_grid.network_field(network, _scene_of)._replace(network=None)
+    return hash_grid.network_field(MovingHashGrid(*box, options), _scene_of)._replace(network=None)
 
 
 FIELD = Part(from_options, MovingOptions, section="moving")

@@ -405,22 +405,6 @@ def test_mixed_second_derivatives_are_those_of_finite_differences():
     np.testing.assert_allclose(along, (loss(table + change) - loss(table - change)) / 2, rtol=1e-3)  # a square: exact
 
 
-@pytest.mark.parametrize("fixed_order", [False, True])
-def test_places_have_the_slope_of_the_graded_levels_alone_and_tables_that_of_all(fixed_order):
-    levels = [TableLevel(SIZE, range(COUNT)), TableLevel((9, 9, 9), range(COUNT, COUNT + 64))]
-    table = np.float32(np.random.default_rng(9).normal(size=(COUNT + 64, 2)))
-    points = list(places(20, low=0.02, high=0.98))
-
-    def slopes(levels, num_graded):
-        how = {"fixed_order": fixed_order, "num_graded": num_graded}
-        return jax.jit(jax.grad(lambda *given: interpolate(*given, levels, **how).sum(), argnums=(0, 1)))(table, points)
-
-    of_table, of_place = slopes(levels, 1)
-    assert_same(of_place, slopes(levels[:1], None)[1])
-    assert_same(of_table, slopes(levels, None)[0])
-    assert (of_table[COUNT:] != 0).any() and not np.allclose(of_place[0], slopes(levels, None)[1][0])
-
-
 def test_hashed_levels_with_different_numbers_of_rows_are_named():
     with pytest.raises(ValueError, match=r"interpolate: hashed levels have \[32, 64\] rows, expected the same number"):
         levels = [TableLevel((9, 9, 9), range(64)), TableLevel((9, 9, 9), range(64, 96))]
