@@ -82,6 +82,7 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         factor=data.factor,
         skips_empty_cells=sampler.skips_empty_cells,
         trains_cameras=config.cameras.any,
+        outlined=outlined,
     )
     scene, more = resolve_background(scene, views, behind_alpha=data.background, fills_space=facts.fills_space)
     data, views, near = dataset.resolve_near(data, views, fills_space=facts.fills_space)
