@@ -28,7 +28,7 @@ from jaxnerf.tools.curve.measure import SCORE
 HEADS = ("run", "`cameras.exposure`", "steps", "PSNR, dB", "exposure aligned, dB", "right halves, dB")
 _SCORES = ("psnr", "psnr_exposure_aligned", "psnr_exposure_half")
 FACTORS, TINTS = (0.6, 1.6), (0.9, 1.1)
-_KINDS = (("as taken", False), ("as taken", True), ("changed", False), ("changed", True))
+_KINDS = (("as taken", False), ("changed", True), ("changed", False))
 
 _DATASET = flags.DEFINE_string("dataset", "fox", "Folder of a dataset.")
 _WIDTH = flags.DEFINE_integer("width", 100, "px of an image's width, at least.", lower_bound=8)
