@@ -176,6 +176,7 @@ class Facts(NamedTuple):
         factor: by which the images were downscaled.
         skips_empty_cells: whether the run's sampler does, see `Options.skips_empty_cells`.
         trains_cameras: whether the run trains parameters of the training images.
+        travels: whether the cameras look at no common point, as on a walk.
         has_times: whether the images have times.
         outlined: whether alpha shows that nothing surrounds the scene, also where it does not bound it.
         rays_per_step: that suit the sampler and the device, see `Options.rays_per_step`; 0 for the options of a field,
@@ -198,6 +199,7 @@ class Facts(NamedTuple):
     factor: int = 1
     skips_empty_cells: bool = False
     trains_cameras: bool = False
+    travels: bool = False
     has_times: bool = False
     outlined: bool = False
     rays_per_step: int = 0

@@ -30,6 +30,7 @@ def dataset_facts(views: Views, **known: Any) -> Facts:
         footprint_spread=footprint_spread(views),
         mean_alpha=float(sample_pixels(views)[:, 3].mean()) if known["has_alpha"] else 1.0,
         has_times=views.time is not None,
+        travels=poses.travel(np.asarray(views.cameras.to_world, np.float64)),
         **known,
     )
 

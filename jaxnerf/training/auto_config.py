@@ -25,6 +25,8 @@ from jaxnerf.training.config import (
     used_sections,
 )
 
+_WITHOUT_POINTS = "; no sparse points are known, which help most there: jaxnerf-cameras --cameras_of finds them"
+
 
 class Resolved(NamedTuple):
     """A resolved config.
@@ -84,6 +86,10 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         trains_cameras=config.cameras.any,
         outlined=outlined,
     )
+    if facts.travels and facts.fills_space:
+        lines.append(
+            "walk          the cameras look at no common point" + _WITHOUT_POINTS * (not facts.num_observations)
+        )
     scene, more = resolve_background(scene, views, behind_alpha=data.background, fills_space=facts.fills_space)
     data, views, near = dataset.resolve_near(data, views, fills_space=facts.fills_space)
     config = replaced(config, data=data, scene=scene, fingerprint=fingerprint)

@@ -162,9 +162,9 @@ def look_one_way(poses: Float[np.ndarray, "V 3 4"], *, cosine: float = 0.85) -> 
 def travel(poses: Float[np.ndarray, "V 3 4"]) -> bool:
     """Returns whether cameras travel, as on a walk: fewer than half look at the point that is nearest to their axes.
 
-    A camera looks at it if it is within 45 degrees of the axis, as in most images. All do in a capture of an object,
-    a room around one, or cameras that look one way.
+    A camera looks at it if it is within 45 degrees of the axis, as in most images, or stands there. All do in a capture
+    of an object, or of a room around one.
     """
     towards = gaze_center(poses) - poses[:, :, 3]
     ahead = -(towards * poses[:, :, 2]).sum(axis=1)
-    return bool((ahead > math.sqrt(0.5) * np.linalg.norm(towards, axis=1)).mean() < 0.5)
+    return bool((ahead >= math.sqrt(0.5) * np.linalg.norm(towards, axis=1)).mean() < 0.5)
