@@ -9,7 +9,8 @@ and "val" by the mean PSNR of colours of 8 bits, and again on "test" with the ti
 The moving bodies are those of docs/extending/moving_scene.md in closed form: 48 training images of 32 px, each from
 another camera at a time of its own, and 6 test images from other cameras at other times. OUT/bodies is the dataset,
 OUT/run the run of `--config=moving` for so many seconds. Flicker is the root mean square, over the pixels of a still
-camera, of the change from one of 97 times to the next beyond the change of the truth, which stands beside it.
+camera, of the change from one of 97 times to the next beyond the change of the truth, which stands beside it. The
+figures that others publish for the same images follow.
 """
 
 import dataclasses
@@ -23,6 +24,7 @@ from absl import flags
 sys.path += [str(pathlib.Path(__file__).resolve().parents[up] / name) for up, name in ((1, ""), (2, "tests/extending"))]
 import common
 import moving_bodies
+from benchmark import tables
 
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.metrics import psnr, round_to_8_bits
@@ -30,6 +32,7 @@ from jaxnerf.evaluation.evaluate import train_and_evaluate
 from jaxnerf.evaluation.restore import newest_step, restore_run
 from jaxnerf.evaluation.supersampling import render_pixels
 from jaxnerf.runtime import cli
+from jaxnerf.tools.curve.measure import SCORE
 
 _RUNS = flags.DEFINE_list("runs", [], "Workdirs of finished runs.")
 _OUT = flags.DEFINE_string("out", "runs/moving", "Folder of the moving bodies and their run.")
@@ -55,6 +58,9 @@ def main(argv: list[str]) -> None:
         f"Moving bodies, from one of {_NUM_TIMES} times to the next: the truth changes by {change:.4f}, root mean "
         f"square over all pixels, and the rendering by {extra:.4f} beyond it.",
     ]
+    scores = [common.read_json(pathlib.Path(workdir) / SCORE) for workdir in _RUNS.value]
+    if scores:
+        lines += ["", *tables.beside({score["job"]: [score] for score in scores})]
     common.publish(lines, "moving")
 
 
@@ -65,7 +71,7 @@ def row(workdir, name):
     test, validation = (mean_psnr(run, split) for split in ("test", "val"))
     frozen = [mean_psnr(restore_run(workdir, time=time), "test") for time in (0.0, 0.5)]
     side = int(run.experiment.load_split("test").size[0, 0])
-    figures = [f"{value:.2f}" for value in (test, validation, *frozen)]
+    figures = ["-" if np.isnan(value) else f"{value:.2f}" for value in (test, validation, *frozen)]
     return [name, str(side), f"{config.train.max_seconds:g}", f"{step:,}", *figures]
 
 
