@@ -26,7 +26,7 @@ def workdir(unoptimized, tmp_path_factory):
     config.data.dir, config.data.factor = str(folder / "data"), 1
     config.moving.update({**SIZES, "motion_width": 32})
     config.occupancy.resolution = 32
-    config.train.update({"max_steps": 120, "lr_steps": 120, "preview_every": 0.0, "batch_size": 384})
+    config.train.update({"max_steps": 300, "lr_steps": 300, "preview_every": 0.0, "batch_size": 384})
     config.eval.summary_seconds = 0.0
     assert jaxnerf.train_and_evaluate(config, folder / "run")
     return folder / "run"
@@ -38,7 +38,7 @@ def test_other_views_at_other_times_are_learned(workdir):
     value = score(run, test)
     frozen = score(jaxnerf.restore_run(workdir, time=0.5), test)
     print(f"moving {value:.2f}, frozen {frozen:.2f}")
-    assert value > 18 and value > frozen + 2
+    assert value > 21 and value > frozen + 4
     same = score(run, dataclasses.replace(test, time=np.full(2, 0.5, np.float32)))
     assert frozen == pytest.approx(same, abs=1e-3)
     assert jaxnerf.restore_run(workdir, time=0.5).experiment.model.needs == ()
