@@ -178,6 +178,7 @@ class Facts(NamedTuple):
         trains_cameras: whether the run trains parameters of the training images.
         travels: whether the cameras look at no common point, as on a walk.
         has_times: whether the images have times.
+        outlined: whether alpha shows that nothing surrounds the scene, also where it does not bound it.
         rays_per_step: that suit the sampler and the device, see `Options.rays_per_step`; 0 for the options of a field,
             which are resolved before.
         rays_reason: why.
@@ -200,6 +201,7 @@ class Facts(NamedTuple):
     trains_cameras: bool = False
     travels: bool = False
     has_times: bool = False
+    outlined: bool = False
     rays_per_step: int = 0
     rays_reason: str = ""
     batch_size: int = 0

@@ -125,6 +125,7 @@ LOSSES = Registry(
     "jaxnerf.register_loss",
     {
         "mse": "jaxnerf.training.losses:MSE",
+        "opacity": "jaxnerf.training.losses:OPACITY",
         "distortion": "jaxnerf.training.losses:DISTORTION",
         "depth": "jaxnerf.training.losses:DEPTH",
         "total_variation": "jaxnerf.fields.hash_grid:TOTAL_VARIATION",

@@ -10,4 +10,5 @@ def get_config():
     config.field = "moving"
     for name in ("width", "view_width", "table_size", "view_depth"):
         setattr(config.moving, name, "auto")
+    config.losses.opacity = "auto"
     return config

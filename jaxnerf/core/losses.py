@@ -27,6 +27,11 @@ def mse_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch
     return sum(squared_error(rendering, batch) for rendering in outputs)
 
 
+def opacity_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
+    """Computes the squared difference between the last rendering's opacity and the alpha of the pixel."""
+    return (outputs[-1].opacity - batch.alpha) ** 2
+
+
 def distortion_loss(outputs: Sequence[Rendering], batch: Batch) -> Float[Array, "*batch"]:
     """Computes the distortion of the last rendering's weights along each ray (arXiv:2111.12077, Eq. 15).
 

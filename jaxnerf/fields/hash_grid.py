@@ -352,10 +352,12 @@ class HashGrid(linen.Module):
         viewdirs: Float[ArrayLike, "*batch #samples 3"],
         radius: Float[ArrayLike, "*batch samples"] | None = None,
         code: Float[ArrayLike, "D N"] | None = None,
+        fixed: Float[ArrayLike, "*batch samples 3"] | None = None,
     ) -> tuple[Float[Array, "*batch samples"], Float[Array, "*batch samples 3"]]:
         """Returns density [..., S] and rgb [..., S, 3] before their activations; arrays inside are [features, N].
 
-        A code [D, N] is read by a further layer of the density network.
+        A code [D, N] is read by a further layer of the density network. Fixed positions [..., S, 3], equal to x with
+        another derivative, are those of the finer half of the levels.
         """
         options, shape = self.options, x.shape[:-1]
         dtype = _COMPUTE_DTYPES.get(options.compute_dtype, options.compute_dtype)
@@ -364,11 +366,22 @@ class HashGrid(linen.Module):
             return value if dtype is None else value.astype(dtype)
 
         side = np.asarray(self.upper, np.float32) - np.asarray(self.lower, np.float32)
-        place = stored([(x[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)])
         levels = self.levels()
+        half = len(levels) if fixed is None else (len(levels) + 1) // 2
+        halves = [(x, levels[:half]), (fixed, levels[half:])]
         # All levels share a table, so there is only one gradient to clear and one array to update.
         table = self.param("table", _near_zero, (levels[-1].rows.stop, options.features_per_level))
-        features = FEATURE_SCALE * interpolate(table, place, levels, fixed_order=self.fixed_order)
+        parts = [
+            interpolate(
+                table,
+                stored([(at[..., i].reshape(-1) - self.lower[i]) / side[i] for i in range(3)]),
+                some,
+                fixed_order=self.fixed_order,
+            )
+            for at, some in halves
+            if some
+        ]
+        features = FEATURE_SCALE * (parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1))
         if options.prefilter:
             cells = [float((side / (np.array(level.size) - 1)).max()) for level in levels]
             left = jnp.stack([damping(radius.reshape(-1), cell) for cell in cells], axis=-1)

@@ -5,6 +5,9 @@
 The hash grid H holds the scene at no particular time; d is 0 at first, so training starts from a scene at rest
 (arXiv:2011.13961). The network of densities also reads c, the last hidden layer of the network of d (after
 arXiv:2205.15285), so that matter may appear or vanish where no displacement brings it.
+
+Displacements follow the gradient of the coarser half of H's levels alone: that of the finer ones leads to matter that
+fits by chance, as where cameras are refined (arXiv:2104.06405).
 """
 
 import dataclasses
@@ -22,7 +25,7 @@ from jaxnerf.fields.hash_grid import HashGrid, HashGridOptions
 from jaxnerf.options import Ablation, Box, Device, Facts, at_least, between, infer, option
 from jaxnerf.registry import Part
 
-_SCALE = 0.1  # of the box: a displacement of an output of 1, so that early steps move little
+_SCALE = 0.01  # of the box: a displacement of an output of 1, so that a step moves matter by little
 _DEPTH = 2
 
 
@@ -37,7 +40,7 @@ class MovingOptions(HashGridOptions):
         auto=True,
         ablations=(Ablation("motion", without=0),),
     )
-    motion_width: int = option(64, "outputs of such a layer", range=at_least(1), ablations=(WIDTH_PART,))
+    motion_width: int = option(32, "outputs of such a layer", range=at_least(1), ablations=(WIDTH_PART,))
     motion_freqs: int = option(4, "octaves of the encoding of positions in it", range=between(0, 16))
     time_freqs: int = option(4, "octaves of the encoding of time in it", range=between(0, 16))
 
@@ -92,8 +95,8 @@ class MovingHashGrid(HashGrid):
         side = np.float32(self.upper) - lower
         place = (planes_of(x) - lower[:, None]) / side[:, None]
         offset, code = Motion(self.options, name="motion")(place, time.reshape(-1))
-        moved = x + jnp.moveaxis(side[:, None] * offset, 0, -1).reshape(x.shape)
-        return super().__call__(moved, viewdirs, radius, code)
+        offset = jnp.moveaxis(side[:, None] * offset, 0, -1).reshape(x.shape)
+        return super().__call__(x + offset, viewdirs, radius, code, x + jax.lax.stop_gradient(offset))
 
 
 def _scene_of(network):

@@ -84,6 +84,7 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         factor=data.factor,
         skips_empty_cells=sampler.skips_empty_cells,
         trains_cameras=config.cameras.any,
+        outlined=outlined,
     )
     if facts.travels and facts.fills_space:
         lines.append(

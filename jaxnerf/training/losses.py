@@ -1,6 +1,6 @@
 """The built-in losses of renderings by name: their functions are in `core.losses`."""
 
-from jaxnerf.core.losses import depth_loss, distortion_loss, mse_loss
+from jaxnerf.core.losses import depth_loss, distortion_loss, mse_loss, opacity_loss
 from jaxnerf.registry import Loss
 
 _MIN_OBSERVATIONS = 100  # of sparse points, for a depth loss
@@ -21,7 +21,18 @@ def _weight_of_distortion(facts):
     return weight, f"distortion    weight {weight:g}, as {where}"
 
 
+def _weight_of_opacity(facts):
+    return (0.1, "opacity       is compared with alpha, which outlines the scene") if facts.outlined else (0.0, "")
+
+
 MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over all renderings")
+OPACITY = Loss(
+    opacity_loss,
+    needs=("alpha",),
+    infer=_weight_of_opacity,
+    help="squared difference of opacity and alpha; auto, for scenes that move, where no visual hull empties space: 0.1 "
+    "where images have alpha",
+)
 DISTORTION = Loss(
     distortion_loss,
     infer=_weight_of_distortion,

@@ -14,6 +14,7 @@ from helpers import all_finite, assert_batch_is_vmap_is_jit, checked_grid, compi
 from jaxnerf.core.losses import (
     depth_loss,
     mse_loss,
+    opacity_loss,
 )
 from jaxnerf.core.occupancy.grid import is_occupied
 from jaxnerf.core.types import without_samples
@@ -35,6 +36,14 @@ def make_rendering(weights, t, delta, rule="segments"):
     samples = jaxnerf.Samples(t=t, delta=delta, rule=rule)
     names = ("rgb", "opacity", "depth", "disparity", "num_dropped")
     return jaxnerf.Rendering(weights=weights, samples=samples, **dict.fromkeys(names, weights[..., 0]))
+
+
+def test_the_opacity_of_the_last_rendering_is_compared_with_alpha():
+    opacity = jnp.float32([0.0, 0.25, 1.0])
+    batch = dataclasses.replace(make_batch(np.zeros(3), 1.0), alpha=jnp.float32([0.0, 1.0, 0.5]))
+    first, last = (make_rendering(jnp.full((3, 1), 0.5), *jnp.ones((2, 3, 1))) for _ in range(2))
+    last = dataclasses.replace(last, opacity=opacity)
+    np.testing.assert_allclose(opacity_loss((first, last), batch), [0, 0.5625, 0.25])
 
 
 compiled_loss = compiled(jaxnerf.distortion_loss)

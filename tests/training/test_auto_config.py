@@ -188,6 +188,14 @@ def test_every_auto_field_is_inferred_and_logged(resolved):
     assert f"a pixel covers {PIXEL:.4g}" in "".join(lines)
 
 
+def test_opacity_is_compared_with_alpha_where_images_have_one(views):
+    config = changed(read_config(auto_config()), {"losses.opacity": AUTO})
+    for channels, weight in ((4, 0.1), (3, 0.0)):
+        pixels = np.ascontiguousarray(views.pixels[:, :channels])
+        seen = dataclasses.replace(views, pixels=pixels, background=views.background if channels == 4 else None)
+        assert resolve(config, seen).config.losses["opacity"] == weight
+
+
 @pytest.mark.parametrize("contracted, weight", [(False, 0.01), (True, 0.001)])
 def test_distortion_weighs_less_where_nothing_bounds_the_scene(views, contracted, weight):
     config = changed(read_config(auto_config(contracted=contracted)), {"losses.distortion": AUTO})
