@@ -1,11 +1,11 @@
-"""Trains and scores walks: PSNR and SSIM of their views that were not trained on, after some seconds.
+"""Trains and scores walks: PSNR and SSIM of views that were not trained on, after some seconds of one core's time.
 
     JAXNERF_SCENES=... taskset -c 0 python experiments/room/walks.py --data_dirs=walk,walk_points --seconds=120,300 \
         [--out=runs/walks] [--width=240] [--set=NAME=VALUE]... [--split=test] [--page=docs/results/captures.md]
 
-Every run is configs/capture.py, on a core that nothing else uses. Finished runs are not trained again; an interrupted
-one goes on. The split "held_out" is every 8th training view, then not trained on. --set changes all runs of a call;
-runs of other calls with the same --out stay in the table.
+Every run is configs/capture.py; seconds are CPU time of one core. The split "held_out" is every 8th training view,
+then not trained on. --set changes all runs of a call. What walks.json in --out has is not measured again; the table has
+all of it. A sheet of scored views is beside it, below each the image.
 """
 
 import ast
@@ -14,11 +14,16 @@ import sys
 
 import numpy as np
 from absl import flags
+from PIL import Image
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 
+from jaxnerf.core.metrics import ssim
+from jaxnerf.data import dataset
 from jaxnerf.runtime import cli
+from jaxnerf.tools.needs import trial
+from jaxnerf.training.config import changed, read_config
 
 HEADS = ("dataset", "changed", "px", "seconds", "PSNR, dB", "SSIM", "steps", "passes", "seconds a frame")
 _OUT = flags.DEFINE_string("out", "runs/walks", "Folder of the runs and the table.")
@@ -27,36 +32,58 @@ _SECONDS = flags.DEFINE_list("seconds", ["120"], "Lengths of training.")
 _WIDTH = flags.DEFINE_integer("width", 240, "px, of the images.", lower_bound=8)
 _SET = flags.DEFINE_multi_string("set", [], "Fields of the config, as train.lr_init=0.01.")
 _SPLIT = flags.DEFINE_string("split", "test", "The views that are scored: held_out or test.")
+_SIDE = 240  # px, the width of a view in the sheet
 
 
 def main(argv: list[str]) -> None:
     """Trains what is missing, then reports everything that is there."""
     del argv
-    out, pairs = pathlib.Path(_OUT.value), [each.split("=", 1) for each in _SET.value]
+    trial._MOST_PIXELS = 2**20  # all: SSIM compares neighbours
+    out = pathlib.Path(_OUT.value)
+    out.mkdir(parents=True, exist_ok=True)
     rows = common.read_json(out / "walks.json") if (out / "walks.json").exists() else {}
     for data_dir in _DATA_DIRS.value:
+        trainer = None
         for seconds in _SECONDS.value:
-            overrides = {"data.dir": data_dir, "data.width": _WIDTH.value, "train.max_seconds": float(seconds)}
-            overrides |= {"data.hold_out": 8 * (_SPLIT.value == "held_out"), "train.preview_every": 0.0}
-            overrides |= {name: ast.literal_eval(value) for name, value in pairs}
-            changed = ", ".join(_SET.value)
             name = "_".join([pathlib.Path(data_dir).name, str(_WIDTH.value), seconds, _SPLIT.value, *_SET.value])
-            config = common.configuration("capture", overrides)
-            results = common.run(config, out / name, split=_SPLIT.value)
-            if results is None:
-                return
-            rows[name] = _row(
-                pathlib.Path(data_dir).name, changed, seconds, common.load_split(config, "train"), results
-            )
-            common.write_json(out / "walks.json", rows)
+            if name not in rows:
+                trainer = trainer or _trainer(data_dir)
+                rows[name] = _measure(trainer, seconds, out / f"{name}.png")
+                common.write_json(out / "walks.json", rows)
     common.publish([*common.markdown(HEADS, list(rows.values())), "", *common.provenance()], "walks")
 
 
-def _row(name, changed, seconds, views, results):
-    width = round(float(np.asarray(views.size)[:, 1].mean()))
-    passes = results["rays_seen"] / len(views.pixels)
-    scores = [f"{results['psnr']:.2f}", f"{results['ssim']:.3f}", f"{results['step']:,}", f"{passes:.2f}"]
-    return [name, changed, f"{width}", seconds, *scores, f"{results['seconds_per_frame']:.1f}"]
+def _trainer(data_dir):
+    overrides = {"data.dir": data_dir, "data.width": _WIDTH.value, "data.hold_out": 8 * (_SPLIT.value == "held_out")}
+    overrides |= {name: ast.literal_eval(value) for name, value in (each.split("=", 1) for each in _SET.value)}
+    config = read_config(common.configuration("capture"))
+    config = changed(config, overrides)
+    data, _, capture = dataset.resolve(config.data)
+    return trial.Trainer(config, dataset.load_split(data, "train", capture=capture), split=_SPLIT.value)
+
+
+def _measure(trainer, seconds, sheet):
+    result, images = trainer.run({}, 0, float(seconds))
+    scored = trainer.held_out()
+    truths = [np.asarray(scored.image(index))[..., :3] for index in range(len(images))]
+    similar = [float(ssim(np.float32(image) / 255, truth)) for image, truth in zip(images, truths, strict=True)]
+    _save_sheet(sheet, images, truths)
+    rays = result.steps * trainer.resolved({}).config.train.batch_size
+    scores = [f"{np.mean(result.psnr):.2f}", f"{np.mean(similar):.3f}", f"{result.steps:,}"]
+    scores += [f"{rays / len(trainer.views.pixels):.2f}", f"{result.frame_seconds:.1f}"]
+    name = pathlib.Path(trainer.config.data.dir).name
+    return [name, ", ".join(_SET.value), f"{scored.size[0][1]}", seconds, *scores]
+
+
+def _save_sheet(path, images, truths):
+    chosen = np.unique(np.linspace(0, len(images) - 1, 12).astype(int))
+    height = round(_SIDE * images[0].shape[0] / images[0].shape[1])
+    target = Image.new("RGB", (_SIDE * 6, height * 4))
+    for place, index in enumerate(chosen):
+        for row, pixels in enumerate((images[index], np.uint8(np.rint(truths[index] * 255)))):
+            view = Image.fromarray(pixels).resize((_SIDE, height))
+            target.paste(view, (place % 6 * _SIDE, (2 * (place // 6) + row) * height))
+    target.save(path)
 
 
 if __name__ == "__main__":

@@ -354,12 +354,13 @@ def known_cameras(folder: str | os.PathLike, paths: Sequence[Path]) -> dict[str,
     capture, found = dataset.resolve(data)[2], {}
     frames = {} if capture is None else {frame.image.name: frame.camera for frame in capture.frames}
     for path in paths:
-        if path.name not in frames:
+        name = path.name if path.name in frames else images_module.copy_name(path)
+        if name not in frames:
             raise ValueError(
                 f"{folder}: has no camera of {path.name}, expected one of each of the {len(paths)} images; remove "
                 "the image, or estimate all cameras without --cameras_of"
             )
-        camera = frames[path.name]
+        camera = frames[name]
         lens = [] if camera.distortion is None else [*map(float, camera.distortion)]
         if camera.lens not in ("pinhole", "opencv") or len(lens) > 4:
             raise ValueError(
