@@ -79,6 +79,8 @@ def in_todays_names(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[st
                 f"turn about what they look at; {_DROP}, or train again"
             )
         cameras["refine_focal"] = False
+    for grid in (part for part in content.values() if isinstance(part, dict) and "features_per_level" in part):
+        grid.setdefault("initial_density", 1.0)  # as all runs began before there was the option
     found = {name: value for name in GONE if (value := _pop(content, name)) is not _ABSENT}
     return content, {name: value for name, value in found.items() if as_tuples(value) not in GONE[name].off}
 
