@@ -16,7 +16,6 @@ def get_config():
     train.averaging_power, train.rays_per_side = 0.0, 1
     train.cpu_batch_size, train.max_seconds = 768, 600.0
     config.hash_grid.table_size = 2**19  # with 2**17, fox has 0.8 dB less, and fern at 400 px 0.5 dB
-    config.hash_grid.initial_density = "auto"
     config.losses.distortion = 0.001  # more accurate depths, but more weight in free space
     config.eval.early_stop_eps = 0.02
     return config

@@ -19,20 +19,7 @@ from jaxnerf.core.scene import needs_of
 from jaxnerf.core.types import Vector
 from jaxnerf.fields.base import PREFILTER_PART, VIEW_PART, WIDTH_PART, Dense, Field, apply_network, infer_prefilter
 from jaxnerf.fields.hash_interpolation import TableLevel, interpolate, stored, transposed_product
-from jaxnerf.options import (
-    POSITIVE,
-    Ablation,
-    Box,
-    Changes,
-    Device,
-    Facts,
-    Options,
-    at_least,
-    between,
-    infer,
-    is_auto,
-    option,
-)
+from jaxnerf.options import Ablation, Box, Changes, Device, Facts, Options, at_least, between, infer, is_auto, option
 from jaxnerf.registry import Loss, Part
 
 _glorot = linen.initializers.glorot_uniform()
@@ -61,7 +48,6 @@ _FINE_DEPTH, _DEPTH = 3, 2
 # H200 (docs/guides/accelerators.md).
 _CPU_WIDTH, _ACCELERATOR_WIDTH, _ACCELERATOR_ROWS = 64, 128, 4
 
-_WALK_DENSITY = 0.05  # docs/results/captures.md
 
 _LEVELS_PART = Ablation(
     "levels",
@@ -92,14 +78,6 @@ class HashGridOptions(Options):
         ablations=(_LEVELS_PART,),
     )
     features_per_level: int = option(4, "features of a vertex", range=at_least(1))
-    initial_density: float = option(
-        1.0,
-        "About the density everywhere before training. auto: 0.05 on a walk whose sparse points show free space, which "
-        "then stays empty, otherwise 1.",
-        unit="1 / world unit",
-        range=POSITIVE,
-        auto=True,
-    )
     table_size: int = option(
         2**17,
         "maximal rows per level; a level with more vertices is hashed. auto: 2^17 to 2^20, in proportion to an "
@@ -160,7 +138,6 @@ class HashGridOptions(Options):
         size = f"{facts.side:.0f} x {facts.side:.0f} px"
         prefilter, why = infer_prefilter(facts)
         depth = _FINE_DEPTH if device.is_cpu and facts.has_fine_cells else _DEPTH
-        initial = _WALK_DENSITY if facts.travels and facts.num_observations else 1.0
         per_layer = f"hash grid     {width} outputs per hidden layer of the {{}} network, for this device"
         return infer(
             self,
@@ -169,7 +146,6 @@ class HashGridOptions(Options):
             width=(width, per_layer.format("density")),
             view_width=(width, per_layer.format("colour")),
             view_depth=(depth, f"hash grid     {depth} hidden layers of the colour network"),
-            initial_density=(initial, f"hash grid     density {initial:g} before training" * (initial < 1)),
             prefilter=(prefilter, f"prefilter     {'on' if prefilter else 'off'}: {why}"),
         )
 
@@ -248,12 +224,7 @@ def network_field(network: "HashGrid", scene_of: Callable[["HashGrid"], Callable
     inputs = {name: jnp.zeros((1, 1)) for name in needs_of(scene_of(network))}
 
     def init(key):
-        found = network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
-        density = network.options.initial_density
-        if density == 1:
-            return found
-        bias = found["density"]["bias"].at[0].set(math.log(density))
-        return {**found, "density": {**found["density"], "bias": bias}}
+        return network.init(typed_key(key, ONE_KEY), jnp.zeros((1, 1, 3)), jnp.zeros((1, 1, 3)), **inputs)["params"]
 
     return Field(
         init,

@@ -39,6 +39,7 @@ GONE: dict[str, Gone] = {  # by "section.option"
     **{f"{name}.reflections": _REFLECTIONS for name in ("coarse", "fine", "hash_grid")},
     "hash_grid.geometry_features": Gone((15,), Changes.TRAINING | Changes.IMAGES, _DROP),
     "hash_grid.feature_scale": Gone((4.0,), Changes.TRAINING | Changes.IMAGES, _DROP),
+    **{f"{name}.initial_density": Gone((1.0,), Changes.TRAINING, _DROP) for name in ("hash_grid", "moving")},
     **{f"losses.{name}": _LOSS for name in ("near_opacity", "depth_smoothness", "normals", "hash_decay", "opaque")},
     "train.beta1": Gone((0.9,), Changes.TRAINING, "Adam's first moment always decays by 0.9; leave it out"),
     "train.max_nonfinite": Gone((20,), Changes.NOTHING, "a run fails after 20 such steps in a row; leave it out"),
@@ -79,8 +80,6 @@ def in_todays_names(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[st
                 f"turn about what they look at; {_DROP}, or train again"
             )
         cameras["refine_focal"] = False
-    for grid in (part for part in content.values() if isinstance(part, dict) and "features_per_level" in part):
-        grid.setdefault("initial_density", 1.0)  # as all runs began before there was the option
     found = {name: value for name in GONE if (value := _pop(content, name)) is not _ABSENT}
     return content, {name: value for name, value in found.items() if as_tuples(value) not in GONE[name].off}
 

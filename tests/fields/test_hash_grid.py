@@ -346,12 +346,6 @@ def test_the_initial_parameters_depend_on_the_key_alone(field):
     np.testing.assert_allclose(density, 1, atol=0.5)  # thin fog to begin with
 
 
-def test_the_density_before_training_is_about_the_initial_one():
-    grid = hash_grid_field(lower=(-1, -1, -1), upper=(1, 1, 1), resolutions=(4,), table_size=64, initial_density=0.02)
-    density, _ = grid.apply(grid.init(jax.random.key(0)), inside((6, 4)), directions((6, 1)))
-    np.testing.assert_allclose(density, 0.02, rtol=0.5)
-
-
 def test_without_view_directions_their_parameters_and_operations_are_absent():
     flops, rows = {}, {}
     x, viewdirs = inside((32, 16)), directions((32, 1))
