@@ -75,10 +75,10 @@ def _write_model(folder, truth, rng):
     (folder / "images").symlink_to(pathlib.Path(_OUT.value, "images").resolve())
     height, width = truth.depth.shape[1:]
     names, frames = [f"{name}.{_FORMAT.value}" for name in truth.names[truth.split == "train"]], []
+    lens = {"focal": truth.focal, "center": truth.center, "distortion": truth.distortion, "lens": "opencv"}
     for name, pose, seen in zip(names, truth.file_to_world, truth.points_seen, strict=False):
-        lens = {"distortion": truth.distortion, "lens": "opencv", "height": height, "width": width}
-        camera, seen = Camera(pose, truth.focal, truth.center, **lens), np.flatnonzero(seen)
-        at = np.asarray(project(camera, truth.points[seen])[0]) + _PIXEL_NOISE * rng.normal(size=(len(seen), 2))
+        camera, seen = Camera(to_world=pose, **lens, height=height, width=width), np.flatnonzero(seen)
+        at = np.asarray(project(camera, truth.points)[0])[seen] + _PIXEL_NOISE * rng.normal(size=(len(seen), 2))
         shown = ((at > 0) & (at < [width, height])).all(axis=1)
         image = folder / "images" / name
         frames.append(Frame(name, image, camera, seen=seen[shown], seen_at=at[shown]))
