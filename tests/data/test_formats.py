@@ -162,7 +162,7 @@ def test_colmap(tmp_path, lens):
         assert near * scale > 1.5 and far * scale < 9
 
 
-def test_points_tell_what_is_free_unless_cameras_travel(tmp_path, monkeypatch):
+def test_points_bound_the_free_space_unless_cameras_travel(tmp_path, monkeypatch):
     """On a walk they are far behind railings that have none."""
     captures.write_colmap(tmp_path, captures.shoot(captures.orbit(8)))
     data, *_ = dataset.resolve(a_data(tmp_path))
