@@ -26,7 +26,7 @@ from jaxnerf.runtime.processes import Detail
 _LEAST_ANGLE = 1e-3  # squared radians between axes, below which the point that they look at is undefined
 _MIN_MATCHES = 2000  # of two images; fewer may be highlights and outlines of smooth bodies, which fit no cameras
 _OFF = 0.8  # px; 0.2 to 0.5 with good cameras, 1.2 to 3.7 where they are off by 0.3 degrees
-_BRIGHTNESS, _TINT = 0.15, 0.05  # fractions
+_BRIGHTNESS, _TINT = 0.06, 0.025  # 0.02 and 0.013 in captures of one exposure, 0.08 and 0.03 where it varies
 CAMERAS = "cameras"  # the entry of the parameters; all other entries are networks
 
 
@@ -84,12 +84,12 @@ def resolve_cameras(options: CameraOptions, views: Views) -> tuple[CameraOptions
         return options, []
     found = agreement(views)
     poses = found.off > _OFF, f"matched corners are {found.off:.2f} px beside each other's epipolar lines, limit {_OFF}"
-    shades = math.expm1(found.brightness), math.expm1(found.tint)
+    brightness, tint = math.expm1(found.brightness), math.expm1(found.tint)
     gains = (
-        shades[0] > _BRIGHTNESS or shades[1] > _TINT,
+        brightness > _BRIGHTNESS or tint > _TINT,
         (
-            f"corners differ by {shades[0]:.0%} in brightness, limit {_BRIGHTNESS:.0%}, and {shades[1]:.0%} in colour, "
-            f"limit {_TINT:.0%}"
+            f"corners differ by {brightness:.1%} in brightness, limit {_BRIGHTNESS:.1%}, and {tint:.1%} in colour, "
+            f"limit {_TINT:.1%}"
         ),
     )
     if found.count < _MIN_MATCHES:

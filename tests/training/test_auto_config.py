@@ -596,10 +596,10 @@ def test_alpha_does_not_bound_the_box_of_a_scene_that_moves_or_whose_poses_are_r
 @pytest.mark.parametrize(
     "found, refine, exposure, words",
     [
-        (Agreement(2500, 0.7, 0.1, 0.04), False, False, ["0.70 px beside", "11% in brightness, limit 15%"]),
-        (Agreement(2500, 0.9, 0.1, 0.04), True, False, ["refined poses on: matched corners are 0.90 px"]),
-        (Agreement(2500, 0.7, 0.2, 0.04), False, True, ["exposures     on: corners differ by 22% in brightness"]),
-        (Agreement(2500, 0.7, 0.1, 0.1), False, True, ["11% in colour, limit 5%"]),
+        (Agreement(2500, 0.7, 0.05, 0.02), False, False, ["0.70 px beside", "5.1% in brightness, limit 6.0%"]),
+        (Agreement(2500, 0.9, 0.05, 0.02), True, False, ["refined poses on: matched corners are 0.90 px"]),
+        (Agreement(2500, 0.7, 0.2, 0.02), False, True, ["exposures     on: corners differ by 22.1% in brightness"]),
+        (Agreement(2500, 0.7, 0.05, 0.1), False, True, ["10.5% in colour, limit 2.5%"]),
         (Agreement(1500, 5.0, 0.3, 0.2), False, False, ["off: only 1500 corners of images match"]),
     ],
 )
