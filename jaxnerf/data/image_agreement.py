@@ -57,9 +57,9 @@ def agreement(views: Views) -> Agreement:
             for (one, first), (other, last) in itertools.combinations(shown, 2):
                 rays, colors = ((corners(one)[k][first], corners(other)[k][last]) for k in (0, 2))
                 off.append(focal * _beside(poses[other, :, 3] - poses[one, :, 3], *rays))
-                told = ((np.minimum(*colors) > _DARKEST) & (np.maximum(*colors) < _BRIGHTEST)).all(axis=1)
-                if told.sum() >= _LEAST:
-                    ratios.append(np.median(np.log(colors[0][told] / colors[1][told]), axis=0, keepdims=True))
+                usable = ((np.minimum(*colors) > _DARKEST) & (np.maximum(*colors) < _BRIGHTEST)).all(axis=1)
+                if usable.sum() >= _LEAST:
+                    ratios.append(np.median(np.log(colors[0][usable] / colors[1][usable]), axis=0, keepdims=True))
     ratio = np.concatenate(ratios)
     level = ratio.mean(axis=1, keepdims=True)
     found = np.concatenate(off), np.abs(level), np.abs(ratio - level).max(axis=1, initial=0)
