@@ -230,7 +230,7 @@ def _camera_facts(capture, evidence, images, up):
     low, high = cover.elevation.min(), cover.elevation.max()
     shown = evidence.tracks.shown
     seen = shown.sum() / max(len(shown), 1)
-    sure, off = cameras.circle_error(evidence)
+    sure, error = cameras.circle_error(evidence)
     handed = "right-handed" if np.linalg.det(poses[:, :, :3]).min() > 0 else "mirrored"
     return [
         (
@@ -254,7 +254,7 @@ def _camera_facts(capture, evidence, images, up):
             "overlap",
             f"{len(shown)} corners are matched, each in {seen:.1f} of {1 + evidence.near.shape[1]} views; "
             f"{percent(evidence.fraction)} fit the cameras within {tracks.INLIER:.0f} px; {sure} that a third "
-            f"image confirms are {off:.2f} px off (median)",
+            f"image confirms are {error:.2f} px off (median)",
         ),
     ]
 
