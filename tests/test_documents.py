@@ -204,20 +204,45 @@ def test_faults_of_commands_are_found(command):
 OPTIONAL = ("equinox", "wandb")  # packages of examples that the package does not need; without them these are skipped
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("code", EXAMPLES)
-def test_python_examples_run(code, unoptimized, tmp_path, monkeypatch):
-    for name in OPTIONAL:
-        if re.search(rf"^import {name}\b", code, re.MULTILINE):
-            pytest.importorskip(name)
+READ_VALUES = ("docs/index.md", "docs/concepts/one_idea.md", "docs/guides/other_libraries.md")  # of arrays
+
+
+@pytest.fixture
+def run_example(tmp_path, monkeypatch):
+    """Returns a function that runs the code of an example in a folder of its own."""
+
+    def run(code):
+        for name in OPTIONAL:
+            if re.search(rf"^import {name}\b", code, re.MULTILINE):
+                pytest.importorskip(name)
+        with jax.numpy_rank_promotion("allow"):
+            exec(compile(code, "example", "exec"), {})
+
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "offline")
-    if '"runs/lego/' in code:
-        (tmp_path / "runs" / "lego").mkdir(parents=True)
-        (tmp_path / "runs" / "lego" / "config.json").write_text('{"seed": 0}')
-        (tmp_path / "runs" / "lego" / "metrics.jsonl").write_text('{"step": 1, "seconds": 2.0, "psnr_fine": 20.0}\n')
+    (tmp_path / "runs" / "lego").mkdir(parents=True)
+    (tmp_path / "runs" / "lego" / "config.json").write_text('{"seed": 0}')
+    (tmp_path / "runs" / "lego" / "metrics.jsonl").write_text('{"step": 1, "seconds": 2.0, "psnr_fine": 20.0}\n')
     of_runs = (registry.LOSSES, registry.FIELDS, registry.SAMPLERS, registry.READERS)
     for parts in (*of_runs, EXPORTERS, ESTIMATORS):
         monkeypatch.setattr(parts, "_parts", dict(parts._parts))  # what an example registers is forgotten
-    with jax.numpy_rank_promotion("allow"):
-        exec(compile(code, "example", "exec"), {})
+    return run
+
+
+@pytest.mark.parametrize("code", [each for each in EXAMPLES if not each.id.startswith(READ_VALUES)])
+def test_python_examples_are_traced(code, run_example):
+    """Names, arguments and shapes are right: tracing takes a hundredth of the time of running op by op."""
+    jax.eval_shape(lambda: run_example(code))
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param(
+            *each.values, id=each.id, marks=pytest.mark.slow if each.id.startswith(READ_VALUES) else pytest.mark.extra
+        )
+        for each in EXAMPLES
+    ],
+)
+def test_python_examples_run(code, unoptimized, run_example):
+    run_example(code)

@@ -3,8 +3,9 @@
     JAXNERF_SCENES=... python experiments/moving/score_moving.py --out=runs/moving [--seconds=60] \
         [--runs=runs/benchmark/dnerf_lego_400/1800s-COMMIT,...] [--page=docs/results/benchmark.md]
 
---runs are workdirs of finished runs, as experiments/benchmark/run.py makes them. Each is scored on its splits "test"
-and "val" by the mean PSNR of colours of 8 bits, and again on "test" with the time frozen at 0 and at 0.5.
+--runs are workdirs of finished runs, as experiments/benchmark/run.py makes them, and "trained at" is the commit that
+did. Each is scored on its splits "test" and "val" by the mean PSNR of colours of 8 bits, and again on "test" with the
+time frozen at 0 and at 0.5.
 
 The moving bodies are those of docs/extending/moving_scene.md in closed form: 48 training images of 32 px, each from
 another camera at a time of its own, and 6 test images from other cameras at other times. OUT/bodies is the dataset,
@@ -13,6 +14,7 @@ camera, of the change from one of 97 times to the next beyond the change of the 
 figures that others publish for the same images follow.
 """
 
+import collections
 import dataclasses
 import pathlib
 import sys
@@ -38,7 +40,17 @@ _RUNS = flags.DEFINE_list("runs", [], "Workdirs of finished runs.")
 _OUT = flags.DEFINE_string("out", "runs/moving", "Folder of the moving bodies and their run.")
 _SECONDS = flags.DEFINE_float("seconds", 60.0, "Of training on the moving bodies.", lower_bound=1.0)
 _NUM_TIMES = 97
-HEADS = ("run", "px", "s", "steps", "test, dB", "validation, dB", "test at time 0, dB", "test at time 0.5, dB")
+HEADS = (
+    "run",
+    "trained at",
+    "px",
+    "s",
+    "steps",
+    "test, dB",
+    "validation, dB",
+    "test at time 0, dB",
+    "test at time 0.5, dB",
+)
 
 
 def main(argv: list[str]) -> None:
@@ -60,7 +72,10 @@ def main(argv: list[str]) -> None:
     ]
     scores = [common.read_json(pathlib.Path(workdir) / SCORE) for workdir in _RUNS.value]
     if scores:
-        lines += ["", *tables.beside({score["job"]: [score] for score in scores})]
+        by_job = collections.defaultdict(list)
+        for score in scores:
+            by_job[score["job"]].append(score)
+        lines += ["", *tables.beside(by_job)]
     common.publish(lines, "moving")
 
 
@@ -68,11 +83,12 @@ def row(workdir, name):
     """Returns the figures of a finished run."""
     run = restore_run(workdir)
     config, step = run.experiment.config, newest_step(run, workdir)
+    commit = common.read_json(pathlib.Path(workdir) / SCORE).get("commit", common.commit())
     test, validation = (mean_psnr(run, split) for split in ("test", "val"))
     frozen = [mean_psnr(restore_run(workdir, time=time), "test") for time in (0.0, 0.5)]
     side = int(run.experiment.load_split("test").size[0, 0])
     figures = ["-" if np.isnan(value) else f"{value:.2f}" for value in (test, validation, *frozen)]
-    return [name, str(side), f"{config.train.max_seconds:g}", f"{step:,}", *figures]
+    return [name, commit, str(side), f"{config.train.max_seconds:g}", f"{step:,}", *figures]
 
 
 def mean_psnr(run, split):

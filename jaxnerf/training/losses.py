@@ -22,7 +22,9 @@ def _weight_of_distortion(facts):
 
 
 def _weight_of_opacity(facts):
-    return (0.1, "opacity       is compared with alpha, which outlines the scene") if facts.outlined else (0.0, "")
+    if not (facts.outlined and facts.has_times):
+        return 0.0, ""
+    return 0.1, "opacity       is compared with alpha, which outlines the scene at each time"
 
 
 MSE = Loss(mse_loss, weight=1.0, help="squared error of the colours, summed over all renderings")
@@ -31,7 +33,7 @@ OPACITY = Loss(
     needs=("alpha",),
     infer=_weight_of_opacity,
     help="squared difference of opacity and alpha; auto, for scenes that move, where no visual hull empties space: 0.1 "
-    "where images have alpha",
+    "where images have times and alpha, else 0",
 )
 DISTORTION = Loss(
     distortion_loss,

@@ -190,11 +190,13 @@ def test_every_auto_field_is_inferred_and_logged(resolved):
     assert f"a pixel covers {PIXEL:.4g}" in "".join(lines)
 
 
-def test_opacity_is_compared_with_alpha_where_images_have_one(views):
+def test_opacity_is_compared_with_alpha_where_images_have_times_and_alpha(views):
     config = changed(read_config(auto_config()), {"losses.opacity": AUTO})
-    for channels, weight in ((4, 0.1), (3, 0.0)):
+    times = np.linspace(0, 1, len(views.names), dtype=np.float32)
+    for channels, time, weight in ((4, times, 0.1), (3, times, 0.0), (4, None, 0.0)):
         pixels = np.ascontiguousarray(views.pixels[:, :channels])
-        seen = dataclasses.replace(views, pixels=pixels, background=views.background if channels == 4 else None)
+        background = views.background if channels == 4 else None
+        seen = dataclasses.replace(views, pixels=pixels, background=background, time=time)
         assert resolve(config, seen).config.losses["opacity"] == weight
 
 

@@ -161,7 +161,7 @@ _SPLITS = [(1, 16), (4, 4)]
 
 
 @pytest.mark.parametrize(
-    ("num_devices", "size"), [(4, 16), *(pytest.param(*x, marks=pytest.mark.slow) for x in _SPLITS)]
+    ("num_devices", "size"), [(4, 16), *(pytest.param(*x, marks=pytest.mark.extra) for x in _SPLITS)]
 )
 def test_it_does_not_depend_on_how_the_batch_is_split(num_devices, size):
     experiment, _, cells, data = experiment_of()
@@ -184,7 +184,7 @@ def uninterrupted(compiled_once, tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("resumed_at", "per_dispatch"),
-    [(4, 1), (8, 1), (STEPS, 5)],
+    [pytest.param(4, 1, marks=pytest.mark.extra), (8, 1), (STEPS, 5)],
 )
 def test_a_run_resumed_in_either_part_and_one_of_several_steps_a_dispatch_are_the_same(
     uninterrupted, tmp_path, resumed_at, per_dispatch, monkeypatch

@@ -1,0 +1,72 @@
+"""Trains and scores variants of a config on one dataset, at equal CPU seconds.
+
+    JAXNERF_SCENES=... taskset -c 0 python experiments/moving/variants.py --data_dir=dnerf_lego --factor=4 \
+        --seconds=120 [--config=moving,lego_fast] [--set=losses.opacity=0] [--split=val] [--seeds=0,1] \
+        [--page=docs/results/benchmark.md --table=NAME]
+
+--set adds, for each config, a variant with that change. Seconds are CPU time of one core, without compilation. Scored
+are views of --split; "held_out" is every 8th training view, then not trained on.
+"""
+
+import pathlib
+import statistics
+import sys
+
+from absl import flags
+
+sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
+import common
+from benchmark import settings
+
+from jaxnerf.data import dataset
+from jaxnerf.runtime import cli
+from jaxnerf.tools.needs import trial
+from jaxnerf.training.config import changed, read_config
+
+HEADS = ("dataset, config", "changed", "px", "CPU s", "PSNR by seed, dB", "mean, dB", "steps", "CPU s a frame")
+_CONFIGS = flags.DEFINE_list("config", ["moving"], "Names of configs.")
+_DATA_DIR = flags.DEFINE_string("data_dir", "dnerf_lego", "A folder, or a name below $JAXNERF_SCENES.")
+_FACTOR = flags.DEFINE_integer("factor", 4, "By which the images are downscaled.", lower_bound=1)
+_SECONDS = flags.DEFINE_list("seconds", ["120"], "Lengths of training.")
+_SPLIT = flags.DEFINE_string("split", "val", "The views that are scored: val, test or held_out.")
+_SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds; every variant is trained with each.")
+_TABLE = flags.DEFINE_string("table", "variants", "Name of the table in --page.")
+_SET = settings.define_set()
+
+
+def main(argv: list[str]) -> None:
+    """Trains all variants in turn, and prints the table."""
+    del argv
+    rows, seeds = [], common.seeds_of("--seeds", _SEEDS.value)
+    for config in _CONFIGS.value:
+        trainer = make_trainer(config)
+        for change in ("", *_SET.value):
+            for seconds in _SECONDS.value:
+                values = settings.parse([change] if change else [])
+                results = [trainer.run(values, seed, float(seconds))[0] for seed in seeds]
+                rows.append([f"{_DATA_DIR.value}, {config}", change or "-", *figures(trainer, seconds, results)])
+                print(rows[-1], file=sys.stderr, flush=True)
+    common.publish([*common.provenance(), "", *common.markdown(HEADS, rows)], _TABLE.value)
+
+
+def make_trainer(name):
+    """Returns the Trainer of a config by name."""
+    overrides = {"data.dir": _DATA_DIR.value, "data.format": "blender", "data.factor": _FACTOR.value}
+    overrides |= {"data.hold_out": 8 * (_SPLIT.value == "held_out")}
+    config = changed(read_config(common.configuration(name)), overrides)
+    data, _, capture = dataset.resolve(config.data)
+    return trial.Trainer(config, dataset.load_split(data, "train", capture=capture), split=_SPLIT.value)
+
+
+def figures(trainer, seconds, results):
+    """Returns the last cells of a row."""
+    scores = [statistics.fmean(result.psnr) for result in results]
+    steps = statistics.fmean(result.steps for result in results)
+    frame = statistics.fmean(result.frame_seconds for result in results)
+    by_seed = ", ".join(f"{score:.2f}" for score in scores)
+    side = str(trainer.held_out().size[0][1])
+    return [side, seconds, by_seed, f"{statistics.fmean(scores):.2f}", f"{steps:,.0f}", f"{frame:.2f}"]
+
+
+if __name__ == "__main__":
+    cli.run(main)
