@@ -1,7 +1,7 @@
 """Scores a run that was trained on a capture of the embedded room against its ground truth.
 
-    python experiments/room/score_room.py --workdir=W --room=DIR [--step=...] [--rays=256] [--out=FILE] \
-        [--page=docs/results/captures.md]
+    python experiments/room/score_room.py --workdir=W --room=DIR [--trained_on=DIR] [--step=...] [--rays=256] \
+        [--out=FILE] [--page=docs/results/captures.md] [--table=room]
 
 For the held-out views near the path ("val") and the far novel views ("test"), prints and writes as JSON:
 
@@ -16,9 +16,11 @@ For the held-out views near the path ("val") and the far novel views ("test"), p
 Depth and weights are those of the field in the occupied cells, as it is rendered.
 """
 
+import dataclasses
 import functools
 import pathlib
 import sys
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -33,6 +35,8 @@ from jaxnerf.core import contraction
 from jaxnerf.core.cameras import pixel_grid
 from jaxnerf.core.types import Rays, SceneFn
 from jaxnerf.core.views import Views
+from jaxnerf.data.dataset import load_dataset
+from jaxnerf.data.geometry.world import poses_in_file, poses_in_run
 from jaxnerf.evaluation.metrics import image_metrics
 from jaxnerf.evaluation.restore import TrainedRun, newest_step, restore_run
 from jaxnerf.models.grid_schedule import GridSchedule
@@ -50,6 +54,8 @@ _NUM_SAMPLES = 512  # positions on the part of a ray in free space
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder that training wrote.", required=True)
 _CAPTURE = flags.DEFINE_string("room", None, "Folder that make_room.py wrote.", required=True)
+_TRAINED_ON = flags.DEFINE_string("trained_on", None, "The model that make_room.py wrote, if the run is trained on it.")
+_TABLE = flags.DEFINE_string("table", "room", "Name of the table on --page.")
 _STEP = flags.DEFINE_integer("step", None, "Of the checkpoint; the newest when not given.")
 _RAYS = flags.DEFINE_integer("rays", 256, "Rays per view whose weight in free space is measured.", lower_bound=1)
 _OUT = flags.DEFINE_string("out", None, "JSON file; replaces it. W/room_score.json by default.")
@@ -73,17 +79,34 @@ def main(argv: list[str]) -> None:
     """Scores a run and prints the table."""
     del argv
     truth = synthetic_capture.read_ground_truth(_CAPTURE.value)
-    run = restore_run(_WORKDIR.value, data_dir=_CAPTURE.value)
+    run = restore_run(_WORKDIR.value, data_dir=_TRAINED_ON.value or _CAPTURE.value)
     step = newest_step(run, _WORKDIR.value, _STEP.value)
-    results = score(run, step, truth, num_rays=_RAYS.value)
-    common.publish(table(results), "room")
+    load = run.experiment.load_split
+    if _TRAINED_ON.value:
+        load = functools.partial(views_in_run, run, _CAPTURE.value)
+    results = score(run, step, truth, num_rays=_RAYS.value, load=load)
+    common.publish(table(results), _TABLE.value)
     out = pathlib.Path(_OUT.value or pathlib.Path(_WORKDIR.value, "room_score.json"))
     common.write_json(out, {"workdir": _WORKDIR.value, "room": _CAPTURE.value, "step": step, **results})
     print(f"wrote {out}")
 
 
+def views_in_run(run: TrainedRun, folder: str, split: str) -> Views:
+    """Returns the views of a capture's split in the world of a run that was trained on another form of the capture."""
+    views, own = load_dataset(folder, split=split), run.experiment.load_split("train", max_views=1)
+    poses = poses_in_run(poses_in_file(views.cameras.to_world, views.to_file), own.to_file)
+    cameras = dataclasses.replace(views.cameras, to_world=np.float32(poses))
+    near, far = np.full_like(views.near, np.min(own.near)), views.far * np.float32(unit_of(views) / unit_of(own))
+    return dataclasses.replace(views, cameras=cameras, near=near, far=far, to_file=own.to_file)
+
+
 def score(
-    run: TrainedRun, step: int, truth: synthetic_capture.GroundTruth, *, num_rays: int = 256
+    run: TrainedRun,
+    step: int,
+    truth: synthetic_capture.GroundTruth,
+    *,
+    num_rays: int = 256,
+    load: Callable[[str], Views] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Returns {split: measurements}, with one row per image in "images".
 
@@ -92,6 +115,7 @@ def score(
         step: of a checkpoint.
         truth: of the capture that it was trained on.
         num_rays: see --rays.
+        load: split -> its Views in the run's world; None: as the run loads them.
 
     Raises:
         ValueError: if the run has no occupancy grid, or its images have another size than the ground truth.
@@ -104,7 +128,7 @@ def score(
     for split in PLACES:
         if not (truth.split == split).any():
             continue
-        views = run.experiment.load_split(split)
+        views = (load or run.experiment.load_split)(split)
         scored = [
             _score_view(run, variables, optical_depths, views, index, truth, num_rays)
             for index in range(len(views.names))

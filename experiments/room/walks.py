@@ -1,14 +1,16 @@
 """Trains and scores walks: PSNR and SSIM of views that were not trained on, after some seconds of one core's time.
 
-    JAXNERF_SCENES=... taskset -c 0 python experiments/room/walks.py --data_dirs=walk,walk_points --seconds=120,300 \
+    JAXNERF_SCENES=... taskset -c 0 python experiments/room/walks.py --runs=walk:300,walk_points:300 \
         [--out=runs/walks] [--width=240] [--set=NAME=VALUE]... [--split=test] [--page=docs/results/captures.md]
 
-Every run is configs/capture.py; seconds are CPU time of one core. The split "held_out" is every 8th training view,
-then not trained on. --set changes all runs of a call. What walks.json in --out has is not measured again; the table has
-all of it. A sheet of scored views is beside it, below each the image.
+A run is a folder, or a name below $JAXNERF_SCENES, and its seconds: CPU time of one core. Each is configs/capture.py
+with its own learning rates. The split "held_out" is every 8th training view, then not trained on. --set changes all
+runs of a call. What walks.json in --out has is not measured again. A sheet of scored views is beside it, below each the
+image.
 """
 
 import ast
+import math
 import pathlib
 import sys
 
@@ -27,8 +29,7 @@ from jaxnerf.training.config import changed, read_config
 
 HEADS = ("dataset", "changed", "px", "seconds", "PSNR, dB", "SSIM", "steps", "passes", "seconds a frame")
 _OUT = flags.DEFINE_string("out", "runs/walks", "Folder of the runs and the table.")
-_DATA_DIRS = flags.DEFINE_list("data_dirs", ["walk"], "Folders, or names below $JAXNERF_SCENES.")
-_SECONDS = flags.DEFINE_list("seconds", ["120"], "Lengths of training.")
+_RUNS = flags.DEFINE_list("runs", ["walk:120"], "Folder:seconds of training.")
 _WIDTH = flags.DEFINE_integer("width", 240, "px, of the images.", lower_bound=8)
 _SET = flags.DEFINE_multi_string("set", [], "Fields of the config, as train.lr_init=0.01.")
 _SPLIT = flags.DEFINE_string("split", "test", "The views that are scored: held_out or test.")
@@ -38,19 +39,19 @@ _SIDE = 240  # px, the width of a view in the sheet
 def main(argv: list[str]) -> None:
     """Trains what is missing, then reports everything that is there."""
     del argv
-    trial._MOST_PIXELS = 2**20  # all: SSIM compares neighbours
     out = pathlib.Path(_OUT.value)
     out.mkdir(parents=True, exist_ok=True)
     rows = common.read_json(out / "walks.json") if (out / "walks.json").exists() else {}
-    for data_dir in _DATA_DIRS.value:
-        trainer = None
-        for seconds in _SECONDS.value:
-            name = "_".join([pathlib.Path(data_dir).name, str(_WIDTH.value), seconds, _SPLIT.value, *_SET.value])
-            if name not in rows:
-                trainer = trainer or _trainer(data_dir)
-                rows[name] = _measure(trainer, seconds, out / f"{name}.png")
-                common.write_json(out / "walks.json", rows)
-    common.publish([*common.markdown(HEADS, list(rows.values())), "", *common.provenance()], "walks")
+    trainers, table = {}, []
+    for data_dir, seconds in (run.rsplit(":", 1) for run in _RUNS.value):
+        name = "_".join([pathlib.Path(data_dir).name, str(_WIDTH.value), seconds, _SPLIT.value, *_SET.value])
+        if name not in rows:
+            if data_dir not in trainers:
+                trainers = {data_dir: _trainer(data_dir)}
+            rows[name] = _measure(trainers[data_dir], seconds, out / f"{name}.png")
+            common.write_json(out / "walks.json", rows)
+        table.append(rows[name])
+    common.publish([*common.markdown(HEADS, table), "", *common.provenance()], "walks")
 
 
 def _trainer(data_dir):
@@ -59,7 +60,9 @@ def _trainer(data_dir):
     config = read_config(common.configuration("capture"))
     config = changed(config, overrides)
     data, _, capture = dataset.resolve(config.data)
-    return trial.Trainer(config, dataset.load_split(data, "train", capture=capture), split=_SPLIT.value)
+    views = dataset.load_split(data, "train", capture=capture)
+    # All pixels are scored, as SSIM compares neighbours.
+    return trial.Trainer(config, views, split=_SPLIT.value, most_pixels=math.inf)
 
 
 def _measure(trainer, seconds, sheet):

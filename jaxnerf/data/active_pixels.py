@@ -23,7 +23,7 @@ from jaxnerf.runtime.user_cache import load_or_make
 _MAX_RAYS = 2**22  # pixels up to which the ray of each is tested
 _NUM_TILES = 2**21  # tiles that are tested instead of more pixels; a ray takes some microseconds
 _SLOW = 0.5  # seconds of work from which the result is cached
-_VERSION = 1  # of cached results; a change of the code that finds other cells or pixels for the same views increases it
+_VERSION = 2  # of cached results; a change of the code that finds other cells or pixels for the same views increases it
 
 
 def active_region(

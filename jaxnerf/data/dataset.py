@@ -10,7 +10,7 @@ import numpy as np
 from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt
 from jaxnerf.data.geometry import bounds, world
-from jaxnerf.data.geometry.poses import AXES, axis_of, look_one_way
+from jaxnerf.data.geometry.poses import AXES, axis_of, look_one_way, travel
 from jaxnerf.data.images import downscaled_copies, image_files, load_images, pixel_rays
 from jaxnerf.data.readers import base
 from jaxnerf.data.readers.base import Capture
@@ -338,6 +338,8 @@ def load_split(
         capture = capture._replace(bounds=(near, data.far))  # what the cameras see need not be found
     capture, to_file = _in_world(data, bounds.with_bounds(capture))
     nearest = {frame.name: frame.bounds[0] if sure else 0.0 for frame, sure in zip(capture.frames, known, strict=True)}
+    # On a walk a camera sees far points past railings and walls that have none, so points do not tell what is free.
+    known = () if capture.points is not None and travel(world.poses_of(capture)) else known
     capture = bounds.override_bounds(capture, near, data.far, to_file)
     background = background_of(data)
     options = {"factor": data.factor, "background": background, "select": select, "with_pixels": with_pixels}

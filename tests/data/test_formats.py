@@ -162,6 +162,16 @@ def test_colmap(tmp_path, lens):
         assert near * scale > 1.5 and far * scale < 9
 
 
+def test_points_bound_the_free_space_unless_cameras_travel(tmp_path, monkeypatch):
+    """On a walk they are far behind railings that have none."""
+    captures.write_colmap(tmp_path, captures.shoot(captures.orbit(8)))
+    data, *_ = dataset.resolve(a_data(tmp_path))
+    views = dataset.load_split(data, "train")
+    np.testing.assert_array_equal(views.free_depth, views.near)
+    monkeypatch.setattr(dataset, "travel", lambda poses: True)
+    assert dataset.load_split(data, "train").free_depth is None
+
+
 def test_colmap_precedes_llff_and_format_overrides(tmp_path):
     shots = captures.shoot(captures.front(8))
     points = captures.write_colmap(tmp_path, shots)

@@ -70,9 +70,12 @@ def clear_radii(views: Views) -> Float[np.ndarray, " V"]:
 
     A photographer stands there, and where nothing in the image is close, nothing beside the image is much closer, in
     general. The radius is 0.75 times the distance to the nearest matter: `Views.free_depth`, or the distance to the
-    16th nearest sparse point, seen from there or not, if that is less. It is 0 where neither is known.
+    16th nearest sparse point, seen from there or not, if that is less. It is 0 where neither is known, and without
+    `Views.free_depth`.
     """
-    known = np.zeros(len(views.offset)) if views.free_depth is None else np.asarray(views.free_depth)
+    if views.free_depth is None:
+        return np.zeros(len(views.offset), np.float32)
+    known = np.asarray(views.free_depth)
     nearest = np.where(known > 0, known, np.inf)
     if views.sparse is not None and len(views.sparse.positions) >= _FEW_POINTS:
         centers = np.asarray(views.cameras.to_world)[:, :, 3]

@@ -89,10 +89,20 @@ class Trainer:
         views: of the split "train".
         pacer: of the machine's speed; None: seconds are those of the clock.
         split: whose views are scored.
+        most_pixels: of a view that are scored: every n-th row and column, see `stride`.
     """
 
-    def __init__(self, config: RunConfig, views: Views, pacer: Pacer | None = None, *, split: str = "held_out"):
+    def __init__(
+        self,
+        config: RunConfig,
+        views: Views,
+        pacer: Pacer | None = None,
+        *,
+        split: str = "held_out",
+        most_pixels: float = _MOST_PIXELS,
+    ):
         self.config, self.views, self.pacer, self.split = config, views, pacer, split
+        self.most_pixels = most_pixels
         self._compiled: dict[str, _Compiled] = {}
         self._compiling: dict[str, float] = {}  # seconds that no result has reported yet
         self._held_out: dict[str, Views] = {}
@@ -151,7 +161,7 @@ class Trainer:
         if key not in self._compiled:
             began = seconds()
             config, views, _ = self.resolved(values)
-            self._compiled[key] = _Compiled(config, views, self._views_held_out)
+            self._compiled[key] = _Compiled(config, views, self._views_held_out, self.most_pixels)
             self._compiling[key] = seconds() - began
         return self._compiled[key]
 
@@ -181,7 +191,7 @@ class _Run(NamedTuple):
 class _Compiled:
     """A variant's compiled program of training, and its renderer."""
 
-    def __init__(self, config: RunConfig, views: Views, held_out: Callable[[Any], Views]):
+    def __init__(self, config: RunConfig, views: Views, held_out: Callable[[Any], Views], most_pixels: float):
         # The length of a trial is no part of what is resolved: the complete run's length says what is inferred.
         train = replaced(
             config.train, max_steps=UNLIMITED_STEPS, lr_steps=UNLIMITED_STEPS, max_seconds=1e6, max_reinits=3
@@ -189,7 +199,7 @@ class _Compiled:
         config, _ = auto_config.resolve_for_device(replaced(config, train=train))
         experiment = build.build(config)
         build.check_views(config, views)
-        self._experiment, self._views = experiment, views
+        self._experiment, self._views, self._most_pixels = experiment, views, most_pixels
         self._cells = experiment.prepare(views)[0]
         self._step, state = compile_training(experiment, views)
         self._held_out = held_out(experiment)
@@ -279,13 +289,13 @@ class _Compiled:
     def _view(self, variables, views, index):
         """Returns the colours [H, W, 3] of every n-th row and column of a view, and n."""
         height, width = (int(side) for side in views.size[index])
-        every = stride(views, index)
+        every = stride(views, index, self._most_pixels)
         pixels = pixel_grid(height, width, offset=self._experiment.config.data.pixel_offset)[::every, ::every]
         return np.asarray(render_pixels(self._run, variables, views, index, pixels)[0].rgb), every
 
     def _truth(self, index, every=None):
         views = self._held_out
-        every = every or stride(views, index)
+        every = every or stride(views, index, self._most_pixels)
         mask = pixel_mask(views, index)
         mask = None if mask is None else np.asarray(mask)[::every, ::every]
         return np.asarray(views.image(index))[::every, ::every], mask
@@ -299,9 +309,9 @@ def _key(values):
     return repr(sorted(values.items()))
 
 
-def stride(views: Views, index: int) -> int:
-    """Returns n, of whose rows and columns of a view every n-th is scored."""
-    return math.ceil(math.sqrt(float(np.prod(views.size[index])) / _MOST_PIXELS))
+def stride(views: Views, index: int, most_pixels: float = _MOST_PIXELS) -> int:
+    """Returns n, of whose rows and columns of a view every n-th is scored; 1, all of them, where most_pixels is inf."""
+    return max(math.ceil(math.sqrt(float(np.prod(views.size[index])) / most_pixels)), 1)
 
 
 def _of_steps(data, steps):

@@ -193,10 +193,10 @@ def test_the_nearest_points_bound_the_space_around_a_camera():
     few = dataclasses.replace(views.sparse, positions=views.sparse.positions[:15])
     np.testing.assert_allclose(clear_radii(dataclasses.replace(views, sparse=few)), [0.75, 6.0])
     unknown = some_views(free_depth=np.float32([0.0, 0.0]))
-    for free_depth in (None, unknown.free_depth):
-        alone = clear_radii(dataclasses.replace(views, free_depth=free_depth))
-        np.testing.assert_allclose(alone[1], 0.75 * to_wall, rtol=1e-6)
-        np.testing.assert_array_equal(clear_radii(dataclasses.replace(unknown, free_depth=free_depth)), [0, 0])
+    alone = clear_radii(dataclasses.replace(views, free_depth=unknown.free_depth))
+    np.testing.assert_allclose(alone[1], 0.75 * to_wall, rtol=1e-6)
+    for nothing in (unknown, dataclasses.replace(views, free_depth=None)):
+        np.testing.assert_array_equal(clear_radii(nothing), [0, 0])
 
 
 def test_surface_range_holds_the_wall_and_ignores_a_wrong_point():
