@@ -1,11 +1,12 @@
-"""Trains and scores variants of a config on one dataset, at equal CPU seconds.
+"""Trains and scores variants of a config on one dataset, at equal CPU seconds or steps.
 
     JAXNERF_SCENES=... taskset -c 0 python experiments/moving/variants.py --data_dir=dnerf_lego --factor=4 \
-        --seconds=120 [--config=moving,lego_fast] [--set=losses.opacity=0] [--splits=val] [--seeds=0,1] \
+        --seconds=120 [--steps=600] [--config=moving,lego_fast] [--set=losses.opacity=0] [--splits=val] [--seeds=0,1] \
         [--page=docs/results/benchmark.md --table=NAME]
 
---set adds, for each config, a variant with that change. Seconds are CPU time of one core, without compilation. Scored
-are the views of each of --splits; "held_out", which stands alone, is every 8th training view, then not trained on.
+--set adds, for each config, a variant with that change. Seconds are CPU time of one core, without compilation; runs of
+so many --steps replace them. Scored are the views of each of --splits; "held_out", which stands alone, is every 8th
+training view, then not trained on.
 """
 
 import pathlib
@@ -28,6 +29,7 @@ _CONFIGS = flags.DEFINE_list("config", ["moving"], "Names of configs.")
 _DATA_DIR = flags.DEFINE_string("data_dir", "dnerf_lego", "A folder, or a name below $JAXNERF_SCENES.")
 _FACTOR = flags.DEFINE_integer("factor", 4, "By which the images are downscaled.", lower_bound=1)
 _SECONDS = flags.DEFINE_list("seconds", ["120"], "Lengths of training.")
+_STEPS = flags.DEFINE_integer("steps", 0, "Steps of training, in place of --seconds; 0: none.", lower_bound=0)
 _SPLITS = flags.DEFINE_list("splits", ["val"], "The views that are scored: val, test or held_out.")
 _SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds; every variant is trained with each.")
 _TABLE = flags.DEFINE_string("table", "variants", "Name of the table in --page.")
@@ -41,7 +43,7 @@ def main(argv: list[str]) -> None:
     for config in _CONFIGS.value:
         trainer = make_trainer(config)
         for change in ("", *_SET.value):
-            for seconds in _SECONDS.value:
+            for seconds in ["-"] if _STEPS.value else _SECONDS.value:
                 found = [scores(trainer, settings.parse([change] if change else []), seed, seconds) for seed in seeds]
                 rows.append([f"{_DATA_DIR.value}, {config}", change or "-", *figures(trainer, seconds, found)])
                 print(rows[-1], file=sys.stderr, flush=True)
@@ -60,7 +62,8 @@ def make_trainer(name):
 
 def scores(trainer, values, seed, seconds):
     """Returns the steps of a run, and the mean PSNR of each split."""
-    result = trainer.run(values, seed, float(seconds))[0]
+    length = 0.0 if _STEPS.value else float(seconds)
+    result = trainer.run(values, seed, length, steps=_STEPS.value)[0]
     return result.steps, [statistics.fmean(each) for each in (result.psnr, *map(trainer.psnr_of, _SPLITS.value[1:]))]
 
 
