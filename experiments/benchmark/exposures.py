@@ -9,25 +9,21 @@ are those after a gain per channel is fitted to each (`jaxnerf-eval --align=expo
 to the left half, and the right half is scored. A finished run is not repeated.
 """
 
-import dataclasses
 import pathlib
 import sys
 
-import numpy as np
 from absl import flags
-from jaxtyping import Float
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 from benchmark import settings
+from benchmark.changed_views import changed, factors
 
-from jaxnerf.core.views import Views
 from jaxnerf.runtime import cli
 from jaxnerf.tools.curve.measure import SCORE
 
 HEADS = ("run", "`cameras.exposure`", "steps", "PSNR, dB", "exposure aligned, dB", "right halves, dB")
 _SCORES = ("psnr", "psnr_exposure_aligned", "psnr_exposure_half")
-FACTORS, TINTS = (0.6, 1.6), (0.9, 1.1)
 _KINDS = (("as taken", False), ("changed", True), ("changed", False))
 
 _DATASET = flags.DEFINE_string("dataset", "fox", "Folder of a dataset.")
@@ -79,22 +75,6 @@ def measured(folder: pathlib.Path, exposure: bool, is_changed: bool) -> dict[str
     found = {key: value for key, value in found.items() if key in _SCORES}
     common.write_json(folder / SCORE, found)
     return found
-
-
-def factors(count: int, seed: int) -> Float[np.ndarray, "V 3"]:
-    """Returns the factors of the images' channels."""
-    rng = np.random.default_rng(seed)
-    tints = rng.uniform(*TINTS, (count, 3))
-    return np.exp(rng.uniform(*np.log(FACTORS), (count, 1))) * tints
-
-
-def changed(views: Views, gains: Float[np.ndarray, "V 3"]) -> Views:
-    """Returns Views whose colours are multiplied by factors, clipped, and rounded as they were."""
-    largest = np.iinfo(views.pixels.dtype).max
-    pixels, counts = np.array(views.pixels), np.prod(views.size, axis=1)
-    colors = pixels[:, :3] * np.repeat(gains, counts, axis=0)
-    pixels[:, :3] = np.rint(np.minimum(colors, largest))
-    return dataclasses.replace(views, pixels=pixels)
 
 
 if __name__ == "__main__":

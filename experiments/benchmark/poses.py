@@ -16,22 +16,19 @@ the test views are mapped by its inverse and scored. BARF then also optimises th
 does in a further column. --without trains each run also without refinement. A finished run is not repeated.
 """
 
-import dataclasses
 import pathlib
 import sys
 from typing import Any
 
 import numpy as np
 from absl import flags
-from jaxtyping import Float
 
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1]))
 import common
 from benchmark import settings
+from benchmark.changed_views import perturbed, turned, with_poses
 from pose_estimation.pose_errors import errors, similarity
 
-from jaxnerf.core.poses import se3_exponential
-from jaxnerf.core.views import Views
 from jaxnerf.data.facts import LookAt
 from jaxnerf.runtime import cli
 from jaxnerf.tools.curve.measure import SCORE
@@ -145,38 +142,6 @@ def configuration(seed: int, refine: bool):
 
 def _is_capture():
     return _DATASET.value not in (*_BLENDER, "still_life")
-
-
-def perturbed(poses: Float[np.ndarray, "V 3 4"], amount: float, seed: int) -> Float[np.ndarray, "V 3 4"]:
-    """Returns cameras that see the world after random motions of it, which is how BARF perturbs."""
-    twists = np.random.default_rng(seed).normal(size=(len(poses), 6)) * amount
-    motions = np.asarray(se3_exponential(np.float32(twists)), np.float64)
-    back = np.swapaxes(motions[:, :, :3], 1, 2)
-    eyes = back @ (poses[:, :, 3] - motions[:, :, 3])[:, :, None]
-    return np.concatenate([back @ poses[:, :, :3], eyes], axis=2)
-
-
-def turned(
-    poses: Float[np.ndarray, "V 3 4"], degrees: float, seed: int, center: Float[np.ndarray, "3"] | None = None
-) -> Float[np.ndarray, "V 3 4"]:
-    """Returns cameras that are turned about themselves, and moved by the same fraction of their distance.
-
-    Args:
-        poses: camera to world.
-        degrees: the standard deviation of the angles about each axis.
-        seed: of the angles.
-        center: from which the mean distance is taken; None: the origin.
-    """
-    size = np.radians(degrees) * np.random.default_rng(seed).normal(size=(len(poses), 6))
-    turns = se3_exponential(np.float32(np.concatenate([size[:, :3], 0 * size[:, 3:]], axis=1)))
-    distance = np.linalg.norm(poses[:, :, 3] - (0 if center is None else center), axis=1).mean()
-    eyes = poses[:, :, 3] + distance * size[:, 3:]
-    return np.concatenate([np.asarray(turns)[:, :, :3] @ poses[:, :, :3], eyes[:, :, None]], axis=2)
-
-
-def with_poses(views: Views, poses: Float[np.ndarray, "V 3 4"]) -> Views:
-    """Returns Views whose cameras have other poses."""
-    return dataclasses.replace(views, cameras=dataclasses.replace(views.cameras, to_world=np.float32(poses)))
 
 
 if __name__ == "__main__":

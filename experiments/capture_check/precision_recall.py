@@ -18,6 +18,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import common
 
+from jaxnerf.data.geometry.poses import neighbours
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.readers.base import read_capture
 from jaxnerf.tools.capture_check import cameras, images, report, tracks, view_evidence
@@ -99,7 +100,7 @@ def _rotation(vector):
 
 def _accused(capture, keypoints, poses, scale):
     """Returns the views that errors name."""
-    near = tracks.neighbours(poses)
+    near = neighbours(poses)
     found = tracks.follow(keypoints, near)
     evidence = tracks.Evidence(keypoints, near, found, poses, scale, 0.0)
     findings = cameras.judge_views(capture, evidence)

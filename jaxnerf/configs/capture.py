@@ -9,6 +9,7 @@ def get_config():
     data = config.data
     data.format, data.dir, data.factor, data.width = "auto", "", "auto", 200
     data.background, data.ndc = "auto", "auto"
+    config.cameras.refine, config.cameras.exposure = "auto", "auto"
     # Without alpha no cell is known to be empty at first. In real scenes thin density is mostly spurious fog.
     config.occupancy.threshold, config.occupancy.cpu_pool_samples_per_ray = 0.03, 9.0
     train = config.train

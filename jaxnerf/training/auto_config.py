@@ -14,6 +14,7 @@ from jaxnerf.options import Changes, Device, Facts, changing, is_auto, replaced
 from jaxnerf.registry import FIELDS, LOSSES, SAMPLERS
 from jaxnerf.runtime.processes import Detail
 from jaxnerf.training.build import build_model
+from jaxnerf.training.camera_parameters import resolve_cameras
 from jaxnerf.training.config import (
     Config,
     RunConfig,
@@ -65,6 +66,8 @@ def resolve(config: Config, views: Views | None = None, *, platform: str | None 
         views = dataset.load_split(data, "train", capture=capture, fingerprint=config.fingerprint)
     fingerprint = config.fingerprint or dataset.fingerprint(data, capture)
     sampler = config.declared_by(SAMPLERS)
+    cameras, found = resolve_cameras(config.cameras, views)
+    config, lines = replaced(config, cameras=cameras), lines + found
     has_alpha = bounded_by_alpha(config.scene, views, ndc=data.ndc, refined=config.cameras.refine)
     # A box only for rendering holds all that cameras see.
     has_alpha &= config.has_box

@@ -18,10 +18,15 @@ from jaxnerf.core.poses import se3_exponential
 from jaxnerf.core.safe_math import norm
 from jaxnerf.core.types import Batch, Camera, Rays, Rendering
 from jaxnerf.core.views import Views
+from jaxnerf.data.image_agreement import agreement
 from jaxnerf.models.base import Model
-from jaxnerf.options import POSITIVE, Ablation, Changes, Device, Facts, Options, at_least, infer, option
+from jaxnerf.options import POSITIVE, Ablation, Changes, Device, Facts, Options, at_least, infer, is_auto, option
+from jaxnerf.runtime.processes import Detail
 
 _LEAST_ANGLE = 1e-3  # squared radians between axes, below which the point that they look at is undefined
+_MIN_MATCHES = 2000  # of two images; fewer may be highlights and outlines of smooth bodies, which fit no cameras
+_OFF = 0.8  # px; 0.2 to 0.5 with good cameras, 1.2 to 3.7 where they are off by 0.3 degrees
+_BRIGHTNESS, _TINT = 0.06, 0.025  # 0.02 and 0.013 in captures of one exposure, 0.08 and 0.03 where it varies
 CAMERAS = "cameras"  # the entry of the parameters; all other entries are networks
 
 
@@ -33,14 +38,17 @@ class CameraOptions(Options):
 
     exposure: bool = option(
         False,
-        "whether each image has a gain per colour channel; renderings show the scene without it",
+        "Whether each image has a gain per colour channel; renderings show the scene without it. Auto: where images "
+        "show the same corners at different brightness or in other colours.",
+        auto=True,
         ablations=(Ablation("exposures", without=False, more=True, aligned="colors"),),
     )
     exposure_lr: float = option(1e-2, "initial learning rate; it decays as that of the networks", range=POSITIVE)
     refine: bool = option(
         False,
         "Whether each pose is corrected, by turns and moves about what the cameras look at. Alpha then does not bound "
-        "the scene, as outlines seen from wrong poses cut matter away.",
+        "the scene, as outlines seen from wrong poses cut matter away. Auto: where images do not fit their cameras.",
+        auto=True,
         ablations=(Ablation("refined poses", without=False, more=True, aligned="pose"),),
     )
     refine_focal: bool = option(False, "with `refine`: whether the focal length, common to all images, is, too")
@@ -64,6 +72,36 @@ class CameraOptions(Options):
     def any(self) -> bool:
         """Whether there are such parameters."""
         return self.exposure or self.refine
+
+
+def resolve_cameras(options: CameraOptions, views: Views) -> tuple[CameraOptions, list[str]]:
+    """Infers whether poses and exposures are trained, from corners that several images of the split "train" show.
+
+    Returns:
+        The options without "auto" in `refine` and `exposure`, and one line per inferred value with its reason.
+    """
+    if not (is_auto(options.refine) or is_auto(options.exposure)):
+        return options, []
+    found = agreement(views)
+    poses = found.off > _OFF, f"matched corners are {found.off:.2f} px beside each other's epipolar lines, limit {_OFF}"
+    brightness, tint = math.expm1(found.brightness), math.expm1(found.tint)
+    gains = (
+        brightness > _BRIGHTNESS or tint > _TINT,
+        (
+            f"corners differ by {brightness:.1%} in brightness, limit {_BRIGHTNESS:.1%}, and {tint:.1%} in colour, "
+            f"limit {_TINT:.1%}"
+        ),
+    )
+    if found.count < _MIN_MATCHES:
+        poses = gains = False, f"only {found.count} corners of images match, which is too little to tell"
+    elif views.time is not None:
+        poses = gains = False, "images of a scene that moves do not tell"
+
+    def inferred(name, is_on, why):
+        line = f"{name:13} {'on' if is_on else 'off'}: {why}"
+        return is_on, line if is_on else Detail(line)
+
+    return infer(options, refine=inferred("refined poses", *poses), exposure=inferred("exposures", *gains))
 
 
 class CameraParameters(NamedTuple):

@@ -6,6 +6,7 @@ from jaxnerf.data.synthetic import load_synthetic
 from studies import study
 
 poses = study("benchmark/poses")
+changed_views = study("benchmark/changed_views")
 pose_errors = study("pose_estimation/pose_errors")
 TRUTH = np.float64(load_synthetic(size=200).cameras.to_world)
 
@@ -32,7 +33,7 @@ def test_cameras_that_are_turned_about_themselves_have_the_errors_that_are_asked
 def test_a_motion_of_the_world_is_seen_by_the_cameras_that_barf_perturbs():
     moved = poses.perturbed(TRUTH, 0.15, 1)
     twists = np.random.default_rng(1).normal(size=(len(TRUTH), 6)) * 0.15
-    motions = np.asarray(poses.se3_exponential(np.float32(twists)))
+    motions = np.asarray(changed_views.se3_exponential(np.float32(twists)))
     x = np.array([0.2, -0.4, 0.6])
     after = motions[:, :, :3] @ x + motions[:, :, 3]
     seen = np.einsum("vji,vj->vi", moved[:, :, :3], x - moved[:, :, 3])

@@ -18,12 +18,13 @@ from jaxnerf.configs import default, lego_fast, lego_mlp_fast
 from jaxnerf.data import synthetic
 from jaxnerf.data.facts import footprint_radii, footprint_spread, mean_color
 from jaxnerf.data.geometry import visual_hull
+from jaxnerf.data.image_agreement import Agreement
 from jaxnerf.data.ray_batches import view_rays
 from jaxnerf.data.scene import SceneOptions
 from jaxnerf.options import AUTO
 from jaxnerf.registry import FIELDS, Part
 from jaxnerf.tools.embedded_scene import still_life
-from jaxnerf.training import workdir
+from jaxnerf.training import camera_parameters, workdir
 from jaxnerf.training.auto_config import device_fields, fill_from, resolve, resolve_for_device
 from jaxnerf.training.build import build
 from jaxnerf.training.compiled_step import steps_per_dispatch
@@ -56,6 +57,8 @@ AUTO_FIELDS = {
     "data.near": 0.5,
     "scene.background": (0.5, 0.4, 0.3),
     "cameras.num_images": 60,
+    "cameras.refine": True,
+    "cameras.exposure": True,
     "train.batch_size": 512,
     "train.rays_per_side": 2,
     "train.microbatch_size": 128,
@@ -590,6 +593,32 @@ def test_alpha_does_not_bound_the_box_of_a_scene_that_moves_or_whose_poses_are_r
     both = [resolve(auto_config(), each).lines for each in (views, moving)]
     still, line = ([each for each in lines if each.startswith("time  ")] for lines in both)
     assert not still and line[0].endswith("the scene is trained as if nothing moved; --config=moving uses it")
+
+
+@pytest.mark.parametrize(
+    "found, refine, exposure, words",
+    [
+        (Agreement(2500, 0.7, 0.05, 0.02), False, False, ["0.70 px beside", "5.1% in brightness, limit 6.0%"]),
+        (Agreement(2500, 0.9, 0.05, 0.02), True, False, ["refined poses on: matched corners are 0.90 px"]),
+        (Agreement(2500, 0.7, 0.2, 0.02), False, True, ["exposures     on: corners differ by 22.1% in brightness"]),
+        (Agreement(2500, 0.7, 0.05, 0.1), False, True, ["10.5% in colour, limit 2.5%"]),
+        (Agreement(1500, 5.0, 0.3, 0.2), False, False, ["off: only 1500 corners of images match"]),
+    ],
+)
+def test_poses_and_exposures_are_trained_where_images_contradict_them(
+    views, monkeypatch, found, refine, exposure, words
+):
+    monkeypatch.setattr(camera_parameters, "agreement", lambda views: found)
+    config = auto_config()
+    config.cameras.refine = config.cameras.exposure = AUTO
+    got, _, lines = resolve(config, views)
+    assert (got.cameras.refine, got.cameras.exposure) == (refine, exposure)
+    assert all(any(word in line for line in lines) for word in words)
+    config.cameras.refine = False
+    assert not resolve(config, views).config.cameras.refine
+    moving = dataclasses.replace(views, time=np.linspace(0, 1, len(views.size), dtype=np.float32))
+    config.cameras.refine = AUTO
+    assert not resolve(config, moving).config.cameras.any
 
 
 def test_sizes_follow_the_images_up_to_a_limit_that_contraction_doubles(views):

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _ROUNDED = 2e-3  # a matrix of three decimals is off by at most 2 sqrt(3) 0.0005; one scaled by 1.001 by 0.002
@@ -168,3 +168,21 @@ def travel(poses: Float[np.ndarray, "V 3 4"]) -> bool:
     towards = gaze_center(poses) - poses[:, :, 3]
     ahead = -(towards * poses[:, :, 2]).sum(axis=1)
     return bool((ahead >= math.sqrt(0.5) * np.linalg.norm(towards, axis=1)).mean() < 0.5)
+
+
+def neighbours(
+    poses: Float[np.ndarray, "V 3 4"], *, count: int = 5, of: Int[np.ndarray, " N"] | None = None
+) -> Int[np.ndarray, "N K"]:
+    """Returns the indices of the views most similar to each view, or to each of the views `of`, nearest first.
+
+    The measure is the angle of the rotation between two views plus half their distance, in units of the
+    median distance from the median position. Neither changes if axes are swapped or negated in all poses.
+    """
+    turn, eyes = poses[:, :, :3], poses[:, :, 3]
+    rows = np.arange(len(poses)) if of is None else of
+    cosine = (np.einsum("aij,bij->ab", turn[rows], turn) - 1) / 2
+    distance = np.linalg.norm(eyes[rows, None] - eyes, axis=-1)
+    spread = np.median(np.linalg.norm(eyes - np.median(eyes, axis=0), axis=-1))
+    cost = np.arccos(np.clip(cosine, -1, 1)) + 0.5 * distance / max(spread, 1e-12)
+    cost[np.arange(len(rows)), rows] = np.inf
+    return np.argsort(cost, axis=1, kind="stable")[:, : min(count, len(poses) - 1)]

@@ -17,7 +17,7 @@ class Finding(NamedTuple):
     Attributes:
         severity: "error" where training would be useless, or "warning".
         kind: "axes", "focal", "lens", "swap", "pose", "fold", "overlap", "points", "size", "file", "mask", "training",
-            "duplicate", "blur", "bounds", "leak" or "skipped".
+            "accuracy", "duplicate", "blur", "bounds", "leak" or "skipped".
         found: what the check found, with the name of the file.
         expected: what it expects there; empty for the note of a reader.
         change: the file, field or flag to change, and how.

@@ -11,7 +11,7 @@ from jaxnerf.data import dataset
 from jaxnerf.data.geometry import path_poses
 from jaxnerf.data.geometry.bounds import known_bounds
 from jaxnerf.data.geometry.path_poses import coverage
-from jaxnerf.data.geometry.poses import axis_of, gaze_center, look_one_way, sideways, up_of
+from jaxnerf.data.geometry.poses import axis_of, gaze_center, look_one_way, neighbours, sideways, up_of
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.images.load_images import scored_splits, split_indices
 from jaxnerf.data.readers import base
@@ -99,7 +99,7 @@ def inspect(
     whole = base.read_capture(folder, format)
     capture = subset(whole)
     images, findings = images_module.read(capture)
-    near_views = tracks.neighbours(poses_of(capture))
+    near_views = neighbours(poses_of(capture))
     findings += images_module.compare(capture, images, near_views)
     findings += depths.judge_model_points(capture) + folds.noted(capture)
     evidence = cameras.gather(capture, images, near_views)
@@ -114,6 +114,8 @@ def inspect(
         if not wrong:
             flagged = {index for finding in views for index in finding.frames if finding.severity == "error"}
             findings += folds.judge_folds(capture, evidence, flagged)
+        if not any(finding.kind in _OF_CAMERAS for finding in (*wrong, *findings)):
+            findings += cameras.judge_accuracy(capture, evidence)
         findings += exposure.judge_exposure(capture, images, evidence)
     findings += wrong
     if evidence.fraction < _FEW_FIT and not any(finding.kind in _OF_CAMERAS for finding in findings):
@@ -228,6 +230,7 @@ def _camera_facts(capture, evidence, images, up):
     low, high = cover.elevation.min(), cover.elevation.max()
     shown = evidence.tracks.shown
     seen = shown.sum() / max(len(shown), 1)
+    sure, error = cameras.circle_error(evidence)
     handed = "right-handed" if np.linalg.det(poses[:, :, :3]).min() > 0 else "mirrored"
     return [
         (
@@ -250,7 +253,8 @@ def _camera_facts(capture, evidence, images, up):
         (
             "overlap",
             f"{len(shown)} corners are matched, each in {seen:.1f} of {1 + evidence.near.shape[1]} views; "
-            f"{percent(evidence.fraction)} fit the cameras within {tracks.INLIER:.0f} px",
+            f"{percent(evidence.fraction)} fit the cameras within {tracks.INLIER:.0f} px; {sure} that a third "
+            f"image confirms are {error:.2f} px off (median)",
         ),
     ]
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxnerf.core.cameras import undistort
+from jaxnerf.data import image_agreement
 from jaxnerf.data.readers.base import Capture
 from jaxnerf.runtime import stages
 from jaxnerf.tools.capture_check.images import ImageSummary
@@ -70,21 +71,6 @@ class Evidence(NamedTuple):
     fraction: float
 
 
-def neighbours(poses: Float[np.ndarray, "V 3 4"], *, count: int = 5) -> Int[np.ndarray, "V K"]:
-    """Returns the indices of the views most similar to each view, nearest first.
-
-    The measure is the angle of the rotation between two views plus half their distance, in units of the
-    median distance from the median position. Neither changes if axes are swapped or negated in all poses.
-    """
-    turn, eyes = poses[:, :, :3], poses[:, :, 3]
-    cosine = (np.einsum("aij,bij->ab", turn, turn) - 1) / 2
-    distance = np.linalg.norm(eyes[:, None] - eyes, axis=-1)
-    spread = np.median(np.linalg.norm(eyes - np.median(eyes, axis=0), axis=-1))
-    cost = np.arccos(np.clip(cosine, -1, 1)) + 0.5 * distance / max(spread, 1e-12)
-    np.fill_diagonal(cost, np.inf)
-    return np.argsort(cost, axis=1, kind="stable")[:, : min(count, len(poses) - 1)]
-
-
 def keypoints_of(capture: Capture, images: Sequence[ImageSummary | None]) -> list[Keypoints]:
     """Returns the Keypoints of every image, without corners for which `undistort` does not converge."""
     result = []
@@ -108,18 +94,7 @@ def match(first: Keypoints, second: Keypoints) -> Int[np.ndarray, " N"]:
 
     Matches are mutual nearest neighbours that pass Lowe's ratio test.
     """
-    result = np.full(len(first.points), -1)
-    if min(len(first.points), len(second.points)) < 2:
-        return result
-    similarity = first.descriptors @ second.descriptors.T
-    forward, backward = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    rows = np.arange(len(similarity))
-    best = similarity[rows, forward]
-    similarity[rows, forward] = -1
-    unambiguous = 1 - best < _RATIO**2 * (1 - similarity.max(axis=1))  # |a - b|^2 = 2 - 2 a b
-    good = unambiguous & (backward[forward] == rows)
-    result[good] = forward[good]
-    return result
+    return image_agreement.match(first.descriptors, second.descriptors, _RATIO)
 
 
 def follow(

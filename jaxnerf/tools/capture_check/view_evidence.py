@@ -170,7 +170,7 @@ def _estimate_pose(points, places, tolerance):
 
 
 def nearest(poses: Float[np.ndarray, "V 3 4"], pose: Float[np.ndarray, "3 4"], doubtful: Collection[int]) -> list[int]:
-    """Returns the views whose cameras are nearest to a pose, without doubtful ones; see `tracks.neighbours`."""
+    """Returns the views whose cameras are nearest to a pose, without doubtful ones; see `poses.neighbours`."""
     cosine = (np.einsum("ij,bij->b", pose[:, :3], poses[:, :, :3]) - 1) / 2
     eyes = poses[:, :, 3]
     spread = np.median(np.linalg.norm(eyes - np.median(eyes, axis=0), axis=-1))

@@ -7,6 +7,7 @@ import pytest
 
 from jaxnerf.core import poses as core_poses
 from jaxnerf.core.types import Camera
+from jaxnerf.data.geometry.poses import neighbours
 from jaxnerf.data.readers import base
 from jaxnerf.tools.capture_check import folds, report, tracks
 
@@ -34,7 +35,7 @@ def orbit(names=None):
 
 
 def evidence(keypoints, poses):
-    near = tracks.neighbours(poses)
+    near = neighbours(poses)
     return tracks.Evidence(keypoints, near, tracks.follow(keypoints, near), poses, np.full(len(poses), FOCAL), 1.0)
 
 

@@ -9,6 +9,7 @@ import pytest
 import captures
 from jaxnerf.core import poses as core_poses
 from jaxnerf.data.geometry import path_poses
+from jaxnerf.data.geometry.poses import neighbours
 from jaxnerf.data.readers import base
 from jaxnerf.tools.capture_check import cameras, report, tracks
 from jaxnerf.tools.capture_check.view_evidence import Alternative, Support, find_alternative, support
@@ -35,7 +36,7 @@ def evidence(kinds=None, *, seed=0):
 
 
 def _with_poses(keypoints, poses):
-    near = tracks.neighbours(poses)
+    near = neighbours(poses)
     return tracks.Evidence(keypoints, near, tracks.follow(keypoints, near), poses, np.full(len(poses), FOCAL), 1.0)
 
 
