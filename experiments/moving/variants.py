@@ -33,7 +33,7 @@ _STEPS = flags.DEFINE_integer("steps", 0, "Steps of training, in place of --seco
 _SPLITS = flags.DEFINE_list("splits", ["val"], "The views that are scored: val, test or held_out.")
 _SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds; every variant is trained with each.")
 _TABLE = flags.DEFINE_string("table", "variants", "Name of the table in --page.")
-_SET = settings.define_set()
+_SET = flags.DEFINE_multi_string("set", [], "A change of options, such as losses.opacity=0; each is a variant.")
 
 
 def main(argv: list[str]) -> None:
