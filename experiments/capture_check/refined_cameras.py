@@ -58,7 +58,14 @@ def main(argv: list[str]) -> None:
     if not train(config, run):
         raise ValueError(f"{run}: training was stopped; the same command continues it")
     if not refined.exists():
-        export = [sys.executable, "-m", "jaxnerf.export", f"--workdir={run}", "--kind=cameras", "--name=refined"]
+        export = [
+            sys.executable,
+            "-m",
+            "jaxnerf.tools.exporters.program",
+            f"--workdir={run}",
+            "--kind=cameras",
+            "--name=refined",
+        ]
         subprocess.run(export, check=True)
         found = next(path for path in run.rglob("refined") if path.is_dir())
         planting.copy(source, refined, without=["transforms.json"])
