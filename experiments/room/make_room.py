@@ -12,6 +12,7 @@ import pathlib
 import sys
 import time
 
+import jax
 import numpy as np
 from absl import flags
 
@@ -41,6 +42,7 @@ _FORMAT = flags.DEFINE_enum("image_format", "png", ["png", "jpg"], "Format of th
 _MODEL = flags.DEFINE_string("model", None, "Folder of the COLMAP model, missing; none when not given.")
 _SEED = flags.DEFINE_integer("seed", 0, "Of everything random.", lower_bound=0)
 _PIXEL_NOISE = 0.2  # px, of the observations of points
+_project = jax.jit(project)
 
 
 def main(argv: list[str]) -> None:
@@ -78,7 +80,7 @@ def _write_model(folder, truth, rng):
     lens = {"focal": truth.focal, "center": truth.center, "distortion": truth.distortion, "lens": "opencv"}
     for name, pose, seen in zip(names, truth.file_to_world, truth.points_seen, strict=False):
         camera, seen = Camera(to_world=pose, **lens, height=height, width=width), np.flatnonzero(seen)
-        at = np.asarray(project(camera, truth.points)[0])[seen] + _PIXEL_NOISE * rng.normal(size=(len(seen), 2))
+        at = np.asarray(_project(camera, truth.points)[0])[seen] + _PIXEL_NOISE * rng.normal(size=(len(seen), 2))
         shown = ((at > 0) & (at < [width, height])).all(axis=1)
         image = folder / "images" / name
         frames.append(Frame(name, image, camera, seen=seen[shown], seen_at=at[shown]))

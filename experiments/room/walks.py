@@ -3,7 +3,8 @@
     JAXNERF_SCENES=... taskset -c 0 python experiments/room/walks.py --runs=walk:300,walk_points:300 \
         [--out=runs/walks] [--width=240] [--set=NAME=VALUE]... [--split=test] [--page=docs/results/captures.md]
 
-A run is a folder, or a name below $JAXNERF_SCENES, and its seconds: CPU time of one core. Each is configs/capture.py
+A run is a folder, or a name below $JAXNERF_SCENES, and its seconds, CPU time of one core, or, as walk:3000steps, its
+steps: beside other programs CPU time is no measure of a machine's speed. Each is configs/capture.py
 with its own learning rates. The split "held_out" is every 8th training view, then not trained on. --set changes all
 runs of a call. What walks.json in --out has is not measured again. A sheet of scored views is beside it, below each the
 image.
@@ -29,7 +30,7 @@ from jaxnerf.training.config import changed, read_config
 
 HEADS = ("dataset", "changed", "px", "seconds", "PSNR, dB", "SSIM", "steps", "passes", "seconds a frame")
 _OUT = flags.DEFINE_string("out", "runs/walks", "Folder of the runs and the table.")
-_RUNS = flags.DEFINE_list("runs", ["walk:120"], "Folder:seconds of training.")
+_RUNS = flags.DEFINE_list("runs", ["walk:120"], "Folder:seconds of training, or folder:STEPSsteps.")
 _WIDTH = flags.DEFINE_integer("width", 240, "px, of the images.", lower_bound=8)
 _SET = flags.DEFINE_multi_string("set", [], "Fields of the config, as train.lr_init=0.01.")
 _SPLIT = flags.DEFINE_string("split", "test", "The views that are scored: held_out or test.")
@@ -66,7 +67,8 @@ def _trainer(data_dir):
 
 
 def _measure(trainer, seconds, sheet):
-    result, images = trainer.run({}, 0, float(seconds))
+    steps = int(seconds.removesuffix("steps")) if seconds.endswith("steps") else 0
+    result, images = trainer.run({}, 0, 0.0 if steps else float(seconds), steps=steps)
     scored = trainer.held_out()
     truths = [np.asarray(scored.image(index))[..., :3] for index in range(len(images))]
     similar = [float(ssim(np.float32(image) / 255, truth)) for image, truth in zip(images, truths, strict=True)]
@@ -75,6 +77,7 @@ def _measure(trainer, seconds, sheet):
     scores = [f"{np.mean(result.psnr):.2f}", f"{np.mean(similar):.3f}", f"{result.steps:,}"]
     scores += [f"{rays / len(trainer.views.pixels):.2f}", f"{result.frame_seconds:.1f}"]
     name = pathlib.Path(trainer.config.data.dir).name
+    seconds = f"{result.seconds:.0f}, other programs beside it" if steps else seconds
     return [name, ", ".join(_SET.value), f"{scored.size[0][1]}", seconds, *scores]
 
 

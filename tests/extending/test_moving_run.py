@@ -15,18 +15,18 @@ from jaxnerf.tools.viewer.frame_renderer import FrameCamera, FrameRenderer
 
 pytest_plugins = ["run_fixtures"]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("unoptimized")]
-SIZES = {"resolutions": (8, 16, 32), "width": 32, "view_width": 32, "table_size": 2**14, "view_depth": 1}
+SIZES = {"resolutions": (8, 16), "width": 32, "view_width": 32, "table_size": 2**14, "view_depth": 1}
 
 
 @pytest.fixture(scope="module")
 def workdir(unoptimized, tmp_path_factory):
     folder = tmp_path_factory.mktemp("moving")
-    moving_bodies.write_dataset(folder / "data", num_train=32, num_test=2, size=24)
+    moving_bodies.write_dataset(folder / "data", num_train=32, num_test=2, size=20)
     config = moving.get_config()
     config.data.dir, config.data.factor = str(folder / "data"), 1
     config.moving.update({**SIZES, "motion_width": 32})
-    config.occupancy.resolution = 32
-    config.train.update({"max_steps": 300, "lr_steps": 300, "preview_every": 0.0, "batch_size": 384})
+    config.occupancy.resolution = 20
+    config.train.update({"max_steps": 250, "lr_steps": 250, "preview_every": 0.0, "batch_size": 320})
     config.eval.summary_seconds = 0.0
     assert jaxnerf.train_and_evaluate(config, folder / "run")
     return folder / "run"
@@ -60,7 +60,7 @@ def test_videos_and_the_viewer_show_the_time_that_is_asked_for(workdir):
     views = run.experiment.load_split("train")
     renderer = FrameRenderer(run, views, chunk=256)
     state = renderer.scene_state(run.steps()[-1], run.variables(run.steps()[-1]))
-    camera = FrameCamera(np.asarray(views.cameras.to_world[0]), moving_bodies.ANGLE, 24, 24)
+    camera = FrameCamera(np.asarray(views.cameras.to_world[0]), moving_bodies.ANGLE, 20, 20)
     shown = [renderer.render(state, camera._replace(time=time)).rgb for time in (0.0, 0.5)]
     for image, expected in zip(shown, moving, strict=False):
         assert abs(np.rint(255 * image) - expected).max() <= 8

@@ -1,5 +1,6 @@
 """Trials: a model trained for some seconds and scored on views that are held out of training."""
 
+import copy
 import dataclasses
 import math
 import pathlib
@@ -132,6 +133,7 @@ class Trainer:
         compiling = self._compiling.pop(_key(values), 0.0)
         began = seconds() - compiling
         state, done, took = compiled.train(seed, length, steps, self.pacer)
+        self._last = compiled, state
         scores, images, frame = compiled.score(state, pose)
         result = Result(
             **scores,
@@ -144,6 +146,11 @@ class Trainer:
             memory=compiled.memory,
         )
         return result, images
+
+    def psnr_of(self, split: str) -> list[float]:
+        """Returns the PSNR, dB, of each view of another split after the training of the last `run`."""
+        compiled, state = self._last
+        return compiled.psnr_of(state, split)
 
     def make_pacer(self, file: pathlib.Path) -> Pacer:
         """Makes the pacer that takes steps of the complete model; file: see `Pacer`."""
@@ -272,6 +279,12 @@ class _Compiled:
                 rgb, every = self._view(variables, fitted, index)
                 found["psnr_pose"].append(_psnr(rgb, *self._truth(index, every)))
         return found, images, float(np.median(frames))
+
+    def psnr_of(self, state: Any, split: str) -> list[float]:
+        """Returns the PSNR of each view of a split."""
+        other = copy.copy(self)
+        other._held_out = self._experiment.load_split(split, max_views=_MOST_VIEWS)
+        return other.score(state, False)[0]["psnr"]
 
     def _view(self, variables, views, index):
         """Returns the colours [H, W, 3] of every n-th row and column of a view, and n."""
