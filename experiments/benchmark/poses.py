@@ -69,7 +69,7 @@ def main(argv: list[str]) -> None:
                 folder = f"{name}_{_SIDE.value}_{kind}_{amount:g}_seed{seed}_{_STEPS.value}" + "_given" * (not refine)
                 found = measured(pathlib.Path(_OUT.value) / folder, kind, amount, seed, refine)
                 label = f"{name}, {_SIDE.value} px" + ", not refined" * (not refine)
-                rows.append(row(label, found, kind, amount, seed, _STEPS.value))
+                rows.append(row(label, found, kind, amount, seed, _STEPS.value, align=_ALIGN.value))
                 print(f"{folder}: {found}", flush=True)
     published = PUBLISHED if (name, kinds) == ("lego", [("twist", 0.15)]) else []
     published = [(*cells, *["-"] * _ALIGN.value) for cells in published]
@@ -77,12 +77,15 @@ def main(argv: list[str]) -> None:
     common.publish([*common.markdown(heads, [*rows, *published]), "", *common.provenance()], _TABLE.value)
 
 
-def row(name: str, found: dict[str, float], kind: str, amount: float, seed: int, steps: int) -> tuple[str, ...]:
-    """Returns the cells of a row of the table."""
+def row(
+    name: str, found: dict[str, float], kind: str, amount: float, seed: int, steps: int, *, align: bool = False
+) -> tuple[str, ...]:
+    """Returns the cells of a row of the table; align: with that of aligned scores."""
     turns = (f"{found['turn_before']:.2f}", f"{found['turn']:.3f}")
     moves = (f"{found['move_before']:.3f}", f"{found['move']:.4f}")
     noise = f"{amount:g} degrees" if kind == "degrees" else f"{amount:g}"
-    scores = (f"{found[key]:.2f}" for key in ("psnr", _POSE_ALIGNED) if key in found)
+    keys = ("psnr", *[_POSE_ALIGNED] * align)
+    scores = (f"{found[key]:.2f}" if key in found else "-" for key in keys)  # "-": scored without --align before
     return (name, noise, str(seed), f"{steps:,}", *turns, *moves, f"{found['focal']:.4f}", *scores)
 
 

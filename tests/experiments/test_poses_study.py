@@ -46,3 +46,4 @@ def test_a_row_has_a_cell_for_each_head():
     assert {len(poses.HEADS)} == {
         len(cells) for cells in (poses.row("lego", found, "twist", 0.15, 0, 3000), *poses.PUBLISHED)
     }
+    assert poses.row("lego", found, "twist", 0.15, 0, 3000, align=True)[-2:] == ("30.00", "-")

@@ -1,10 +1,10 @@
 """Exports the cameras that a run has refined, and measures how well images fit them, as jaxnerf-check does.
 
-    JAXNERF_SCENES=... python experiments/capture_check/refined_cameras.py [--dataset=fox] [--degrees=0.5] \
+    JAXNERF_SCENES=... python experiments/benchmark/refined_cameras.py [--dataset=fox] [--degrees=0.5] \
         [--seed=0] [--width=100] [--steps=1200] [--set=train.cpu_batch_size=384] [--out=runs/refined] \
         [--page=docs/results/captures.md]
 
-A copy of the dataset gets cameras that are turned and moved as by `experiments/benchmark/poses.py --degrees`.
+A copy of the dataset gets cameras that are turned and moved as by `poses.py --degrees`.
 `capture` trains on it, jaxnerf-export writes the refined cameras, and the training images are compared with all three.
 A finished run is not repeated.
 """
@@ -58,7 +58,14 @@ def main(argv: list[str]) -> None:
     if not train(config, run):
         raise ValueError(f"{run}: training was stopped; the same command continues it")
     if not refined.exists():
-        export = [sys.executable, "-m", "jaxnerf.export", f"--workdir={run}", "--kind=cameras", "--name=refined"]
+        export = [
+            sys.executable,
+            "-m",
+            "jaxnerf.tools.exporters.program",
+            f"--workdir={run}",
+            "--kind=cameras",
+            "--name=refined",
+        ]
         subprocess.run(export, check=True)
         found = next(path for path in run.rglob("refined") if path.is_dir())
         planting.copy(source, refined, without=["transforms.json"])
