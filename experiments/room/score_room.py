@@ -33,6 +33,7 @@ import common
 
 from jaxnerf.core import contraction
 from jaxnerf.core.cameras import pixel_grid
+from jaxnerf.core.rendering import sample_inputs
 from jaxnerf.core.types import Rays, SceneFn
 from jaxnerf.core.views import Views
 from jaxnerf.data.dataset import load_dataset
@@ -213,7 +214,8 @@ def optical_depth(scene: SceneFn, rays: Rays, start, end, *, num_samples: int = 
     length = jnp.maximum(end - start, 0)
     t = start[:, None] + length[:, None] * ((jnp.arange(num_samples) + 0.5) / num_samples)[None]
     x = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-    density, _ = scene(x, rays.viewdirs[:, None])
+    inputs = sample_inputs("optical_depth", scene, rays, t, jnp.broadcast_to(length[:, None] / num_samples, t.shape))
+    density, _ = scene(x, rays.viewdirs[:, None], **inputs)
     return density.mean(axis=-1) * length * jnp.linalg.norm(rays.directions, axis=-1)
 
 
