@@ -53,8 +53,8 @@ def _link(source, target, count):
 
 def _measure(folder, count):
     """Returns the row of a dataset; nothing is cached before."""
-    options = [f"--data_dir={folder}", f"--workdir={folder}/run", f"--config.data.width={_WIDTH.value}"]
-    options += ["--config=capture", "--config.train.max_steps=1", "--config.train.preview_every=0"]
+    options = ["--config=capture", f"--data_dir={folder}", f"--workdir={folder}/run"]
+    options += [f"--config.data.width={_WIDTH.value}", "--config.train.max_steps=1", "--config.train.preview_every=0"]
     environment = os.environ | {"XDG_CACHE_HOME": f"{folder}/cache"}
     command = [sys.executable, "-m", "jaxnerf.train", *options]
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
