@@ -1,7 +1,7 @@
 """Prints what `cameras.refine` and `cameras.exposure` are where they are "auto", with right and with wrong cameras.
 
     JAXNERF_SCENES=... python experiments/benchmark/auto_cameras.py [--datasets=lego,mic,fern,fox,can] \
-        [--degrees=0.3] [--width=200] [--seed=0] [--page=docs/results/captures.md]
+        [--degrees=0.3] [--width=200] [--seed=0] [--page=docs/results/cameras.md]
 
 Each dataset is measured as it is, with cameras that are turned and moved as by `poses.py --degrees`, and with images
 whose exposures are changed as by `exposures.py`. Nothing is trained. Times are CPU seconds of the process; the first

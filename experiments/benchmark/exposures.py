@@ -1,7 +1,7 @@
 """Trains on images whose exposure and white balance differ by known factors, with and without `cameras.exposure`.
 
     JAXNERF_SCENES=... python experiments/benchmark/exposures.py [--dataset=fox] [--width=100] [--steps=1500] \
-        [--seed=0] [--set=cameras.exposure_lr=2e-2] [--out=runs/exposures] [--page=docs/results/captures.md]
+        [--seed=0] [--set=cameras.exposure_lr=2e-2] [--out=runs/exposures] [--page=docs/results/cameras.md]
 
 Each training image is multiplied by a factor from 0.6 to 1.6, of which the logarithm is uniform, and each channel by
 one more from 0.9 to 1.1, and is clipped and rounded to 8 bits again. The test images stay as they are. Their scores

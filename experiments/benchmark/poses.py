@@ -2,7 +2,7 @@
 
     JAXNERF_SCENES=... python experiments/benchmark/poses.py [--dataset=lego] [--side=100] [--noise=0.15] \
         [--seeds=0,1] [--steps=4000] [--set=cameras.refine_lr=2e-3] [--out=runs/poses] [--align] [--without] \
-        [--page=docs/results/captures.md]
+        [--page=docs/results/cameras.md]
 
 The poses of the training views are perturbed as BARF (arXiv:2104.06405) does for synthetic scenes: by motions of the
 world before the true cameras, exp(twist) with twists from a normal distribution of the standard deviation --noise. With

@@ -2,7 +2,7 @@
 
     JAXNERF_SCENES=... python experiments/benchmark/refined_cameras.py [--dataset=fox] [--degrees=0.5] \
         [--seed=0] [--width=100] [--steps=1200] [--set=train.cpu_batch_size=384] [--out=runs/refined] \
-        [--page=docs/results/captures.md]
+        [--page=docs/results/cameras.md]
 
 A copy of the dataset gets cameras that are turned and moved as by `poses.py --degrees`.
 `capture` trains on it, jaxnerf-export writes the refined cameras, and the training images are compared with all three.
