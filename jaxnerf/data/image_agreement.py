@@ -107,6 +107,8 @@ def _corners(views, view):
     pixels = np.float32(views.pixels[first : first + height * width]) / np.iinfo(views.pixels.dtype).max
     step = _step(views)
     rows, columns = height // step, width // step
+    if min(rows, columns) <= 2 * _EDGE:
+        return np.zeros((0, 3)), np.zeros((0, len(_CELLS) * len(_BINS))), np.zeros((0, 3))
     image = (1 + pixels[:, 3:].prod(axis=1, keepdims=True) * (pixels[:, :3] - 1)).reshape(height, width, 3)
     image = image[: rows * step, : columns * step].reshape(rows, step, columns, step, 3).mean(axis=(1, 3))
     down, right = np.gradient(image.mean(axis=-1))

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+import captures
 from jaxnerf.core.poses import se3_exponential
 from jaxnerf.data import image_agreement
 from jaxnerf.data.synthetic import load_synthetic
@@ -49,3 +50,9 @@ def test_images_without_corners_say_nothing(views):
     assert image_agreement.agreement(grey) == (0, 0, 0, 0)
     hidden = dataclasses.replace(views, mask=np.zeros(len(views.pixels), bool))
     assert image_agreement.agreement(hidden) == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(("count", "height", "width"), [(1, 20, 30), (3, 1, 50), (3, 900, 3)])
+def test_single_and_narrow_images_say_nothing(count, height, width):
+    black = captures.black_views(captures.orbit(count, height=height, width=width))
+    assert image_agreement.agreement(black) == (0, 0, 0, 0)
