@@ -2,14 +2,15 @@
 
     JAXNERF_SCENES=... python experiments/benchmark/poses.py [--dataset=lego] [--side=100] [--noise=0.15] \
         [--seeds=0,1] [--steps=4000] [--set=cameras.refine_lr=2e-3] [--out=runs/poses] [--align] [--without] \
-        [--page=docs/results/cameras.md]
+        [--one_pose] [--page=docs/results/cameras.md]
 
 The poses of the training views are perturbed as BARF (arXiv:2104.06405) does for synthetic scenes: by motions of the
 world before the true cameras, exp(twist) with twists from a normal distribution of the standard deviation --noise. With
 --degrees=0.1,0.3,1,3 each camera is turned about itself instead, by a normal angle about each axis, and moved by the
-same fraction of its distance from the origin, in a capture from what the cameras look at. "still_life" is the embedded
-scene in closed form. Cameras of a capture are refined as by default, those of other scenes, which may be far off, from
-step 50 on at a rate of 4e-3.
+same fraction of its distance from the origin, in a capture from what the cameras look at. With --one_pose all begin at
+the pose of the camera in the middle, as BARF's of forward-facing scenes do. "still_life" is the embedded
+scene in closed form. Cameras of a capture are refined as by default, those of other scenes and those that
+begin at one pose, which are far off, from step 50 on at a rate of 4e-3.
 
 Errors are those after the similarity that maps the refined cameras' positions onto the true ones best (Umeyama 1991);
 the test views are mapped by its inverse and scored. BARF then also optimises their poses on their images, as --align
@@ -49,6 +50,7 @@ _DATASET = flags.DEFINE_string("dataset", "lego", "lego, mic, still_life, or the
 _SIDE = flags.DEFINE_integer("side", 100, "px of an image's side, of a capture of its width.", lower_bound=8)
 _NOISE = flags.DEFINE_list("noise", ["0.15"], "Standard deviations of the twists, as BARF perturbs.")
 _DEGREES = flags.DEFINE_list("degrees", [], "Standard deviations of turns about the cameras, in place of --noise.")
+_ONE_POSE = flags.DEFINE_bool("one_pose", False, "Whether all cameras begin at one pose, in place of noise.")
 _SEEDS = flags.DEFINE_list("seeds", ["0"], "Seeds of the noise and of training.")
 _STEPS = flags.DEFINE_integer("steps", 4000, "Steps of training.", lower_bound=1)
 _ALIGN = flags.DEFINE_bool("align", False, "Whether test views are also scored after their poses are fitted to them.")
@@ -63,6 +65,7 @@ def main(argv: list[str]) -> None:
     del argv
     rows, name = [], _DATASET.value
     kinds = [("degrees", float(value)) for value in _DEGREES.value] or [("twist", float(v)) for v in _NOISE.value]
+    kinds = [("one_pose", 0.0)] if _ONE_POSE.value else kinds
     for kind, amount in kinds:
         for seed in common.seeds_of("--seeds", _SEEDS.value):
             for refine in (False, True)[not _WITHOUT.value :]:
@@ -83,7 +86,7 @@ def row(
     """Returns the cells of a row of the table; align: with that of aligned scores."""
     turns = (f"{found['turn_before']:.2f}", f"{found['turn']:.3f}")
     moves = (f"{found['move_before']:.3f}", f"{found['move']:.4f}")
-    noise = f"{amount:g} degrees" if kind == "degrees" else f"{amount:g}"
+    noise = {"degrees": f"{amount:g} degrees", "one_pose": "one pose"}.get(kind, f"{amount:g}")
     keys = ("psnr", *[_POSE_ALIGNED] * align)
     scores = (f"{found[key]:.2f}" if key in found else "-" for key in keys)  # "-": scored without --align before
     return (name, noise, str(seed), f"{steps:,}", *turns, *moves, f"{found['focal']:.4f}", *scores)
@@ -102,8 +105,7 @@ def measured(folder: pathlib.Path, kind: str, amount: float, seed: int, refine: 
     config = configuration(seed, refine)
     views = common.load_split(config, "train")
     truth = np.asarray(views.cameras.to_world, np.float64)
-    center = LookAt(views).center if _is_capture() else None
-    noisy = perturbed(truth, amount, seed) if kind == "twist" else turned(truth, amount, seed, center)
+    noisy = _changed(views, truth, kind, amount, seed)
     given = with_poses(views, noisy)
     if not train(config, folder, views=given):
         raise ValueError(f"{folder}: training was stopped; the same command continues it")
@@ -129,9 +131,19 @@ def measured(folder: pathlib.Path, kind: str, amount: float, seed: int, refine: 
     return found
 
 
+def _changed(views, truth, kind, amount, seed):
+    if kind == "one_pose":
+        off = np.linalg.norm(truth[:, :, 3] - truth[:, :, 3].mean(axis=0), axis=1)
+        return np.repeat(truth[off.argmin()][None], len(truth), axis=0)
+    if kind == "twist":
+        return perturbed(truth, amount, seed)
+    return turned(truth, amount, seed, LookAt(views).center if _is_capture() else None)
+
+
 def configuration(seed: int, refine: bool):
     """Returns the config of a run of the chosen dataset."""
-    options = {"cameras.refine": refine, "train.preview_every": 0.0, **({} if _is_capture() else _FAR_OFF)}
+    far_off = _ONE_POSE.value or not _is_capture()
+    options = {"cameras.refine": refine, "train.preview_every": 0.0, **(_FAR_OFF if far_off else {})}
     options |= {"train.max_seconds": 0.0, "train.max_steps": _STEPS.value, "train.lr_steps": _STEPS.value}
     if _DATASET.value == "still_life":
         data = {"data.format": "synthetic", "data.dir": "", "data.factor": 1, "data.size": _SIDE.value}

@@ -20,12 +20,16 @@ class Similarity(NamedTuple):
 
 
 def similarity(start: Float[np.ndarray, "V 3"], end: Float[np.ndarray, "V 3"]) -> Similarity:
-    """Returns the similarity that maps points onto others with the least squared distance (Umeyama 1991)."""
+    """Returns the similarity that maps points onto others with the least squared distance (Umeyama 1991).
+
+    Points that coincide are only moved.
+    """
     centers = start.mean(axis=0), end.mean(axis=0)
     left, sizes, right = np.linalg.svd((end - centers[1]).T @ (start - centers[0]) / len(start))
     signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
     turn = (left * signs) @ right
-    scale = float((sizes * signs).sum() / ((start - centers[0]) ** 2).sum(axis=1).mean())
+    spread = ((start - centers[0]) ** 2).sum(axis=1).mean()
+    scale = float((sizes * signs).sum() / spread) if spread else 1.0
     return Similarity(scale, turn, centers[1] - scale * turn @ centers[0])
 
 
