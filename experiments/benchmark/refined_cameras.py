@@ -9,7 +9,6 @@ A copy of the dataset gets cameras that are turned and moved as by `poses.py --d
 A finished run is not repeated.
 """
 
-import os
 import pathlib
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from benchmark import settings
 from benchmark.changed_views import turned
 from capture_check import planting
 
+from jaxnerf.data import dataset
 from jaxnerf.data.geometry.poses import gaze_center, neighbours
 from jaxnerf.data.geometry.world import poses_of
 from jaxnerf.data.images.load_images import split_indices
@@ -46,7 +46,7 @@ def main(argv: list[str]) -> None:
     del argv
     from jaxnerf.training.loop import train
 
-    source = pathlib.Path(os.environ["JAXNERF_SCENES"]) / _DATASET.value
+    source = dataset.dataset_folder(_DATASET.value)
     out = pathlib.Path(_OUT.value) / f"{source.name}_{_WIDTH.value}_{_DEGREES.value:g}_{_STEPS.value}_{_SEED.value}"
     given, run, refined = out / "given", out / "run", out / "refined"
     if not given.exists():
@@ -58,15 +58,8 @@ def main(argv: list[str]) -> None:
     if not train(config, run):
         raise ValueError(f"{run}: training was stopped; the same command continues it")
     if not refined.exists():
-        export = [
-            sys.executable,
-            "-m",
-            "jaxnerf.tools.exporters.program",
-            f"--workdir={run}",
-            "--kind=cameras",
-            "--name=refined",
-        ]
-        subprocess.run(export, check=True)
+        export = [sys.executable, "-m", "jaxnerf.tools.exporters.program", f"--workdir={run}"]
+        subprocess.run([*export, "--kind=cameras", "--name=refined"], check=True)
         found = next(path for path in run.rglob("refined") if path.is_dir())
         planting.copy(source, refined, without=["transforms.json"])
         (refined / "transforms.json").write_bytes((found / "transforms.json").read_bytes())
